@@ -82,8 +82,10 @@ class Known:
     up_c: np.ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
     height: float | None = None  # of the lens above the ground [m]; with up_c the goal's size is checked
     ball_distance: tuple[float, float] | None = None  # of the ball from the lens [m], narrower than the parameters'
-    ball_ray_c: np.ndarray | None = None  # to the ball a frame ago, unit, shape (3,)
-    within: float = math.radians(12.0)  # of ball_ray_c [rad]
+    ball_ray_c: np.ndarray | None = None  # to where the ball is expected, unit, shape (3,)
+    ball_within: float = math.radians(12.0)  # of ball_ray_c [rad]
+    goal_ray_c: np.ndarray | None = None  # to where the goal's middle is expected, unit, shape (3,)
+    goal_within: float = math.radians(12.0)  # of goal_ray_c [rad]
     north_c: np.ndarray | None = None  # the world's x in the camera frame, unit, shape (3,)
 
 
@@ -146,7 +148,7 @@ class Detector:
                 continue
             score = found.score
             if known.ball_ray_c is not None:
-                score -= 0.5 * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c))) / known.within
+                score -= 0.5 * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c))) / known.ball_within
             if best is None or score > best.score:
                 best = BallSeen(found.ray_c, found.half_angle, score)
         return best
@@ -192,7 +194,7 @@ class Detector:
         low, high = known.ball_distance or self.params.ball_distance
         if not low <= distance <= high:
             return False
-        if known.ball_ray_c is not None and float(ray @ known.ball_ray_c) < math.cos(known.within):
+        if known.ball_ray_c is not None and float(ray @ known.ball_ray_c) < math.cos(known.ball_within):
             return False
         if known.up_c is None or known.height is None:
             return True

@@ -7,6 +7,7 @@ pictures that were not trained on, and told as probabilities.
 """
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -212,6 +213,7 @@ class LearntDetector(Detector):
         return probability, things
 
     def _best_ball(self, probability: Tensor, things: Tensor, known: Known) -> BallSeen | None:
+        probability = self._expected_there(probability, things[:, :3], known.ball_ray_c, known.ball_within)
         for i in probability.argsort(descending=True).tolist():
             ray, half_angle = things[i, :3].double().numpy(), float(things[i, 3])
             if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, known):
@@ -219,11 +221,24 @@ class LearntDetector(Detector):
         return None
 
     def _best_goal(self, probability: Tensor, things: Tensor, known: Known) -> GoalSeen | None:
+        probability = self._expected_there(probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within)
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
             if probability[i] >= LEAST_PROBABILITY and self._right_size(rays, known):
                 return GoalSeen(rays, float(probability[i]))
         return None
+
+    def _expected_there(self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float) -> Tensor:
+        """Probabilities where it is known about where the thing is; the networks' own are of a thing that can be anywhere in view.
+
+        Bayes' rule: the odds grow by the share of the view's solid angle that is left, and vanish outside of it.
+        """
+        if expected_c is None:
+            return probability
+        cap, view = (1.0 - math.cos(angle) for angle in (within, self.lens.params.half_fov))
+        odds = probability / (1.0 - probability).clamp(min=1e-6) * max(view / cap, 1.0)
+        there = rays @ torch.from_numpy(expected_c).float() >= math.cos(within)
+        return there * odds / (1.0 + odds)
 
 
 def looked(

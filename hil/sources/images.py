@@ -44,7 +44,7 @@ class ImageParams(Bounded):
     path: str | None = None  # of the folder or video
     device: int = 0  # number of a live camera
     delay: Annotated[float, Bound(0.0, 0.5)] = 0.0  # from the exposure to the arrival of a picture [s]
-    hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts, and a ball that one misses reads as it hung [s]
+    hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts [s]
     fisheye: FisheyeParams | None = None  # the lens; left out, that of training
     mount: MountParams | None = None  # left out, that of training
     detector: DetectorParams = field(default_factory=DetectorParams)
@@ -96,7 +96,7 @@ class Looker:
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
-        self._ball = Following(params.hold)
+        self._followed = Following(training.payload_radius)
 
     def look(self, picture: np.ndarray, stamp: float, hint: Hint | None) -> Detection:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
@@ -104,9 +104,10 @@ class Looker:
         if hint is not None:
             rot_wb = rotation_from_quat(torch.tensor([hint.quat], dtype=torch.float64))[0].numpy()
             rot_wc = rot_wb @ self._rot_cb.T
-            known = self._ball.known(rot_wc, hint.pos_w[2] + float(rot_wb[2] @ self._position_b), hint.ball_distance)
+            height = hint.pos_w[2] + float(rot_wb[2] @ self._position_b)
+            known = self._followed.known(rot_wc, rot_wb[:, 2], height, hint.ball_distance, stamp)
         try:
-            seen = self._ball.take(self.detector.detect(picture, known), rot_wc, stamp)
+            seen = self._followed.take(self.detector.detect(picture, known), rot_wc, stamp)
         except ValueError as error:
             raise SourceError(f"{error}: the pictures' size is not that of images.fisheye") from error
         corners = None if seen.goal is None else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))

@@ -56,7 +56,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     zero = np.zeros((1, 3))
     now = SimpleNamespace(
         pos_w=np.array([[0.0, 0.0, 1.3]]), quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]), vel_w=zero, rate_b=zero,
-        payload_pos_w=np.array([[0.05, -0.03, 0.93]]), payload_vel_w=zero,
+        payload_pos_w=np.array([[0.05, -0.03, 0.93]]), payload_vel_w=zero, time=0.0,
     )  # fmt: skip
     goal = np.array([[1.0, 0.2, 0.0]])
     points, valid = eyes.look(now, now, goal, np.array([True]))
@@ -126,7 +126,7 @@ def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
     assert (pose.height, pose.ball_ray_c, pose.ball_distance) == (1.2, None, None)
     assert [track.ball_distance for track in tracks] == [HANGING, None]
     for track, ray in zip(tracks, truth.ball_ray.numpy()):
-        assert 1e-3 < np.arccos(track.ball_ray_c @ ray) < track.within
+        assert 1e-3 < np.arccos(track.ball_ray_c @ ray) < track.ball_within
 
 
 @pytest.mark.parametrize(

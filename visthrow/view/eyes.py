@@ -1,6 +1,5 @@
 """Keypoints from rendered pictures: what a camera on each vehicle of a plant would take, and what a detector makes of it."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +21,6 @@ from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)
 """Distance of a hanging ball from the lens [m]."""
-
-HOLD = 5
-"""Frames for which a ball that is not seen reads as if it went on hanging as it did."""
 
 SURE = 0.5
 """Share of the looks in a hover in which ball and goal must be found."""
@@ -76,7 +72,7 @@ class Eyes:
         self.camera = KeypointCamera(params)
         self._hall: Scenes | None = None
         self._looks = 0
-        self._balls: list[Following] = []
+        self._followed: list[Following] = []
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
         self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
@@ -97,10 +93,11 @@ class Eyes:
         self._looks += 1
         points, valid = np.zeros((self.count, KEYPOINTS, 2), np.float32), np.zeros((self.count, KEYPOINTS), bool)
         rots = rotation_from_quat(torch.from_numpy(np.array(measured.quat_wb, float))).numpy()
-        if not self._balls:
-            self._balls = [self._hanging(rot) for rot in rots]
+        if not self._followed:
+            self._followed = [self._hanging(rot) for rot in rots]
         for e in range(self.count):
-            seen = self._looked(np.ascontiguousarray(pictures[e, ..., ::-1]), e, measured.pos_w[e], rots[e], bool(carried[e]))
+            picture = np.ascontiguousarray(pictures[e, ..., ::-1])
+            seen = self._looked(picture, e, measured.pos_w[e], rots[e], bool(carried[e]), float(measured.time))
             one, ok = detected_keypoints(self.camera, seen, rots[e])
             points[e], valid[e] = one.numpy(), ok.numpy()
             if e == 0 and self._keep:
@@ -116,20 +113,19 @@ class Eyes:
 
     def _hanging(self, rot_wb: np.ndarray) -> Following:
         """A ball that hangs still below a vehicle: where it is looked for first."""
-        down = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b)) - [0.0, 0.0, self._below]
-        distance = float(np.linalg.norm(down))
-        return Following(HOLD, down / distance, math.asin(self.params.payload_radius / distance))
+        from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
+        return Following(self.params.payload_radius, from_lens - [0.0, 0.0, self._below])
 
-    def _looked(self, picture: np.ndarray, e: int, pos_w: np.ndarray, rot_wb: np.ndarray, carried: bool) -> Seen:
-        """What the detector finds, or of a ball that it misses where it would hang; vehicle e and its measured pose."""
+    def _looked(self, picture: np.ndarray, e: int, pos_w: np.ndarray, rot_wb: np.ndarray, carried: bool, stamp: float) -> Seen:
+        """What the detector finds, or of a ball that it misses where it is predicted; vehicle e and its measured pose at a time [s]."""
         rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
         height = float(pos_w[2] + rot_wb[2] @ np.array(self.params.mount.position_b))
-        seen = self.detector.detect(picture, self._balls[e].known(rot_wc, height, HANGING if carried else None))
+        seen = self.detector.detect(picture, self._followed[e].known(rot_wc, rot_wb[:, 2], height, HANGING if carried else None, stamp))
         self.found["frames"] += 1
         for name in THINGS:
             self._hits[name][e] += getattr(seen, name) is not None
             self.found[name] += getattr(seen, name) is not None
-        return self._balls[e].take(seen, rot_wc, self._looks)
+        return self._followed[e].take(seen, rot_wc, stamp)
 
     def sheet(self, path: Path, columns: int = 3) -> Path:
         """Draw six of the kept frames, spread over the throw, with what was found; returns the path.

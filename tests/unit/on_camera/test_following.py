@@ -1,0 +1,129 @@
+"""Ball and goal from frame to frame: a pendulum below a vehicle that throws, seen now and then."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from camera.detectors.contours import BallSeen, GoalSeen, Known, Seen
+from camera.detectors.following import GATE, LOST, READ, Following
+from camera.detectors.learnt import LearntDetector
+from camera.fisheye import Fisheye
+from camera.mount import rotation_from_vector
+from camera.params import CameraParams
+from visthrow import config
+
+RADIUS, LENGTH, PERIOD = 0.033, 0.36, 0.02
+STEPS = 20
+"""Of integration in a period."""
+
+
+def throw(frames=40, pitch=0.8, thrust=16.0):
+    """Attitudes (N, 3, 3) of a vehicle that pitches to and fro under a thrust [m/s^2], and rays (N, 3) to the ball below its lens.
+
+    The rope's direction r obeys r'' = -(thrust / length) (its part across r) - |r'|^2 r: gravity pulls both alike.
+    """
+    r, v, dt = np.array([0.0, 0.0, -1.0]), np.zeros(3), PERIOD / STEPS
+    rots, rays = [], []
+    for k in range(frames * STEPS):
+        angle = pitch * math.sin(2.0 * math.pi * k * dt / 1.1)
+        up = np.array([math.sin(angle), 0.0, math.cos(angle)])
+        if k % STEPS == 0:
+            rots.append(rotation_from_vector(torch.tensor([[0.0, angle, 0.0]], dtype=torch.float64))[0].numpy())
+            rays.append(r.copy())
+        pull = -thrust / LENGTH * (up - r * (r @ up)) - r * (v @ v)
+        v = v + dt * pull
+        r = r + dt * v
+        r /= np.linalg.norm(r)
+    return np.array(rots), np.array(rays)
+
+
+def followed(rots, rays, blind, seed=0):
+    """By frame [rad]: angle from the truth of what is read (NaN: not seen) and of what is expected, and within which it is looked for."""
+    rng, following = np.random.default_rng(seed), Following(RADIUS, LENGTH * rays[0])
+    read, off, within = [], [], []
+    for i, (rot, ray) in enumerate(zip(rots, rays)):
+        stamp = i * PERIOD
+        known = following.known(rot, rot[:, 2], 1.3, (0.2, 0.6), stamp)
+        noisy = rot.T @ ray + READ * rng.standard_normal(3)
+        ball = None if i in blind else BallSeen(noisy / np.linalg.norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
+        seen = following.take(Seen(ball, None), rot, stamp)
+        angle = lambda of: math.acos(min(1.0, float(of @ rot.T @ ray)))  # noqa: E731, B023
+        read.append(math.nan if seen.ball is None else angle(seen.ball.ray_c))
+        off.append(angle(known.ball_ray_c))
+        within.append(known.ball_within)
+    return np.array(read), np.array(off), np.array(within)
+
+
+def test_a_ball_that_is_lost_in_a_throw_reads_where_it_swings():
+    """Five frames: what it reads is off by less than the ball turns in one; at its last place it would be by what it turns in five."""
+    rots, rays = throw()
+    held, read = [], []
+    for first in range(10, 34):
+        blind = range(first, first + 5)
+        held.append(math.acos(rays[first - 1] @ rays[first + 4]))
+        read.append(followed(rots, rays, blind, first)[0][first + 4])
+    assert np.median(held) > 0.2
+    assert np.nanmedian(read) < 0.05
+    assert np.nanmax(read) < 3.0 * LOST
+
+
+def test_a_ball_is_where_it_is_looked_for():
+    rots, rays = throw()
+    for first in range(5, 30, 3):
+        _, off, within = followed(rots, rays, range(first, first + 8), first)
+        assert (off < within).all()
+        assert (np.diff(within[first : first + 9]) > 0.0).all(), "ever wider while it is missed"
+        assert within[first + 9] < within[first + 8], "and closer again"
+
+
+def test_what_is_lost_for_long_is_not_seen():
+    rots, rays = throw()
+    read, _, within = followed(rots, rays, range(10, 40))
+    seen = ~np.isnan(read)
+    assert seen[10:13].all()
+    assert not seen[22:].any()
+    np.testing.assert_array_equal(seen[10:], within[10:] < GATE * LOST)
+
+
+def test_without_an_attitude_nothing_is_followed():
+    rots, rays = throw(4)
+    following = Following(RADIUS, LENGTH * rays[0])
+    following.known(rots[0], rots[0][:, 2], 1.3, (0.2, 0.6), 0.0)
+    assert following.take(Seen(None, None), None, 0.0) == Seen(None, None)
+    assert following.known(rots[1], rots[1][:, 2], 1.3, (0.2, 0.6), 0.02).ball_ray_c is None
+
+
+def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed():
+    rots, _ = throw(6)
+    following, corner = Following(RADIUS), np.array([0.7, 0.0, -0.7])
+    for i, rot in enumerate(rots):
+        known = following.known(rot, rot[:, 2], 1.3, None, i * PERIOD)
+        if i == 0:
+            assert known.goal_ray_c is None
+            following.take(Seen(None, GoalSeen(np.tile(rot.T @ corner, (4, 1)), 1.0)), rot, 0.0)
+            continue
+        np.testing.assert_allclose(rot @ known.goal_ray_c, corner / np.linalg.norm(corner), atol=1e-9)
+        assert following.take(Seen(None, None), rot, i * PERIOD).goal is None
+
+
+def chosen(detector, probability, rays, known):
+    half = np.full(len(rays), math.asin(RADIUS / LENGTH))
+    things = torch.tensor(np.column_stack([rays, half]), dtype=torch.float32)
+    return detector._best_ball(torch.tensor(probability), things, known)
+
+
+@pytest.mark.parametrize(("within_deg", "found"), [(12.0, True), (60.0, True), (100.0, False)])
+def test_what_is_known_of_a_place_counts_as_bayes_has_it(within_deg, found):
+    """Odds of 0.4 / 0.6 anywhere in a view of 220 deg: 0.98 within 12 deg, 0.64 within 60, 0.43 within 100."""
+    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    detector = LearntDetector(Fisheye(camera.fisheye), RADIUS, camera.goal_side)
+    here, there = np.array([0.0, 0.0, 1.0]), np.array([0.0, math.sin(2.5), math.cos(2.5)])
+    assert chosen(detector, [0.4], [here], Known()) is None
+    ball = chosen(detector, [0.45, 0.4], [there, here], Known(ball_ray_c=here, ball_within=math.radians(within_deg)))
+    assert (ball is not None) == found
+    if ball is not None:
+        np.testing.assert_allclose(ball.ray_c, here)
+        odds = 0.4 / 0.6 * (1.0 - math.cos(camera.fisheye.half_fov)) / (1.0 - math.cos(math.radians(within_deg)))
+        assert ball.score == pytest.approx(odds / (1.0 + odds), abs=1e-6)
