@@ -29,8 +29,8 @@ STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
 """Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of the rope's direction and its rate."""
 
 CONSTANTS = {
-    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 3, "corners": 2,
-    "lens": 3, "goal": 2,
+    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "drag": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 3,
+    "corners": 2, "lens": 3, "goal": 2,
 }  # fmt: skip
 """Unknowns that stay the same; see `Spreads`."""
 
@@ -59,8 +59,10 @@ class Spreads:
     lens: float = 0.0003  # place of the lens on the body [m]
     goal: float = 0.001  # place of the goal [m]
     length: float = 0.03  # of the rope, relative [-]
+    drag: float = 0.3  # of the rotors, over the mass [1/s]
     wind: float = 0.01  # steady horizontal push [m/s^2]
     push: float = 0.1  # unsteady one on both bodies, each step [m/s^2]
+    lift: float = 0.5  # likewise along the body's z, where thrust is late and unsteady
     pendulum: float = 0.05  # of the ball's equation of motion, each step [m/s^2]
     tilt: float = 0.2  # before anything is known [rad]
     scale: float = 0.03  # of the focal length, likewise, relative [-]
@@ -188,10 +190,11 @@ class Problem:
         self.ball_seen = torch.from_numpy(seen)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         s = spreads
-        spread = {"camera": s.tilt, "scale": s.scale, "latency": s.latency, "thrust": s.thrust, "length": s.length, "attitude": s.pose_bias,
-                  "gyro": s.pose_bias, "wind": s.wind, "ball": 0.5 * s.keypoint_bias, "corners": 0.5 * s.keypoint_bias,
-                  "lens": s.lens, "goal": s.goal}  # fmt: skip
+        spread = {"camera": s.tilt, "scale": s.scale, "latency": s.latency, "thrust": s.thrust, "length": s.length, "drag": s.drag,
+                  "attitude": s.pose_bias, "gyro": s.pose_bias, "wind": s.wind, "ball": 0.5 * s.keypoint_bias,
+                  "corners": 0.5 * s.keypoint_bias, "lens": s.lens, "goal": s.goal}  # fmt: skip
         self.prior = torch.cat([torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64) for name, n in CONSTANTS.items()])
+        self.push = tensor([s.push, s.push, s.lift])
         self.attitude = tensor([s.attitude, s.attitude, s.heading * s.attitude])
         self.split(self.prior[None])["attitude"][0, 2] *= s.heading
 
@@ -223,14 +226,15 @@ class Problem:
         lift = (1.0 + c["thrust"][:, None]) * self.thrust[:-1, None] / total
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         wind = torch.nn.functional.pad(c["wind"], (0, 1))[:, None]
-        momentum = (self.vehicle * jump(vel) + self.load * jump(ball)) / (total * dt) - lift * mean(rot[..., 2]) + GRAVITY * up - wind
+        pushed = wind - c["drag"][:, None] * mean(vel)
+        momentum = (self.vehicle * jump(vel) + self.load * jump(ball)) / (total * dt) - lift * mean(rot[..., 2]) + GRAVITY * up - pushed
         falling, along = jump(swung) / dt + GRAVITY * up, mean(rope)
         across = falling - along * (falling * along).sum(-1, keepdim=True)
         coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0  # Magnus: of a rate that is linear in a step
         turned = _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
         return torch.cat(
             [
-                momentum / s.push,
+                _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push,
                 across[..., :2] / s.pendulum,
                 (jump(pos) - mean(vel) * dt) / 1e-4,
                 (jump(swing) - mean(swing_rate) * dt) / 2e-4,
