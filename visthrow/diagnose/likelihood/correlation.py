@@ -143,15 +143,17 @@ def _climbed(
     stamps = [np.unique(w.time[w.channel == channel]) for w in windows]
     period = float(np.median(np.concatenate([np.diff(own) for own in stamps])))
     found: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
+    levels: noise.Noise | None = None
     times = int(np.searchsorted(PERIODS * period, LONGEST))
     if not times:
         return Correlation(period, 0.0, 1), 0.0
 
     def tried(place: tuple[int, int, int]) -> float:
+        nonlocal levels
         if place not in found:
             own = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
-            value, scales = _likelihood(windows, channels, {**known, channel: own})
-            found[place] = value, replace(own, scale=own.scale * scales[channel])
+            value, levels = _likelihood(windows, channels, {**known, channel: own}, levels)
+            found[place] = value, replace(own, scale=own.scale * levels.scale[channel])
         return found[place][0]
 
     best = max(((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried)
@@ -175,10 +177,12 @@ def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[in
     return [p for p in near if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
 
 
-def _likelihood(windows: Sequence[Window], channels: int, known: Mapping[int, Correlation]) -> tuple[float, np.ndarray]:
-    """Log marginal likelihood of windows, and their channels' scales, shape (C,)."""
+def _likelihood(
+    windows: Sequence[Window], channels: int, known: Mapping[int, Correlation], start: noise.Noise | None = None
+) -> tuple[float, noise.Noise]:
+    """Log marginal likelihood of windows, and their levels; ``start``: where these are searched from."""
     told = with_correlations(windows, known)
     grams = each(lambda window: hidden_gram(window, channels), told)
     shaped = designs.correlated_of(grams, told, noise.CORRELATION_TIMES[1], "cpu")
-    levels, value = noise.roughly(shaped)
-    return value, levels.scale
+    levels, value = noise.roughly(shaped, start)
+    return value, levels

@@ -137,9 +137,12 @@ def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
     return replace(noise, share=noise.share[list(windows)], latent_sd=levels)
 
 
-def roughly(grams: Sequence[Gram]) -> tuple[Noise, float]:
-    """Rough levels of grams with correlated latents, and their log-likelihood."""
-    return _maximise(grams, _first_guess(grams), "cpu", ROUGHLY_NATS)
+def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, float]:
+    """Rough levels of grams with correlated latents, and their log-likelihood; ``start``: levels of like grams, to search from."""
+    guess = _first_guess(grams)
+    if start is not None:
+        guess = replace(start, latent_sd={key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()})
+    return _maximise(grams, guess, "cpu", ROUGHLY_NATS)
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
