@@ -190,7 +190,7 @@ class FirstOrderParams(Bounded):
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
     decay: float = 0.985  # of derivatives, per step backward
     learning_rate: float = 2e-3  # at the first iteration
-    adapting: Count = 200  # gradients where the training starts from a policy
+    adapting: Count = 160  # gradients where the training starts from a policy
     adapting_rate: float = 2e-4  # at the first of them, a tenth of it at the last
     adapting_width: float = 0.15  # of the hazard in them
     final_rate: float = 5e-5  # at the last one; half a cosine between
