@@ -39,8 +39,8 @@ def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> n
 def _motor_shares(torque: np.ndarray, rotors: RotorParams, torque_ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Thrust of each motor for roll and pitch, and for yaw [N], shapes (E, 4)."""
     x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
-    roll = torque[:, :1] * y / (4.0 * np.mean(y**2))
-    pitch = -torque[:, 1:2] * x / (4.0 * np.mean(x**2))
+    roll = torque[:, :1] * y / np.sum(y**2)
+    pitch = -torque[:, 1:2] * x / np.sum(x**2)
     yaw = torque[:, 2:] * spin / (4.0 * torque_ratio)
     return roll + pitch, yaw
 

@@ -185,9 +185,9 @@ class ReferencePlant:
         start, size = BODY + BLOCKS + 6, 3 * self._ropes.segments
         return slice(start, start + size), slice(start + size, start + 2 * size)
 
-    def _upper_end(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity of the rope's upper end: the mount while attached."""
-        rotation = rotation_from_quat(state[:, 3:7])
+    def _upper_end(self, state: np.ndarray, rotation: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity of the rope's upper end: the mount while attached; ``rotation`` of the vehicles, where it is known."""
+        rotation = rotation_from_quat(state[:, 3:7]) if rotation is None else rotation
         arm = turned(rotation, self._ropes.mount)
         arm_dot = turned(rotation, cross(state[:, 10:13], self._ropes.mount))
         on = self._attached[:, None]
@@ -207,7 +207,7 @@ class ReferencePlant:
         force_w = turned(rotation, force_b)
         rates[:, :BODY] = rigid_body_rates(vehicle, body, force_w, torque_b)
         rope = self._rope_of(state)
-        root = self._upper_end(state)
+        root = self._upper_end(state, rotation)
         lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
         drag_w = blocks.payload_force(
             self.params.rope, self.extras.payload_drag, self._ropes.points(*root, rope)[2], wind_w, rope[0][:, -1], lift_w,

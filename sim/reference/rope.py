@@ -123,7 +123,7 @@ class RopeDynamics:
         joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames).reshape(len(ids), -1)
         qpos = [
             body[:, 0:3],
-            np.roll(body[:, 3:7], 1, axis=1) / np.linalg.norm(body[:, 3:7], axis=1, keepdims=True),
+            body[:, [6, 3, 4, 5]] / np.linalg.norm(body[:, 3:7], axis=1, keepdims=True),
             joints,
         ]
         qvel = [body[:, 7:13], local.reshape(len(ids), -1)]
