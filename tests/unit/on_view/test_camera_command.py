@@ -17,6 +17,7 @@ from tests.drawn import pixel_rays
 from visthrow import config
 from visthrow.cli import main
 from visthrow.onboard.policy import Policy
+from visthrow.training import trainer
 
 LENS = FisheyeParams(320, 320, 96.0, 97.0, 161.0, 157.0, 0.01, -0.004, fov_deg=190.0)
 LARGE = FisheyeParams(640, 640, 192.0, 194.0, 322.5, 314.5, 0.01, -0.004, fov_deg=190.0)
@@ -137,7 +138,8 @@ SLOW = {"opencv", "ros", "basalt", "ocam", "circles", "charuco"}
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in SLOW)) for k in (*WRITERS, "ocam", *BOARDS)])
-def test_every_calibration_becomes_a_config_that_trains_and_flies(kind, tmp_path, boards, capsys):
+def test_every_calibration_becomes_a_config_that_trains_and_flies(kind, tmp_path, boards, capsys, monkeypatch):
+    monkeypatch.setattr(trainer, "EVALUATED", 20)
     camera = tmp_path / "camera.toml"
     assert main(["camera", "calibrate", *calibration(kind, tmp_path, boards), "--out", str(camera)]) == 0
     said = capsys.readouterr().out
