@@ -1,4 +1,4 @@
-"""``visthrow bench``: how long training and diagnosis take here; what was measured before. Each action is imported when chosen."""
+"""``visthrow bench``: how long training takes here; what was measured before. Each action is imported when chosen."""
 
 import argparse
 
@@ -6,7 +6,6 @@ from visthrow.common.arguments import add_commands, run_command
 
 ACTIONS = {
     "train": ("where the wall time of a training goes: in an iteration, or to an error", "visthrow.evidence.bench.iteration"),
-    "explain": ("seconds of a diagnosis and of its report, on logs of one's own", "visthrow.evidence.bench.explain"),
     "records": ("print the recorded measurements as Markdown", "visthrow.evidence.bench.records"),
 }
 
@@ -17,7 +16,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
         "  visthrow bench train laptop --until 0.06 0.04  seconds of a whole training to these errors, over seeds\n"
-        "  visthrow bench explain flights/*.npz           seconds of a diagnosis and of its report\n"
         "  visthrow bench records                         what was measured before, on which machine and commit\n"
     )
     add_commands(parser, ACTIONS, "bench")

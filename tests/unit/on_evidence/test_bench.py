@@ -173,8 +173,7 @@ def test_mistakes_of_developers_are_told(of, words, message, capsys):
 
 @pytest.mark.parametrize("kind", sorted(bench.ACTIONS.keys() - {"records"}))
 def test_every_measurement_can_be_kept(kind):
-    needed = {"explain": ["flight.npz"]}
-    args = cli.build_parser().parse_args(["bench", kind, *needed.get(kind, [])])
+    args = cli.build_parser().parse_args(["bench", kind])
     assert (args.json, args.record) == (None, None), "what the end of each one asks for"
 
 

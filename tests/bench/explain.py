@@ -1,11 +1,22 @@
-"""How long a diagnosis takes: reading and the fit of initial states, the verdicts, the report; on the logs of one's own flights."""
+"""How long a diagnosis takes: reading and the fit of initial states, the verdicts, the report; on the logs of one's own flights.
+
+    python -m tests.bench.explain flights/*.npz --no-report
+"""
 
 import argparse
+import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
+from sim.arrays.cores import cores
+from tests.bench import start
+from visthrow.diagnose.inputs import opening
+from visthrow.diagnose.reporting import explain_cli
+from visthrow.diagnose.select import search
 from visthrow.evidence.bench.records import Report, Table, add_arguments_of_measurements, finish
+from visthrow.training.device import resolve
 
 VERDICT_S = {"cpu": 90.0, "cuda": 5.0}
 """Bars for ten throws and a minute of flight with the whole catalogue: two quiet CPU cores, an H200."""
@@ -13,22 +24,8 @@ REPORT_S = 120.0
 """What the report may take on top."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    from visthrow.diagnose.inputs import opening
-
-    opening.add_arguments(parser)
-    parser.add_argument("--no-report", action="store_true", help="measure the verdicts only")
-    add_arguments_of_measurements(parser, 2)
-    parser.set_defaults(device="cpu")
-
-
 def measure(args: argparse.Namespace) -> dict[str, float]:
     """Seconds of each stage of one diagnosis, and what was looked at."""
-    from visthrow.diagnose.inputs import opening
-    from visthrow.diagnose.reporting import explain_cli
-    from visthrow.diagnose.select import search
-
     begun = time.perf_counter()
     model, logs = opening.open_model(args)
     opened = time.perf_counter()
@@ -47,9 +44,6 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print, keep."""
-    from sim.arrays.cores import cores
-    from visthrow.training.device import resolve
-
     runs = [measure(args) for _ in range(args.repeats)]
     stages = [stage for stage in ("open", "explain", "verdict", "report") if stage in runs[0]]
     bar = VERDICT_S["cuda" if resolve(args.device).startswith("cuda") else "cpu"]
@@ -63,3 +57,17 @@ def run(args: argparse.Namespace) -> int:
         "verdict = open + explain. The bars hold for ten throws and a minute of flight, on two quiet cores or an H200.",
     )
     return finish(Report("explain", "How long a diagnosis takes", (Table(title, header, rows),), notes, {"runs": runs}), args)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__, record=False)
+    opening.add_arguments(parser)
+    parser.add_argument("--no-report", action="store_true", help="measure the verdicts only")
+    add_arguments_of_measurements(parser, 2)
+    parser.set_defaults(device="cpu")
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
