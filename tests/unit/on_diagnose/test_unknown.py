@@ -14,6 +14,7 @@ from visthrow.diagnose.reporting.blackbox import Table, table_of, train, unexpla
 from visthrow.diagnose.select import result, search, selector, terms, verdicts
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
+from visthrow.diagnose.select.scatter import Varies
 
 EFFECTS = catalogue(12)
 IN_THE_BODY = ("vehicle torque", grammar.JOINT)
@@ -303,3 +304,20 @@ def test_beside_a_law_a_name_must_be_sure_of_its_sign():
     point = SimpleNamespace(information=information, score=information @ [8.0, 1.0, 0.3])
     assert verdicts._sure(point, priors, [0, 1, 2]) == [0]
     assert verdicts._sure(point, priors, []) == []
+
+
+@pytest.mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])
+def test_terms_are_screened_beside_what_varies(days):
+    """As if each were an effect of the problem: else what flights have of their own is taken for a law."""
+    model = SyntheticModel(EFFECTS, law="swirl", law_size=0.02)
+    problem = Problem.of(model, model.windows({}), range(14))
+    varies = Varies(days, {0: 5.0}, {4: 2.0} if days else {})
+    calm, parts = terms.calmed(replace(linearise(problem, np.zeros(12)), varies=varies))
+    screen = terms.screen(calm, parts, "payload force", terms.knots_of(calm))
+    for i in (0, 1, 40):
+        own = terms.as_effect(screen.terms[i], 0.1, 0.0)
+        _, wide = terms.extended(problem, calm, [own])
+        np.testing.assert_allclose(screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
+        np.testing.assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
+        cross = wide.information[-1, :-1] / own.floor
+        np.testing.assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())

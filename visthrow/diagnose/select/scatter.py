@@ -337,10 +337,41 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
     return _integrated(by_day(left, varies.days), varies.drifts) if varies.drifts else left
 
 
+def freed_beside(
+    own: np.ndarray, score: np.ndarray, cross: np.ndarray, statistics: Statistics, varies: Varies
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of candidates that are no effects yet, each alone beside the effects, summed over flights.
+
+    Args:
+        own: information of each, shape (F, T).
+        score: about 0, shape (F, T).
+        cross: information with the effects, shape (F, T, K).
+        statistics: of the flights.
+        varies: effects that have shares of their own.
+    """
+    rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
+    for shares in (varies.flights, varies.drifts):
+        if shares is varies.drifts and shares:
+            member = _members(rows, varies.days)[1]
+            own, score, cross = member @ own, member @ score, np.tensordot(member, cross, 1)
+            rows = by_day(rows, varies.days)
+        for j, size in shares.items():
+            column, along = rows.information[:, :, j], cross[:, :, j]
+            part = (size**2 / (1.0 + size**2 * column[:, j]))[:, None] * along
+            own, score = own - part * along, score - part * rows.score[:, j, None]
+            cross, rows = cross - part[..., None] * column[:, None], _integrated(rows, {j: size})
+    return own.sum(0), score.sum(0), cross.sum(0)
+
+
+def _members(statistics: Statistics, days: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Days of flights, and which flights belong to each, shape (D, F)."""
+    names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
+    return names, (row == np.arange(len(names))[:, None]).astype(float)
+
+
 def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
-    names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
-    member = (row == np.arange(len(names))[:, None]).astype(float)
+    names, member = _members(statistics, days)
     return replace(
         statistics, flights=names, information=np.tensordot(member, statistics.information, 1), score=member @ statistics.score,
         square=member @ statistics.square, samples=member @ statistics.samples,

@@ -25,6 +25,7 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
+from visthrow.diagnose.select.scatter import freed_beside
 
 LAW = 2.0 * STRONG
 """Nats by which a term must be ahead where it takes the place of no name, and which a name costs more where a law acts."""
@@ -102,11 +103,26 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
     factors = zip(*(np.split(values, ends) for values in layout.factors(grammar.joined([known[w] for w in through], shared))))
     exerted = each(lambda w: _exerted(point, parts[w], w, block, known[w], own), through)
     told = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
-    batches = [told[first : first + size] for first in range(0, len(told), size)]
-    shares = each(lambda batch: _products(batch, layout, point.device), batches)
-    square, information, score, cross = map(sum, zip(*shares))
-    rows = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
-    return Screen(_terms(block, shared), np.sqrt(square / max(rows, 1)), information, score, cross)
+    flights = np.searchsorted(point.plain.flights, [point.windows[w].flight for w in through])
+    rows = [np.flatnonzero(flights == f) for f in range(len(point.plain.flights))] if point.varies else [np.arange(len(told))]
+    batches = [[told[i] for i in own_rows[first : first + size]] for own_rows in rows for first in range(0, len(own_rows), size)]
+    of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
+    shares = zip(*each(lambda batch: _products(batch, layout, point.device), batches))
+    square, information, score, cross = (_summed(values, of, len(rows)) for values in shares)
+    if point.varies:
+        information, score, cross = freed_beside(information, score, cross, point.plain, point.varies)
+    else:
+        information, score, cross = (values[0] for values in (information, score, cross))
+    square = square.sum(0)
+    count = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
+    return Screen(_terms(block, shared), np.sqrt(square / max(count, 1)), information, score, cross)
+
+
+def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarray:
+    """Sums of arrays by the row that each belongs to."""
+    out = np.zeros((rows, *values[0].shape))
+    np.add.at(out, of, np.array(values))
+    return out
 
 
 def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: grammar.Known, own: int) -> tuple[np.ndarray, ...]:
