@@ -7,13 +7,18 @@ flies; where each motor's command is logged, the rates follow too. No controller
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation, Slerp
 
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.flyer_effects import effects_of
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, spare, stretches_of
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force, triangles
 from visthrow.logs.flightlog import FlightLog
+
+SHORTEST = 1e-3
+"""Of the motors' lag [s]: a lag of nothing divides by it."""
 
 
 class FlyerModel(NumericModel):
@@ -41,7 +46,8 @@ class FlyerModel(NumericModel):
         self.steps = round(params.window / params.step)
         self._names = {effect.name: i for i, effect in enumerate(self.effects)}
         self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3), some before the start
-        self._input = np.array([s.data["input"] for s in stretches])  # (S, fine steps, motors)
+        inputs = np.array([s.data["input"] for s in stretches])  # (S, fine steps, motors)
+        self._told = sum(c * inputs**power for power, c in enumerate(params.thrust_map))  # [N]
         self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
         self._since = np.array([s.data["since"] for s in stretches])  # [s], shape (S,)
         self._spare = spare(params.step)
@@ -54,45 +60,64 @@ class FlyerModel(NumericModel):
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
         return lanes.theta[:, self._names[name]] if name in self._names else np.zeros(len(lanes.owner))
 
-    def _wanted(self, lanes: Lanes, half: int, delay: np.ndarray) -> np.ndarray:
-        """Thrust each motor is told at a half step [N], shape (B, motors)."""
-        p = self.params
-        at = (p.window + half * 0.5 * p.step - delay) * (FINE / p.step)  # tables begin one window early
-        left = np.clip(at.astype(int), 0, self._input.shape[1] - 2)
-        share = (at - left)[:, None]
-        told = (1.0 - share) * self._input[lanes.owner, left] + share * self._input[lanes.owner, left + 1]
-        return p.thrust_map[0] + p.thrust_map[1] * told + p.thrust_map[2] * told * told
+    def _thrusts(self, lanes: Lanes) -> np.ndarray:
+        """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): exact for commands that are held."""
+        p, fine = self.params, self.params.step / FINE
+        delay, tau = p.command_delay + self._theta(lanes, "cmd_delay"), p.motor_time_constant + self._theta(lanes, "motor_tau")
+        tau = np.maximum(tau, SHORTEST)
+        at = (p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay) / fine  # tables begin one window early
+        left = np.clip(at.astype(int), 0, self._told.shape[1] - 1)
+        share, out = (at - left)[..., None], np.empty((*at.shape, self._told.shape[2]))
+        for own in np.unique(tau):
+            keep, lanes_ = np.exp(-fine / own), np.flatnonzero(tau == own)
+            after, _ = lfilter([1.0 - keep], [1.0, -keep], self._told, 1, keep * self._told[:, :1])
+            thrust = np.concatenate([self._told[:, :1], after], 1)
+            which, rows = lanes.owner[lanes_], left[:, lanes_]
+            out[:, lanes_] = thrust[which, rows] + share[:, lanes_] * (thrust[which, rows + 1] - thrust[which, rows])
+        return out
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class.
 
-        The state: position and velocity of the vehicle, with a cable its vector to the payload and that one's rate, with
-        torques the body rates, and the thrust of each motor.
+        The state: position and velocity of the vehicle, with a cable its vector to the payload and that one's rate, with torques the
+        body rates; behind it, the thrust of each motor.
         """
-        p, get = self.params, lambda name: self._theta(lanes, name)
-        delay, tau = p.command_delay + get("cmd_delay"), np.maximum(p.motor_time_constant + get("motor_tau"), 1e-3)[:, None]
-        forces = latent_force(lanes.latent, self.steps, self._blocks)
-        scale = self._scale(lanes)
-        curve, hover = get("thrust_curve")[:, None], self._hover()
-        mass = (p.mass + get("mass_quad"))[:, None]
-        fade, since = get("thrust_fade")[:, None], self._since[lanes.owner][:, None]
-        dynamics = _Dynamics(self, lanes, mass)
+        p, forces = self.params, latent_force(lanes.latent, self.steps, self._blocks)
+        thrust, hover, curve = self._thrusts(lanes), self._hover(), self._theta(lanes, "thrust_curve")[:, None]
+        since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
+        faded = 1.0 + self._theta(lanes, "thrust_fade") * since
+        real = thrust * self._scale(lanes) * (1.0 + curve * (thrust / hover - 1.0)) * faded[..., None]
+        dynamics = _Dynamics(self, lanes)
+        path = integrate(lambda half, state: dynamics(half, state, real[half], forces[half]), dynamics.start(lanes), self.steps,
+                         np.full((len(lanes.owner), 1), p.step))  # fmt: skip
+        return np.concatenate([path, real[::2].swapaxes(0, 1)], 2)
 
-        def slope(half: int, state: np.ndarray) -> np.ndarray:
-            thrust = state[:, -self._input.shape[2] :]
-            told = self._wanted(lanes, half, delay)
-            lag = (told - thrust) / tau
-            faded = 1.0 + fade * (since + 0.5 * p.step * half)
-            real = thrust * scale * (1.0 + curve * (thrust / hover - 1.0)) * faded
-            return np.concatenate([dynamics(half, state, real, forces[half]), lag], 1)
-
-        start = np.concatenate([dynamics.start(lanes), self._wanted(lanes, 0, delay)], 1)
-        return integrate(slope, start, self.steps, np.full((len(start), 1), p.step))
+    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
+        """See the base class; the cable's tension is what accelerates the payload against gravity."""
+        p, time = self.params, np.unique(stretch.latent_time)
+        grid, halves = stretch.data["start"] + p.step * np.arange(len(path)), np.arange(2 * self.steps + 1) + self._spare
+        known = triangles(time, grid) @ path
+        rot = Rotation.from_matrix(stretch.data["rot"][halves])
+        turned = Slerp(stretch.data["start"] + 0.5 * p.step * np.arange(len(halves)), rot)
+        rates = (rot[:-1].inv() * rot[1:]).as_rotvec() / (0.5 * p.step)
+        out = {
+            "time": time, "pos_w": known[:, :3], "vel_w": known[:, 3:6], "quat_wb": turned(time).as_quat(),
+            "rate_b": triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2])),
+            "thrust": known[:, -self._told.shape[2] :].sum(1),
+        }  # fmt: skip
+        if p.cable is not None:
+            gap, vel = path[:, 6:9], path[:, 3:6] + path[:, 9:12]
+            along = gap / np.linalg.norm(gap, axis=1, keepdims=True)
+            force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
+            at_knots = triangles(time, grid) @ np.column_stack([along, np.maximum(-np.sum(along * force, 1), 0.0)])
+            out |= {"payload_pos_w": known[:, :3] + known[:, 6:9], "payload_vel_w": known[:, 3:6] + known[:, 9:12],
+                    "cable_dir_w": at_knots[:, :3], "tension": at_knots[:, 3], "mount_b": np.zeros((len(time), 3))}  # fmt: skip
+        return out
 
     def _hover(self) -> float:
         """Thrust of one input channel in hover [N]."""
         load = self.params.mass + (self.params.cable.mass if self.params.cable is not None else 0.0)
-        return load * self.params.gravity / self._input.shape[2]
+        return load * self.params.gravity / self._told.shape[2]
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
@@ -100,7 +125,7 @@ class FlyerModel(NumericModel):
         volts = (self._volts[lanes.owner] - p.reference_voltage) if self.has_voltage else np.zeros(len(lanes.owner))
         sag = p.voltage_coefficient + self._theta(lanes, "battery_sag")
         scale = (1.0 + self._theta(lanes, "thrust_gain")) * (1.0 + sag * volts)
-        motors = self._input.shape[2]
+        motors = self._told.shape[2]
         if motors == 1 or p.torque is None:
             return np.repeat(scale[:, None], motors, 1)
         own = np.stack([self._theta(lanes, f"motor_{name}") for name in ("fl", "fr", "rl", "rr")], 1)
@@ -142,13 +167,14 @@ class FlyerModel(NumericModel):
 class _Dynamics:
     """Forces and torques of lanes, without the motors' lag."""
 
-    def __init__(self, model: FlyerModel, lanes: Lanes, mass: np.ndarray) -> None:
+    def __init__(self, model: FlyerModel, lanes: Lanes) -> None:
         p = model.params
-        self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
 
         def get(name: str) -> np.ndarray:
             return model._theta(lanes, name)
 
+        mass = (p.mass + get("mass_quad"))[:, None]
+        self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
         self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
         self.lean = get("estimator_lean")[:, None]
         tilt = np.stack([get("frame_tilt_y"), -get("frame_tilt_x"), 0.0 * mass[:, 0] - 1.0], 1)

@@ -15,7 +15,7 @@ from visthrow.logs.check.relations import mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FINE = 16
-"""Steps of the commands' table in a step of the integration: commands switch at their own times."""
+"""Entries of the commands' table in a step of the integration: between them, commands switch at their own times."""
 MOST_LATE = 0.15
 """By which attitudes may be late or early [s]."""
 KNOTS = 8
@@ -130,11 +130,13 @@ def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np
 
 
 def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
-    """Held commands on fine steps from one window before the start to its end, shape (fine steps, motors)."""
-    count = FINE * round(params.window / params.step)
-    times = start - params.window + params.step / FINE * np.arange(2 * count + 1)
-    held = channel.hold(times).astype(float).reshape(len(times), -1)
-    return held[:, :1] if params.input == "command" else held
+    """Means of the held commands over fine steps, from one window before the start to its end, shape (fine steps, motors)."""
+    edges = start - params.window + params.step / FINE * np.arange(2 * FINE * round(params.window / params.step) + 1)
+    time, values = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    values = values.reshape(len(time), -1)[:, : 1 if params.input == "command" else None]
+    ends = np.concatenate([[min(time[0], edges[0])], time[1:], [max(time[-1], edges[-1]) + 1.0]])
+    whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)])
+    return np.diff(on_grid(ends, whole, edges), axis=0) / (params.step / FINE)
 
 
 def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
