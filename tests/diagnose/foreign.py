@@ -3,11 +3,11 @@
     python -m tests.diagnose.foreign --seeds tests/diagnose/bank-foreign.txt --jobs 6 --ledger foreign.jsonl
 
 Written from the equations alone: bodies in maximal coordinates with the cable as a constraint (Udwadia and Kalaba 1992), the controller
-of Lee, Leok and McClamroch 2010, rotors with a lag, an integrator of scipy. Noise, sampling and names are its own. It is frozen: nothing of
-the tool was changed for what it shows. A world hides one thing or nothing, or a force that no catalogue holds, and the tool is asked with
-the numbers of the vehicle that its owner would have.
+of Lee, Leok and McClamroch 2010, rotors with a lag, an integrator of scipy. Noise, sampling and names are its own. A world hides one thing
+or nothing, or a force that no catalogue holds, and the tool is asked with the numbers of the vehicle that its owner would have.
 
-Each line of the seed list is a seed; vehicle, kind and size follow from it.
+Each line of the seed list is a seed; vehicle, kind and size follow from it. A list is used once: what it shows is mended on other seeds.
+The worlds of ``bank-foreign.txt`` were flown without drag, so that no wind could show, and knew one foreign force.
 """
 
 import argparse
@@ -28,10 +28,10 @@ from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
-G, TICK, SHOT = 9.80665, 0.01, 1.0 / 120.0  # [m/s^2]; between commands, between pictures of the capture [s]
-CRAFT = {  # configs/vehicle and configs/rope; body [kg, kg m^2], all rotors' full thrust [N], lag [s], cable [m], ball [kg]
-    "crazyflie": dict(body=0.0393, J=(2.4e-5, 2.4e-5, 3.2e-5), top=0.8, lag=0.025, cable=0.5, ball=0.0054),
-    "five_inch": dict(body=0.6, J=(3e-3, 3e-3, 5e-3), top=38.0, lag=0.03, cable=0.7, ball=0.08),
+G, TICK, SHOT = 9.80665, 0.01, 1.0 / 120.0  # [m/s^2]; between commands, between pictures [s]
+CRAFT = {  # configs/vehicle and configs/rope; body [kg, kg m^2], full thrust [N], lag [s], rotor drag [kg/s], cable [m], ball [kg]
+    "crazyflie": dict(body=0.0393, J=(2.4e-5, 2.4e-5, 3.2e-5), top=0.8, lag=0.025, drag=0.01, cable=0.5, ball=0.0054),
+    "five_inch": dict(body=0.6, J=(3e-3, 3e-3, 5e-3), top=38.0, lag=0.03, drag=0.15, cable=0.7, ball=0.08),
 }
 HIDDEN = {
     "thrust_gain": "gain", "mass_quad": "body", "motor_tau": "lag", "cmd_delay": "late", "rotor_drag_xy": "drag", "parasitic": "square",
@@ -41,20 +41,25 @@ HIDDEN = {
 """Effect of the catalogue -> number of a world that it changes."""
 ALIKE = ({"thrust_gain", "mass_quad"}, {"frame_tilt_y", "marker_rot_y", "wind_x"}, {"motor_tau", "cmd_delay", "pose_delay"})
 """What flights of this kind may take for one another: a class is right that holds the truth and is within one of these."""
+FOREIGN = ("swirl", "beat", "wake", "side")
+"""Forces on the vehicle that no catalogue holds: across its velocity; in time alone; after what it did; to the left or right by its way."""
+STRENGTH = {"swirl": 0.25, "beat": 0.2, "wake": 0.25, "side": 0.15}
+"""In the whole mass: [1/s], [m/s^2], [1/s], [m/s^2]."""
+REMEMBERS, BEATS = 0.5, 4.5  # [s], [rad/s]
 ONE_SIDED = ("cmd_delay", "parasitic", "payload_drag")
 FLIGHTS, FLOORS = 4, 10.0
 
 
 def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
-    """Vehicle, what is hidden ("" for nothing, "swirl" for what no catalogue holds), and the world's numbers."""
+    """Vehicle, what is hidden ("" for nothing), and the world's numbers."""
     rng = np.random.default_rng([20261124, seed])
     name = ("crazyflie", "five_inch")[seed // 6 % 2]
-    kind = ("", "swirl", *[None] * 4)[seed % 6]
+    kind = ("", FOREIGN[seed // 12 % len(FOREIGN)], *[None] * 4)[seed % 6]
     base = CRAFT[name]
-    usual = dict.fromkeys(("late", "drag", "square", "wind", "stamp", "tilt", "arm", "ball_square", "ball_stamp", "swirl"), 0.0)
-    world = usual | {key: base[key] for key in ("body", "lag", "cable", "ball", "top")} | {"gain": 1.0, "J": np.array(base["J"])}
-    if kind == "swirl":
-        world["swirl"] = 0.25 * (base["body"] + base["ball"]) * rng.choice([-1.0, 1.0])  # [kg/s]: a fortieth of the weight at 1 m/s
+    usual = dict.fromkeys(("late", "square", "wind", "stamp", "tilt", "arm", "ball_square", "ball_stamp", *FOREIGN), 0.0)
+    world = usual | {key: base[key] for key in ("body", "lag", "drag", "cable", "ball", "top")} | {"gain": 1.0, "J": np.array(base["J"])}
+    if kind in FOREIGN:
+        world[kind] = STRENGTH[kind] * (base["body"] + base["ball"]) * rng.choice([-1.0, 1.0])
     elif kind is None:
         kind = str(rng.choice(list(HIDDEN)))
         floor = next(e.floor for e in effects_of(known(name), False) if e.name == kind)
@@ -67,7 +72,7 @@ def known(name: str) -> FlyerParams:
     c = CRAFT[name]
     return FlyerParams(
         input="thrust_command", position="pos_w", attitude="quat_wb", mass=c["body"], gravity=G, thrust_map=(0.0, c["top"], 0.0),
-        motor_time_constant=c["lag"], command_delay=0.0, reference_voltage=4.0, voltage_coefficient=0.0, drag_xy=0.0, drag_z=0.0,
+        motor_time_constant=c["lag"], command_delay=0.0, reference_voltage=4.0, voltage_coefficient=0.0, drag_xy=c["drag"], drag_z=0.0,
         lowest=0.3, window=1.0, step=0.02, every=3, most_windows=32, cable=CableParams(c["cable"], c["ball"]),
     )  # fmt: skip
 
@@ -83,12 +88,13 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
         return fade * swing * np.array([np.sin(a), beat * np.cos(a), -beat * beat * np.sin(a)]) + [[0.0, 0.0, 2.0], [0.0] * 3, [0.0] * 3]
 
     def slope(t: float, y: np.ndarray, sent: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        r, p, v, u, q, w, f = y[:3], y[3:6], y[6:9], y[9:12], y[12:16], y[16:19], y[19]
+        r, p, v, u, q, w, f, past = y[:3], y[3:6], y[6:9], y[9:12], y[12:16], y[16:19], y[19], y[20:23]
         turn = Rotation.from_quat(q).as_matrix()
         air, ball_air = v - [world["wind"], 0.0, 0.0], u - [world["wind"], 0.0, 0.0]
         across = turn.T @ air * [1.0, 1.0, 0.0]
         push = turn @ (np.array([0.0, 0.0, world["gain"] * f]) - world["drag"] * across) - world["square"] * np.linalg.norm(air) * air
-        push = push + world["swirl"] * np.array([v[1], -v[0], 0.0]) - [0.0, 0.0, M * G]
+        push = push + world["swirl"] * np.array([v[1], -v[0], 0.0]) + [0.0, world["beat"] * np.sin(BEATS * t), -M * G]
+        push = push + world["wake"] * np.array([-past[1], past[0], 0.0]) + [0.0, world["side"] * np.tanh(5.0 * v[0]), 0.0]
         pull = -world["ball_square"] * np.linalg.norm(ball_air) * ball_air - np.array([0.0, 0.0, m * G])
         gap, rate = p - r, u - v  # |gap|^2 = L^2: gap . (p'' - r'') = -|rate|^2, and back to it where rounding left it
         along = gap @ (pull / m - push / M) + rate @ rate + 40.0 * gap @ rate + 200.0 * (gap @ gap - L * L)
@@ -96,11 +102,12 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
         asked = sent[1][max(np.searchsorted(sent[0], t - world["late"], "right") - 1, 0)]
         spun = 0.5 * np.array([*(q[3] * w + np.cross(q[:3], w)), -q[:3] @ w])
         turning = (torque - np.cross(w, J * w)) / J
-        return np.concatenate([v, u, (push + tie) / M, (pull - tie) / m, spun, turning, [(asked - f) / world["lag"]]])
+        changes = v, u, (push + tie) / M, (pull - tie) / m, spun, turning, [(asked - f) / world["lag"]], (v - past) / REMEMBERS
+        return np.concatenate(changes)
 
     start = wanted(0.0)[0]
     hold = (M + m) * G / world["gain"]
-    y = np.concatenate([start, start - [0, 0, L], np.zeros(6), [0, 0, 0, 1.0], np.zeros(3), [hold]])
+    y = np.concatenate([start, start - [0, 0, L], np.zeros(6), [0, 0, 0, 1.0], np.zeros(3), [hold], np.zeros(3)])
     times, sent, path = TICK * np.arange(round(seconds / TICK)), [], [y]
     for t in times:
         place, speed, pushed = wanted(t)
@@ -155,9 +162,13 @@ def asked(seed: int) -> dict:
 
 
 def judged(hidden: str, groups: list[set[str]], overall: str) -> str:
-    """Of an answer: right, class, missed, false, or for what no catalogue holds unknown."""
-    if hidden in ("", "swirl"):
-        return "false" if groups else ("right" if not hidden else "unknown" if overall in ("UNKNOWN", "EXPLAINED IN PART") else "missed")
+    """Of an answer: right, class, missed, false, and of what no catalogue holds unknown, or part where names are told beside it."""
+    if not hidden:
+        return "false" if groups else "right" if overall == "NO EFFECT" else "unsure"
+    if hidden in FOREIGN:
+        if overall in ("UNKNOWN", "EXPLAINED IN PART"):
+            return "part" if groups else "unknown"
+        return "false" if groups else "missed"
     own = [g for g in groups if hidden in g]
     if not own:
         return "false" if groups else "missed"
@@ -178,7 +189,7 @@ def main() -> None:
         for line in pool.imap_unordered(asked, seeds):
             ledger.write(json.dumps(line) + "\n")
             ledger.flush()
-            count[line["hidden"] if line["hidden"] in ("", "swirl") else "hidden", line.get("judged", "failed")] += 1
+            count[line["hidden"] if line["hidden"] in ("", *FOREIGN) else "hidden", line.get("judged", "failed")] += 1
     for (kind, judged_), number in sorted(count.items()):
         print(f"{kind or 'null':8} {judged_:8} {number}")
 

@@ -24,7 +24,9 @@ from visthrow.diagnose.likelihood.evidence import (
 )
 from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms, left_ahead, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
+from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import allowed, deviations, differences, freed
@@ -226,6 +228,8 @@ def measure(diagnosis: Diagnosis) -> HeldOut:
 
 def judged(diagnosis: Diagnosis) -> Diagnosis:
     """A diagnosis as held-out flights leave it."""
+    if diagnosis.overall == result.NO_EFFECT:
+        return _innovations(diagnosis)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
     held, alone = measure(diagnosis), not _compares_phases(diagnosis.work.after)
@@ -250,6 +254,28 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     if diagnosis.overall == result.UNKNOWN or not left:
         return after
     return replace(after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in left))
+
+
+def _innovations(diagnosis: Diagnosis) -> Diagnosis:
+    """A diagnosis without a name: what the model leaves ahead of a window's begin must be near the noise.
+
+    Asked where no calm phase tells what gusts are; there the latent forces are compared with those.
+    """
+    work, point = diagnosis.work, diagnosis.work.after
+    if _compares_phases(point):
+        return diagnosis
+    groups, left_out = groups_of(point, work.problem.kept)
+    names = work.problem.model.channels
+    own = forms(point.windows, groups, point.noise, [w.residual[:, None] for w in point.windows], len(names))
+    error, most = own.error(np.ones(1)).sum(2), UNKNOWN_RATIO**2 * own.floor.sum(2)
+    firm = [name for c, name in enumerate(names) if jackknifed(most[:, c], error[:, c])[2] < 0.0]
+    if not firm:
+        return diagnosis
+    gains = channel_gains(work, Crossed(groups, left_out, point.statistics, [], np.zeros((len(own.groups), len(point.theta))), {}))
+    floors = floors_of(work.problem, point)
+    level = max(diagnosis.levels, key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf), default=None)
+    reasons = tuple(_left(c, work) for c in gains if c.channel in firm)
+    return replace(diagnosis, overall=result.UNKNOWN, block=level.block if level else "", reasons=reasons)
 
 
 def _unconfirmed(diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reason: str) -> Diagnosis:
