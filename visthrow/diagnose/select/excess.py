@@ -4,6 +4,7 @@ Gusts and draught do not know what the vehicle is doing. A latent force that is 
 quietest phase is no gust but something that the model lacks.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -52,6 +53,11 @@ def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple
             earlier = before.noise.latent_sd.get((block, phase), float("nan"))
             found.append(Level(LATENT_BLOCKS[block], phase, earlier, level, quiet, float(nats), bool(nats > least)))
     return tuple(found)
+
+
+def compares_phases(point: Point) -> bool:
+    """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the sensors' noise."""
+    return max(Counter(block for block, _ in point.noise.latent_sd).values(), default=0) > 1
 
 
 def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:

@@ -26,7 +26,7 @@ from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms,
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.excess import floors_of
+from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import allowed, deviations, differences, freed
@@ -232,7 +232,7 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
         return _innovations(diagnosis)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
-    held, alone = measure(diagnosis), not _compares_phases(diagnosis.work.after)
+    held, alone = measure(diagnosis), not compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
     harmed = [c for c in held.channels if alone and c.high < 0.0]
     if held.share <= 0.0 or harmed:
@@ -262,7 +262,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     Asked where no calm phase tells what gusts are; there the latent forces are compared with those.
     """
     work, point = diagnosis.work, diagnosis.work.after
-    if _compares_phases(point):
+    if compares_phases(point):
         return diagnosis
     groups, left_out = groups_of(point, work.problem.kept)
     names = work.problem.model.channels
@@ -289,11 +289,6 @@ def _unconfirmed(diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reas
 def share_of(finding: Finding, held: HeldOut) -> float:
     """Share of the folds that name a cause or one of its class."""
     return min(sum(held.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
-
-
-def _compares_phases(point: Point) -> bool:
-    """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the sensors' noise."""
-    return max(Counter(block for block, _ in point.noise.latent_sd).values(), default=0) > 1
 
 
 def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str) -> Diagnosis:

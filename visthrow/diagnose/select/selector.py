@@ -15,7 +15,7 @@ import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import STRONG, additions, estimate, log_evidence, pair_additions
 from visthrow.diagnose.select import dropped, terms
-from visthrow.diagnose.select.excess import levels
+from visthrow.diagnose.select.excess import compares_phases, levels
 from visthrow.diagnose.select.point import (
     Point,
     Problem,
@@ -353,7 +353,13 @@ class Selector(SearchState):
         return True
 
     def _propose(self) -> bool:
-        """Make the terms that say most candidates, beside the set and instead of its names; False where that brings no new one."""
+        """Make the terms that say most candidates, beside the set and instead of its names; False where that brings no new one.
+
+        Without a calm phase to compare with, a vehicle that is a little off in many ways asks for a law as well as one that has one: there
+        terms are asked for where no cause of the catalogue explains anything.
+        """
+        if self.names and not compares_phases(self.nominal):
+            return False
         strongest, here = terms.strongest_forces(self.nominal) if self.laws else {}, frozenset(self.active)
         if not strongest or here in self.proposed or len(self.terms) > 1:
             return False
