@@ -48,7 +48,6 @@ def test_nothing_is_found_where_nothing_is():
     assert diagnosis.overall == result.NO_EFFECT
     assert not diagnosis.theta
     assert not diagnosis.events
-    assert not diagnosis.duplicates
     assert {f.verdict for f in diagnosis.findings} <= {result.BOUNDED, result.NOT_IDENTIFIABLE}
     assert len(diagnosis.findings) == len(EFFECTS)
 
@@ -214,15 +213,6 @@ def test_flights_disagree_by_more_than_form_and_noise():
     assert verdict(far) == (None,)
     assert verdict(far, share=2.0) is None
     assert verdict(np.where(np.arange(8) == 3, 25.0, 0.0)) == (3,)
-
-
-def test_a_copied_flight_counts_once():
-    model = world(truth={"effect_03": 10.0})
-    single = search.explain(model, laws=False)
-    model._windows += [replace(w, flight=w.flight + 100, time=w.time + 5.0) for w in model._windows]
-    double = search.explain(model, laws=False)
-    assert double.duplicates == {flight + 100: flight for flight in range(6)}
-    assert double["effect_03"].sd == pytest.approx(single["effect_03"].sd, rel=1e-3)
 
 
 def test_commands_of_other_flights_are_inconsistent_data():

@@ -312,42 +312,32 @@ class WindowStatistics(Share):
     latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
 
 
-def gather(
-    grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray, weights: Mapping[int, float] | None = None
-) -> Statistics:
+def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
     """Add up windows by flight.
 
     Args:
         grams: of the windows.
         parts: of the windows.
         theta: linearisation point in floors, shape (K,).
-        weights: flight -> weight; flights not named count 1, flights of weight 0 are left out.
 
     Raises:
-        DiagnoseError: No flight is left, or information came out negative beyond rounding.
+        DiagnoseError: Information came out negative beyond rounding.
     """
-    weights = weights or {}
-    flights = [f for f in sorted({gram.flight for gram in grams}) if weights.get(f, 1.0) > 0.0]
-    if not flights:
-        raise DiagnoseError("no flight is left to look at")
-    size = len(theta)
-    information, score = np.zeros((len(flights), size, size)), np.zeros((len(flights), size))
-    square, samples = np.zeros(len(flights)), np.zeros(len(flights))
-    at = {flight: i for i, flight in enumerate(flights)}
-    for gram, part in zip(grams, parts):
-        if gram.flight in at:
-            i, w = at[gram.flight], weights.get(gram.flight, 1.0)
-            information[i] += w * part.information
-            score[i] += w * part.score
-            square[i] += w * part.square
-            samples[i] += w * gram.count.sum()
+    flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
+    size, count = len(theta), len(flights)
+    information, score, square, samples = (np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ()))
+    for i, gram, part in zip(row, grams, parts):
+        information[i] += part.information
+        score[i] += part.score
+        square[i] += part.square
+        samples[i] += gram.count.sum()
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
     lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
     if lowest < -1e-5:
         raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
     if lowest < 0.0:  # rounding, which wide priors of several named effects would turn into evidence
         information += (-2.0 * lowest / len(flights)) * np.diag(scale**-2.0)
-    return Statistics(np.array(flights), information, score, square, samples, np.array(theta, dtype=float))
+    return Statistics(flights, information, score, square, samples, np.array(theta, dtype=float))
 
 
 def rescored(known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:

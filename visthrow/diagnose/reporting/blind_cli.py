@@ -27,12 +27,12 @@ def run(args: argparse.Namespace) -> int:
 
     from visthrow.common.errors import DiagnoseError
     from visthrow.common.storage import atomic_write, write_json
-    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.reporting import blind, pictures
-    from visthrow.diagnose.select import search
+    from visthrow.diagnose.reporting.explain_cli import explained
 
-    model, _ = opening.open_model(args)
-    diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without), laws=False)
+    model, logs = opening.open_model(args)
+    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without), laws=False)
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     hidden = blind.hide(diagnosis, seed=args.seed)

@@ -53,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
-def explained(model, logs, known, seed: int = 0, without: Sequence[int] = (), say: Callable[[str], None] = lambda _: None) -> Diagnosis:
+def explained(
+    model, logs, known, seed: int = 0, without: Sequence[int] = (), say: Callable[[str], None] = lambda _: None, *, laws: bool = True
+) -> Diagnosis:
     """Leave out what contradicts itself, or repeats another log, and search for causes in the rest.
 
     Args:
@@ -63,6 +65,7 @@ def explained(model, logs, known, seed: int = 0, without: Sequence[int] = (), sa
         seed: of the null worlds.
         without: flights to leave out.
         say: is told each step in a line.
+        laws: see :func:`visthrow.diagnose.select.search.explain`.
     """
     from visthrow.diagnose.check.run import check, contradictions, copies
     from visthrow.diagnose.select import search
@@ -76,10 +79,11 @@ def explained(model, logs, known, seed: int = 0, without: Sequence[int] = (), sa
     reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in doubled]
     for reason in reasons:
         say(f"  left out: {reason}")
-    found = search.explain(model, seed=seed, without=(*without, *spoiled, *doubled), progress=lambda line: say(f"  {line}"))
+    left_out = (*without, *spoiled, *doubled)
+    found = search.explain(model, seed=seed, without=left_out, laws=laws, progress=lambda line: say(f"  {line}"))
     noted = [f"{one.name}: {row.text}" for one in checked for row in one.rows if (row.topic, row.verdict) == ("thrust", "warn")]
     told = (*found.reasons, *(f"left out: {reason}" for reason in reasons), *(f"check: {text}" for text in noted))
-    return replace(found, reasons=told, duplicates={**doubled, **found.duplicates})
+    return replace(found, reasons=told, duplicates=doubled)
 
 
 def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float, float]]:

@@ -36,11 +36,11 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.planning import design, excitation, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
     from visthrow.diagnose.reporting import pictures, report
-    from visthrow.diagnose.select import search
+    from visthrow.diagnose.reporting.explain_cli import explained
 
-    model, _ = opening.open_model(args)
+    model, logs = opening.open_model(args)
     limits = _limits(args)
-    diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without), laws=False)
+    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without), laws=False)
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")

@@ -57,7 +57,7 @@ class Crossed:
 
 
 def select(
-    information: np.ndarray, score: np.ndarray, priors: Priors, least: float, most: int = MOST_NAMES, begin: Sequence[int] = ()
+    information: np.ndarray, score: np.ndarray, priors: Priors, least: float, begin: Sequence[int] = ()
 ) -> list[int]:
     """Forward search with backward elimination by the statistics alone.
 
@@ -66,11 +66,10 @@ def select(
         score: about 0, shape (K,).
         priors: of the effects.
         least: threshold [nats].
-        most: names.
         begin: a set to begin from; causes that hide each other are not found one by one.
     """
     active = _without_idle(information, score, priors, least, list(begin))
-    while len(active) < most:
+    while len(active) < MOST_NAMES:
         gain = additions(information, score, priors, active)
         best = int(np.argmax(gain))
         if gain[best] <= least:

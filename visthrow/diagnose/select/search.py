@@ -13,7 +13,6 @@ from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import held_out
-from visthrow.diagnose.select.copies import repeated_flights
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.select.selector import Selector
@@ -47,10 +46,8 @@ def explain(
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
     simulated = each(finite, windows)
-    duplicates = repeated_flights(windows)
-    left_out = {*without, *duplicates}
-    kept = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in left_out)
-    if len(kept) < 0.5 * sum(w.flight not in left_out for w in windows) or not kept:
+    kept = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in without)
+    if len(kept) < 0.5 * sum(w.flight not in without for w in windows) or not kept:
         return out_of_domain(model, windows, sum(simulated), seed)
     problem = Problem.of(model, windows, kept)
     priors = problem.priors
@@ -74,7 +71,7 @@ def explain(
             search = Selector(problem, nominal, least, say, laws)
         search.run()
     diagnosis = held_out.judged(conclude(search))
-    return replace(diagnosis, duplicates=duplicates, seconds=time.monotonic() - begun, seed=seed)
+    return replace(diagnosis, seconds=time.monotonic() - begun, seed=seed)
 
 
 def put_right(
