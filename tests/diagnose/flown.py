@@ -19,7 +19,7 @@ def attitude(time: np.ndarray) -> Rotation:
 
 
 def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slope=0.0, noise=2e-4, seed=0, *, wind=0.0, late=0.0,
-        fade=0.0) -> FlightLog:  # fmt: skip
+        fade=0.0, swirl=0.0, beat=0.0) -> FlightLog:  # fmt: skip
     """A vehicle with an attitude of closed form and motors that hold it up; equations and integrator of the test's own."""
     rng = np.random.default_rng(seed)
     mass, payload, step = 0.03, 0.008, 0.005
@@ -36,6 +36,7 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
         p, v, thrust = state[:3], state[3:6], state[6]
         body = rot[i].T @ (v - [wind, 0.0, 0.0])
         force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [0, 0, mass * G]
+        force = force + [swirl * v[1], beat * np.sin(4.5 * half[i]) - swirl * v[0], 0.0]
         lag = [(told[i] - thrust) / 0.03]
         if cable is None:
             return np.concatenate([v, force / mass, lag])

@@ -1,6 +1,7 @@
 """The small models against physics of another hand: scipy's integrator, closed forms, and planted parameters found again."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -167,6 +168,45 @@ class TestFlyer:
         assert np.sqrt(np.mean(residual**2)) == pytest.approx(2e-4, rel=0.1)  # the noise
         wrong = np.concatenate(model.residuals({}))
         assert np.sqrt(np.mean(wrong**2)) > 1e-3
+
+    @pytest.mark.parametrize("phase", [0.0, 0.003, 0.0085])
+    def test_held_commands_pass_the_motors_lag_exactly(self, phase):
+        """Closed form: thrust falls to each command by itself, wherever in a step of the integration that one comes."""
+        rng, fine, tau, mass = np.random.default_rng(3), 1e-4, 0.03, 0.03
+        params = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0), mass=mass, motor_time_constant=tau)
+        time = np.arange(0.0, 4.0, fine)
+        sent = np.arange(-phase, 4.0, 0.01)
+        told = mass * FLYER.gravity * (1.0 + 0.3 * rng.normal(size=len(sent)))
+        thrust = np.empty(len(time))
+        thrust[0], held = told[0], told[np.searchsorted(sent, time, "right") - 1]
+        for i in range(1, len(time)):
+            thrust[i] = held[i - 1] + (thrust[i - 1] - held[i - 1]) * np.exp(-fine / tau)
+        speed = np.concatenate([[0.0], np.cumsum(0.5 * (thrust[1:] + thrust[:-1]) / mass - FLYER.gravity) * fine])
+        height = 5.0 + np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * fine])
+        seen, zero = time[::100], np.zeros(len(time[::100]))
+        log = FlightLog({
+            "pos_w": Channel(seen, np.column_stack([zero, zero, height[::100]]), "m", "world"),
+            "quat_wb": Channel(seen, np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1)), "1", "world"),
+            "thrust_command": Channel(sent, told[:, None], "N"),
+        })  # fmt: skip
+        assert np.abs(np.concatenate(FlyerModel([log], params).residuals({}))).max() < 1e-4  # motion capture has more noise
+
+    def test_a_law_is_looked_for(self):
+        logs = [fly(6.0, swirl=0.008, seed=i) for i in range(3)]
+        diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        assert diagnosis.overall == "UNKNOWN"
+        assert not diagnosis.theta
+        assert diagnosis.laws[0].vector == "axis_cross_vel"
+
+    def test_what_neither_name_nor_law_explains_is_told(self):
+        logs = [fly(6.0, beat=0.01, seed=i) for i in range(3)]
+        diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)), laws=False)
+        assert diagnosis.overall in ("UNKNOWN", "EXPLAINED IN PART")
+        assert any("noise alone" in reason for reason in diagnosis.reasons)
+
+    def test_nothing_is_told_where_nothing_is(self):
+        diagnosis = search.explain(FlyerModel([fly(6.0, seed=i) for i in range(3)], replace(FLYER, command_delay=LATE)))
+        assert diagnosis.overall == "NO EFFECT"
 
     @pytest.mark.slow
     def test_gain_drag_and_battery_are_found(self):

@@ -19,6 +19,7 @@ from visthrow.diagnose.models.numeric import (
     latent_force,
     latent_layout,
     sigma_of,
+    triangles,
 )
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
@@ -103,6 +104,12 @@ class BallModel(NumericModel):
 
         step = self._span[lanes.owner, None] / STEPS * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance.copy(), STEPS, step)
+
+    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
+        """See the base class; a law's coefficient is that of a ball of 1 kg."""
+        time = np.unique(stretch.latent_time)
+        known = triangles(time, np.linspace(time[0], time[-1], STEPS + 1)) @ path
+        return {"time": time, "payload_pos_w": known[:, :3], "payload_vel_w": known[:, 3:]}
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""

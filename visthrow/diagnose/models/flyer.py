@@ -7,6 +7,7 @@ flies; where each motor's command is logged, the rates follow too. No controller
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -61,20 +62,28 @@ class FlyerModel(NumericModel):
         return lanes.theta[:, self._names[name]] if name in self._names else np.zeros(len(lanes.owner))
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
-        """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): exact for commands that are held."""
+        """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): of held commands through a lag.
+
+        In the middle of a step stands what makes Simpson's rule, and so the integration, give the step's own mean: commands switch there.
+        """
         p, fine = self.params, self.params.step / FINE
         delay, tau = p.command_delay + self._theta(lanes, "cmd_delay"), p.motor_time_constant + self._theta(lanes, "motor_tau")
         tau = np.maximum(tau, SHORTEST)
         at = (p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay) / fine  # tables begin one window early
         left = np.clip(at.astype(int), 0, self._told.shape[1] - 1)
-        share, out = (at - left)[..., None], np.empty((*at.shape, self._told.shape[2]))
+        share, out = (at - left)[..., None], np.empty((2, *at.shape, self._told.shape[2]))
         for own in np.unique(tau):
             keep, lanes_ = np.exp(-fine / own), np.flatnonzero(tau == own)
             after, _ = lfilter([1.0 - keep], [1.0, -keep], self._told, 1, keep * self._told[:, :1])
             thrust = np.concatenate([self._told[:, :1], after], 1)
-            which, rows = lanes.owner[lanes_], left[:, lanes_]
-            out[:, lanes_] = thrust[which, rows] + share[:, lanes_] * (thrust[which, rows + 1] - thrust[which, rows])
-        return out
+            whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
+            which, rows, part = lanes.owner[lanes_], left[:, lanes_], share[:, lanes_]
+            begin, rise = thrust[which, rows], thrust[which, rows + 1] - thrust[which, rows]
+            out[:, :, lanes_] = begin + part * rise, whole[which, rows] + part * (begin + 0.5 * part * rise)
+        thrust, whole = out
+        mean = np.diff(whole[::2], axis=0) * (fine / p.step)
+        thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
+        return thrust
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class.

@@ -246,8 +246,11 @@ class Selector(SearchState):
     def _believed(self, move: Move) -> bool:
         """Whether the new names of a set could be named: two at once if they leave nothing to explain.
 
-        Where a law is missing that the catalogue lacks, pairs that hide each other take a part of it each.
+        Where a law is missing that the catalogue lacks, pairs that hide each other take a part of it each. Without a calm phase to
+        compare with, a vehicle that is a little off in many ways asks for a law beside its names: there one stands in place of all.
         """
+        if 0 < sum(map(self.is_term, move.active)) < len(move.active) and not compares_phases(self.nominal):
+            return False
         new = [j for j in move.active if j not in self.active]
         if not all(self.stands(move.point, move.active, j) for j in new):
             return False
@@ -353,13 +356,7 @@ class Selector(SearchState):
         return True
 
     def _propose(self) -> bool:
-        """Make the terms that say most candidates, beside the set and instead of its names; False where that brings no new one.
-
-        Without a calm phase to compare with, a vehicle that is a little off in many ways asks for a law as well as one that has one: there
-        terms are asked for where no cause of the catalogue explains anything.
-        """
-        if self.names and not compares_phases(self.nominal):
-            return False
+        """Make the terms that say most candidates, beside the set and instead of its names; False where that brings no new one."""
         strongest, here = terms.strongest_forces(self.nominal) if self.laws else {}, frozenset(self.active)
         if not strongest or here in self.proposed or len(self.terms) > 1:
             return False
