@@ -8,6 +8,7 @@ import pytest
 from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.check.signals import highpass_sigma
 from visthrow.diagnose.likelihood import designs, marginal, noise
 from visthrow.diagnose.likelihood import stack as stacks
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -240,7 +241,7 @@ def test_highpass_sigma_sees_noise_and_neither_motion_nor_outliers():
     t = np.arange(2000) / 200.0
     signal = np.sin(3.0 * t)[:, None] + rng.normal(0.0, 5e-4, (2000, 2))
     signal[::97] += 0.05
-    np.testing.assert_allclose(noise.highpass_sigma(signal), 5e-4, rtol=0.1)
+    np.testing.assert_allclose(highpass_sigma(signal), 5e-4, rtol=0.1)
 
 
 @pytest.mark.parametrize("device", ["cpu", "cpu:0"])

@@ -332,10 +332,6 @@ def test_additions_are_differences_of_the_evidence():
     np.testing.assert_array_equal(np.isinf(pairs).sum(1), [3, 3, 8, 3, 3, 3, 8, 3])  # itself, the one named, the one not visible
     for i, j in ((0, 5), (7, 1)):
         assert pairs[i, j] == pytest.approx(evidence.log_evidence(information, score, free, [2, i, j]) - base, abs=1e-8)
-    sets = [(1, 3, 4), (7, 2, 0)]
-    bare = evidence.log_evidence(information, score, priors, [])
-    for own, nats in zip(sets, evidence.set_additions(information, score, priors, [], sets)):
-        assert nats == pytest.approx(evidence.log_evidence(information, score, priors, own) - bare, abs=1e-8)
 
 
 def test_evidence_is_the_integral():

@@ -6,6 +6,7 @@ from visthrow.common.rotations import continuous
 from visthrow.logs.check.rows import Row
 from visthrow.logs.flightlog import Channel, FlightLog
 
+MAD_TO_SIGMA = 1.4826
 FEW_SAMPLES = 20
 FEW_STEPS, SLOW_PERIOD = 5, 0.5
 """Values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice."""
@@ -30,26 +31,37 @@ _ASKED = ("setpoint", "command", "action", "observation", "goal", "keypoints", "
 _STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm", "motor_speed")
 
 
-def noise(channel: Channel) -> np.ndarray:
-    """Standard deviation of the sensor's noise, from third differences of evenly spaced samples.
+def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
 
     Third differences of a motion that is smooth over four samples vanish; those of white noise have 20 times its variance.
-    The median of their size ignores what is rare.
+
+    Args:
+        values: evenly sampled, shape (T,) or (T, D), T >= 4.
+        good: which third differences count.
+
+    Returns:
+        Sigma in the values' unit, shape () or (D,).
+
+    Source: Rousseeuw and Croux 1993 for the median absolute deviation.
+    """
+    third = np.diff(np.asarray(values, dtype=float), n=3, axis=0)[good]
+    return MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
+
+
+def noise(channel: Channel) -> np.ndarray:
+    """Standard deviation of the sensor's noise, from third differences of evenly spaced samples.
 
     Returns:
         One value a component, in the channel's unit; NaN where there are too few samples.
     """
     values = channel.values.reshape(len(channel.values), -1).astype(float)
-    if len(values) < FEW_SAMPLES:
-        return np.full(values.shape[1], np.nan)
-    period = np.median(np.diff(channel.time))
-    even = np.abs(np.diff(channel.time) - period) < 0.5 * period
+    steps = np.diff(channel.time)
+    even = np.abs(steps - np.median(steps)) < 0.5 * np.median(steps) if len(steps) else steps > 0.0
     good = channel.valid[:-3] & channel.valid[3:] & even[:-2] & even[1:-1] & even[2:]
-    third = np.diff(values, 3, axis=0)[good]
-    if len(third) < FEW_SAMPLES:
+    if len(values) < FEW_SAMPLES or np.sum(good) < FEW_SAMPLES:
         return np.full(values.shape[1], np.nan)
-    spread = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20.0)
-    return np.maximum(spread, _resolution(values) / np.sqrt(12.0))
+    return np.maximum(highpass_sigma(values, good), _resolution(values) / np.sqrt(12.0))
 
 
 def _resolution(values: np.ndarray) -> np.ndarray:

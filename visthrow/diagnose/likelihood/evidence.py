@@ -139,47 +139,27 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
     return np.where(out, -np.inf, gain)
 
 
-def set_additions(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...], sets: np.ndarray
-) -> np.ndarray:
-    """Gain of log Z by naming several more effects at once, for each of some sets of m: a change of m priors has rank m.
-
-    Args:
-        information: shape (K, K).
-        score: shape (K,).
-        priors: of the effects.
-        active: named already.
-        sets: effects that are not, shape (n, m).
-
-    Returns:
-        Nats, shape (n,).
-    """
-    sets = np.asarray(sets, dtype=int)
-    sigma = covariance(information, priors.deviation(active))
-    mean, diagonal = (score @ sigma)[sets], np.eye(sets.shape[1])
-    change = (priors.slab**-2.0 - SPIKE**-2.0)[sets]
-    own = sigma[sets[:, :, None], sets[:, None]]
-    taken = np.linalg.inv(own + diagonal / change[:, None])
-    wide_mean = mean - (own @ taken @ mean[..., None])[..., 0]
-    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
-    gain = -np.log(priors.slab / SPIKE)[sets].sum(1) - 0.5 * np.linalg.slogdet(diagonal + change[..., None] * own)[1]
-    gain -= 0.5 * np.einsum("pi,pij,pj->p", mean, taken, mean)
-    low, high, slab = priors.low[sets], priors.high[sets], priors.slab[sets]
-    return gain + (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
-
-
 def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
-    """The same for each two effects: of two that hide each other, neither shows alone.
+    """The same for each two effects, a change of two priors: of two that hide each other, neither shows alone.
 
     Returns:
         Nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
     """
-    size = len(score)
-    first, second = np.divmod(np.arange(size * size), size)
-    gain = set_additions(information, score, priors, active, np.stack((first, second), axis=1))
+    size, diagonal = len(score), np.eye(2)
+    pairs = np.stack(np.divmod(np.arange(size * size), size), axis=1)
+    sigma = covariance(information, priors.deviation(active))
+    mean, change = (score @ sigma)[pairs], (priors.slab**-2.0 - SPIKE**-2.0)[pairs]
+    own = sigma[pairs[:, :, None], pairs[:, None]]
+    taken = np.linalg.inv(own + diagonal / change[:, None])
+    wide_mean = mean - (own @ taken @ mean[..., None])[..., 0]
+    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
+    gain = -np.log(priors.slab / SPIKE)[pairs].sum(1) - 0.5 * np.linalg.slogdet(diagonal + change[..., None] * own)[1]
+    gain -= 0.5 * np.einsum("pi,pij,pj->p", mean, taken, mean)
+    low, high, slab = priors.low[pairs], priors.high[pairs], priors.slab[pairs]
+    gain += (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
     out = ~priors.visible
     out[list(active)] = True
-    gain[out[first] | out[second] | (first == second)] = -np.inf
+    gain[out[pairs].any(1) | (pairs[:, 0] == pairs[:, 1])] = -np.inf
     return gain.reshape(size, size)
 
 

@@ -68,10 +68,6 @@ class Factor:
     needs: tuple[str, ...]  # keys of Window.knots
     read: Callable[[Known], np.ndarray]  # (k,) for a scalar, (k, 3) for a vector, in the block's frame
 
-    def values(self, knots: Knots) -> np.ndarray:
-        """The factor at the knots, shape (k,) or (k, 3)."""
-        return self.read(knots if isinstance(knots, Known) else Known(knots))
-
 
 @dataclass(frozen=True)
 class Term:
@@ -99,10 +95,6 @@ class Term:
         symbols = [SCALARS[f].symbol for f in self.factors] + [VECTORS[self.block][self.vector].symbol]
         left = {"vehicle force": "F", "vehicle torque": "M", "payload force": "F_p", JOINT: "M_j"}[self.block]
         return f"{left} = c {' '.join(symbols)}"
-
-    def values(self, knots: Knots) -> np.ndarray:
-        """The term without its coefficient at the knots, shape (k, 3), in the frame of its block."""
-        return table_of([self], knots)[:, :, 0]
 
 
 def rotate(knots: Knots, vector_b: np.ndarray) -> np.ndarray:
@@ -302,11 +294,6 @@ class Layout:
         return values
 
 
-def table_of(terms_: Sequence[Term], knots: Knots) -> np.ndarray:
-    """Values of many terms of one block, shape (k, 3, terms)."""
-    return Layout.of(terms_).table(knots)
-
-
 def acting(block: str) -> tuple[str, ...]:
     """Latent blocks that terms of a block act in."""
     return LATENT_BLOCKS if block == JOINT else (block,)
@@ -347,28 +334,6 @@ def between(count: int) -> np.ndarray:
     hats = np.maximum(1.0 - np.abs(fine[:, None] - np.arange(count)), 0.0)
     curve = CubicSpline(np.arange(count), np.eye(count), bc_type="natural")(fine)
     return np.linalg.lstsq(hats, curve, rcond=None)[0]
-
-
-def coefficients(latent_block: np.ndarray, latent_axis: np.ndarray, latent_time: np.ndarray, time: np.ndarray, block: str,
-                 values: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Latent-force coefficients that a term stands for.
-
-    Args:
-        latent_block: of each coefficient, shape (L,).
-        latent_axis: shape (L,).
-        latent_time: of each coefficient's knot [s], shape (L,).
-        time: of the knots that ``values`` belong to [s], shape (k,).
-        block: of the terms.
-        values: shape (k, 3, T).
-
-    Returns:
-        Shape (L, T); 0 for other blocks.
-    """
-    out = np.zeros((len(latent_block), values.shape[2]))
-    of_block = np.flatnonzero(np.asarray(latent_block) == LATENT_BLOCKS.index(block))
-    at = np.abs(latent_time[of_block, None] - time).argmin(axis=1)
-    out[of_block] = values[at, np.asarray(latent_axis, dtype=int)[of_block]]
-    return out
 
 
 def through_latents(window: Window, known: Known, block: str) -> np.ndarray:

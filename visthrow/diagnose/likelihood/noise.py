@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
+from visthrow.diagnose.check.signals import MAD_TO_SIGMA
 from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood.marginal import TAIL, Gram, Noise, hidden_gram, without_effects
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-
-MAD_TO_SIGMA = 1.4826
-THIRD_DIFFERENCE = np.sqrt(20.0)
-"""Deviation of a third difference of white noise, in sigmas: the root of 1 + 9 + 9 + 1."""
 
 CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
 """Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""
@@ -58,24 +55,6 @@ LONGEST_FALL = 1.0
 HALVINGS = 8
 STALLED = 1e-9
 """Of the step: limits and levels count as met within this."""
-
-
-def highpass_sigma(values: np.ndarray) -> np.ndarray:
-    """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
-
-    Third differences remove motion up to second order within four samples; their median absolute deviation is scaled to a
-    normal distribution's sigma.
-
-    Args:
-        values: evenly sampled, shape (T,) or (T, D), T >= 4.
-
-    Returns:
-        Sigma in the values' unit, shape () or (D,).
-
-    Source: diagnosis by high-pass differences; Rousseeuw and Croux 1993 for the median absolute deviation.
-    """
-    third = np.diff(np.asarray(values, dtype=float), n=3, axis=0)
-    return MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / THIRD_DIFFERENCE
 
 
 def fit(

@@ -47,8 +47,7 @@ class FlyerModel(NumericModel):
         self.steps = round(params.window / params.step)
         self._names = {effect.name: i for i, effect in enumerate(self.effects)}
         self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3), some before the start
-        inputs = np.array([s.data["input"] for s in stretches])  # (S, fine steps, motors)
-        self._told = sum(c * inputs**power for power, c in enumerate(params.thrust_map))  # [N]
+        self._told = params.thrust(np.array([s.data["input"] for s in stretches]))  # [N], (S, fine steps, motors)
         self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
         self._since = np.array([s.data["since"] for s in stretches])  # [s], shape (S,)
         self._spare = spare(params.step)

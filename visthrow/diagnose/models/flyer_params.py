@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from visthrow.common.errors import ConfigError
 
 
@@ -53,6 +55,10 @@ class FlyerParams:
     estimator_rate: float = 1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
     torque: TorqueParams | None = None  # None: rates are not simulated
     cable: CableParams | None = None  # None: no payload
+
+    def thrust(self, told: np.ndarray) -> np.ndarray:
+        """What the map gives for inputs [N]."""
+        return sum(c * told**power for power, c in enumerate(self.thrust_map))
 
     def __post_init__(self) -> None:
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):

@@ -7,11 +7,10 @@ from scipy.signal import lfilter
 
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
-from visthrow.common.rotations import continuous, matrix_of_quat
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.check.physics import valid
-from visthrow.logs.check.relations import mean_over, on_grid, rates_of
+from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FINE = 16
@@ -57,7 +56,7 @@ def _expect_thrust(found: Sequence[Stretch], params: FlyerParams) -> None:
     """Refuse commands of another unit: they carry neither the vehicle nor anything like it."""
     weight = params.gravity * (params.mass + (params.cable.mass if params.cable is not None else 0.0))
     told = np.concatenate([s.data["input"] for s in found])
-    ratio = float(np.median(sum(c * told**power for power, c in enumerate(params.thrust_map)).sum(axis=1))) / weight
+    ratio = float(np.median(params.thrust(told).sum(axis=1))) / weight
     if ratio > _MOST_THRUST:
         raise LogError(
             f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the weight of {weight:.3g} N: "
@@ -99,7 +98,7 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
     if np.min(rows[0][1][:, 2]) < params.lowest:
         return None
     inputs = _inputs(log[params.input], params, start)
-    thrust = sum(c * inputs**power for power, c in enumerate(params.thrust_map)).sum(axis=1)
+    thrust = params.thrust(inputs).sum(axis=1)
     if np.min(thrust[len(thrust) // 2 :]) < _IDLE * params.mass * params.gravity:
         return None
     margin = spare(params.step)
@@ -140,11 +139,10 @@ def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
 
 
 def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
-    """Rotations at the half steps, shape (half steps, 3, 3): quaternions interpolated and brought to unit length."""
-    time, quat = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    """Rotations at the half steps, shape (half steps, 3, 3)."""
+    time, quat = valid(channel)
     near = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
-    time, quat = time[near], continuous(quat[near])
-    return matrix_of_quat(np.column_stack([np.interp(times, time, column) for column in quat.T]))
+    return attitude_at(time[near], quat[near], times).as_matrix()
 
 
 def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:

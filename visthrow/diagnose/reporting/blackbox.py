@@ -61,8 +61,8 @@ class Table:
                 if block != "vehicle torque" and "quat_wb" in window.knots:
                     direction = grammar.rotate(window.knots, direction)
                 values[:, :, axis * count : (axis + 1) * count] = direction[:, :, None] * basis[:, None, :]
-            parts.append(grammar.coefficients(window.latent_block, window.latent_axis, window.latent_time,
-                                              window.knots["time"], block, values))  # fmt: skip
+            through = grammar.through_latents(window, grammar.Known(window.knots), block)
+            parts.append(through @ values.reshape(through.shape[1], -1))
         return np.hstack(parts)
 
 

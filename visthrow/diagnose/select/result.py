@@ -94,11 +94,6 @@ class Law:
     unit: str
     nats: float  # of evidence, less the log of the number of terms tried
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the coefficient."""
-        return self.coefficient - 1.96 * self.sd, self.coefficient + 1.96 * self.sd
-
 
 @dataclass(frozen=True)
 class ChannelGain:

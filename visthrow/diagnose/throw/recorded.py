@@ -7,7 +7,7 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
-from visthrow.diagnose.likelihood.noise import highpass_sigma
+from visthrow.diagnose.check.signals import highpass_sigma
 from visthrow.logs.check.relations import attitude_at
 from visthrow.logs.flightlog import Channel, FlightLog
 
