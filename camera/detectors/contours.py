@@ -31,6 +31,9 @@ from camera.keypoints import GOAL_KEYPOINTS, PAYLOAD_KEYPOINTS, KeypointCamera, 
 ABOVE = 0.5
 """Share of the ball's colour, as it is where the ball is expected, that a ground of its hue may have."""
 
+GATE = 4.0
+"""Standard deviations about each axis of where a thing is expected, within which it is looked for."""
+
 DISTANCE_ERROR = 0.15
 """Of a ball's distance by the size of its cone, a far and blurred one [-]."""
 
@@ -83,9 +86,9 @@ class Known:
     height: float | None = None  # of the lens above the ground [m]; with up_c the goal's size is checked
     ball_distance: tuple[float, float] | None = None  # of the ball from the lens [m], narrower than the parameters'
     ball_ray_c: np.ndarray | None = None  # to where the ball is expected, unit, shape (3,)
-    ball_within: float = math.radians(12.0)  # of ball_ray_c [rad]
+    ball_within: float = math.radians(12.0)  # of ball_ray_c, `GATE` standard deviations [rad]
     goal_ray_c: np.ndarray | None = None  # to where the goal's middle is expected, unit, shape (3,)
-    goal_within: float = math.radians(12.0)  # of goal_ray_c [rad]
+    goal_within: float = math.radians(12.0)  # of goal_ray_c, likewise [rad]
     north_c: np.ndarray | None = None  # the world's x in the camera frame, unit, shape (3,)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from camera.detectors.contours import BallSeen, Known, Seen
+from camera.detectors.contours import GATE, BallSeen, Known, Seen
 
 READ = 0.01
 """Of a direction in the world, about each axis: of the attitude, with which a detection is turned there, and of the detection [rad]."""
@@ -26,9 +26,6 @@ THRUST = 14.0
 
 STILL = 0.05, 0.2
 """Of a ball that is said to hang still: direction [rad] and its rate [rad/s]."""
-
-GATE = 4.0
-"""Standard deviations of a prediction within which a thing is looked for."""
 
 LOST = 0.04
 """Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by as much in a frame of a throw, and of
@@ -101,10 +98,11 @@ class Following:
         rays = {} if seen.ball is None else {"ball": seen.ball.ray_c}
         rays |= {} if seen.goal is None else {"goal": _unit(seen.goal.rays_c.mean(0))}
         for name, ray_c in rays.items():
-            if name in self._tracks:
-                self._tracks[name].see(rot_wc @ ray_c)
+            ray_w, track = rot_wc @ ray_c, self._tracks.get(name)
+            if track is not None and ray_w @ track.ray_w > math.cos(min(GATE * math.hypot(track.spread, READ), math.pi)):
+                track.see(ray_w)
             else:
-                self._tracks[name] = Track(rot_wc @ ray_c, stamp, READ, TURNS[name])
+                self._tracks[name] = Track(ray_w, stamp, READ, TURNS[name])
         if seen.ball is not None:
             self._half_angle = seen.ball.half_angle
         elif "ball" in self._tracks and self._tracks["ball"].spread < LOST:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from camera.detectors.contours import BallSeen, Detector, GoalSeen, Known, Seen
+from camera.detectors.contours import GATE, BallSeen, Detector, GoalSeen, Known, Seen
 from camera.fisheye import Fisheye
 
 SHIPPED = Path(__file__).parent / "learnt.npz"
@@ -221,24 +221,26 @@ class LearntDetector(Detector):
         return None
 
     def _best_goal(self, probability: Tensor, things: Tensor, known: Known) -> GoalSeen | None:
-        probability = self._expected_there(probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within)
-        for i in probability.argsort(descending=True).tolist():
-            rays = things[i].double().numpy()
-            if probability[i] >= LEAST_PROBABILITY and self._right_size(rays, known):
-                return GoalSeen(rays, float(probability[i]))
+        raised = self._expected_there(probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within)
+        # Another square is mistaken for the goal in one frame as in the next: where it was seen does not choose between two sure ones.
+        for odds in (probability, raised):
+            for i in odds.argsort(descending=True).tolist():
+                rays = things[i].double().numpy()
+                if odds[i] >= LEAST_PROBABILITY and self._right_size(rays, known):
+                    return GoalSeen(rays, float(odds[i]))
         return None
 
     def _expected_there(self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float) -> Tensor:
         """Probabilities where it is known about where the thing is; the networks' own are of a thing that can be anywhere in view.
 
-        Bayes' rule: the odds grow by the share of the view's solid angle that is left, and vanish outside of it.
+        Bayes' rule: the odds grow by the normal density of where it is expected over the even one in the view's solid angle.
         """
         if expected_c is None:
             return probability
-        cap, view = (1.0 - math.cos(angle) for angle in (within, self.lens.params.half_fov))
-        odds = probability / (1.0 - probability).clamp(min=1e-6) * max(view / cap, 1.0)
-        there = rays @ torch.from_numpy(expected_c).float() >= math.cos(within)
-        return there * odds / (1.0 + odds)
+        cosine, variance = rays @ torch.from_numpy(expected_c).float(), (within / GATE) ** 2
+        likelier = (1.0 - math.cos(self.lens.params.half_fov)) / variance * (-0.5 / variance * cosine.clamp(-1.0, 1.0).acos() ** 2).exp()
+        odds = probability / (1.0 - probability).clamp(min=1e-6) * likelier
+        return odds / (1.0 + odds)
 
 
 def looked(

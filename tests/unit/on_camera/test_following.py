@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import BallSeen, GoalSeen, Known, Seen
-from camera.detectors.following import GATE, LOST, READ, Following
+from camera.detectors.contours import GATE, BallSeen, GoalSeen, Known, Seen
+from camera.detectors.following import LOST, READ, Following
 from camera.detectors.learnt import LearntDetector
 from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
@@ -114,16 +114,53 @@ def chosen(detector, probability, rays, known):
     return detector._best_ball(torch.tensor(probability), things, known)
 
 
-@pytest.mark.parametrize(("within_deg", "found"), [(12.0, True), (60.0, True), (100.0, False)])
-def test_what_is_known_of_a_place_counts_as_bayes_has_it(within_deg, found):
-    """Odds of 0.4 / 0.6 anywhere in a view of 220 deg: 0.98 within 12 deg, 0.64 within 60, 0.43 within 100."""
+def bayes(detector, probability, off, within):
+    spread = within / GATE
+    likelier = (1.0 - math.cos(detector.lens.params.half_fov)) / spread**2 * math.exp(-0.5 * (off / spread) ** 2)
+    odds = probability / (1.0 - probability) * likelier
+    return odds / (1.0 + odds)
+
+
+@pytest.fixture(scope="module")
+def learnt():
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
-    detector = LearntDetector(Fisheye(camera.fisheye), RADIUS, camera.goal_side)
-    here, there = np.array([0.0, 0.0, 1.0]), np.array([0.0, math.sin(2.5), math.cos(2.5)])
-    assert chosen(detector, [0.4], [here], Known()) is None
-    ball = chosen(detector, [0.45, 0.4], [there, here], Known(ball_ray_c=here, ball_within=math.radians(within_deg)))
-    assert (ball is not None) == found
-    if ball is not None:
-        np.testing.assert_allclose(ball.ray_c, here)
-        odds = 0.4 / 0.6 * (1.0 - math.cos(camera.fisheye.half_fov)) / (1.0 - math.cos(math.radians(within_deg)))
-        assert ball.score == pytest.approx(odds / (1.0 + odds), abs=1e-6)
+    return LearntDetector(Fisheye(camera.fisheye), RADIUS, camera.goal_side)
+
+
+def toward(angle):
+    return np.array([0.0, math.sin(angle), math.cos(angle)])
+
+
+def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
+    """A thing 25 deg from where the ball is expected to 7 deg is not it, though it looks likelier; seen in a throw on pictures."""
+    here, there, within = toward(0.0), toward(math.radians(25.0)), math.radians(28.0)
+    assert chosen(learnt, [0.4], [here], Known()) is None
+    ball = chosen(learnt, [0.66, 0.4], [there, here], Known(ball_ray_c=here, ball_within=within))
+    np.testing.assert_allclose(ball.ray_c, here)
+    assert ball.score == pytest.approx(bayes(learnt, 0.4, 0.0, within), abs=1e-6)
+    assert chosen(learnt, [0.66], [there], Known(ball_ray_c=here, ball_within=within)) is None
+    assert bayes(learnt, 0.66, math.radians(25.0), within) < 0.5
+
+
+def test_where_a_goal_was_seen_raises_a_faint_one_and_does_not_choose_between_sure_ones(learnt):
+    """A square of the goal's size and colour was taken for it in one frame: the likelier goal wins in the next."""
+    square = 0.05 * np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
+    rays = [square + toward(angle) for angle in (0.0, 0.8)]
+    things = torch.tensor(np.array([one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]), dtype=torch.float32)
+    known = Known(goal_ray_c=toward(0.8), goal_within=math.radians(10.0))
+    best = lambda *p: learnt._best_goal(torch.tensor(p), things, known)  # noqa: E731
+    np.testing.assert_allclose(best(0.9, 0.6).rays_c, things[0], atol=1e-6)
+    np.testing.assert_allclose(best(0.3, 0.2).rays_c, things[1], atol=1e-6)
+    assert learnt._best_goal(torch.tensor([0.3, 0.2]), things, Known()) is None
+
+
+def test_a_thing_that_is_seen_elsewhere_is_followed_anew():
+    rots, rays = throw(8)
+    following = Following(RADIUS, LENGTH * rays[0])
+    ball = lambda ray: BallSeen(ray, math.asin(RADIUS / LENGTH), 1.0)  # noqa: E731
+    for i, rot in enumerate(rots):
+        known = following.known(rot, rot[:, 2], 1.3, None, i * PERIOD)
+        at = toward(0.6) if i >= 4 else rot.T @ rays[0]
+        following.take(Seen(ball(at), None), rot, i * PERIOD)
+        if i >= 6:
+            assert math.acos(min(1.0, known.ball_ray_c @ at)) < known.ball_within
