@@ -22,9 +22,9 @@ from hil.links.mavlink_link import Link
 ASK = {msp.RC: 0.002, msp.STATUS: 0.1}
 """What the firmware is asked for, and how often [s]."""
 
-SAMPLES = 4
-"""Of the sensors in a period: 2000 a second for loops of 8 kHz. Of one sample a period, held for 2 ms, the firmware's D is a spike,
-and motors taken at the first loop after each sample miss 17 % of it and see the gyro 1.2 ms later."""
+SAMPLE = 0.0005
+"""Between two samples of the sensors [s]: 2000 a second for loops of 8 kHz. Of one sample in 2 ms, held so long, the firmware's D is a
+spike, and motors taken at the first loop after each sample miss 17 % of it and see the gyro 1.2 ms later."""
 
 SLOW = 0.01
 """Share of late periods above which the machine is too slow for real time."""
@@ -68,14 +68,15 @@ class BetaflightSitl(Fake):
         self.answered = 0
         self.cycles: list[int] = []
         self._outputs: list[np.ndarray] = []
+        self._samples = round(plant.period / SAMPLE)
         self._rate_b, self._sent = plant.rate_b, 0  # at the beginning of the last period; samples sent in this one
 
     def run_on(self, when: float) -> None:
         """See `Fake`: samples by the rates at the period's beginning and their last change."""
-        plant, step = self.plant, self.plant.period / SAMPLES
-        due = np.arange(self._sent, min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), SAMPLES))
+        plant, step = self.plant, self.plant.period / self._samples
+        due = np.arange(self._sent, min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), self._samples))
         if len(due):
-            rates_b = plant.rate_b + due[:, None] * ((plant.rate_b - self._rate_b) / SAMPLES)
+            rates_b = plant.rate_b + due[:, None] * ((plant.rate_b - self._rate_b) / self._samples)
             self._outputs.append(self.sensors.send(rates_b, plant.force_b, plant.quat_wb, step))
             self._sent += len(due)
 

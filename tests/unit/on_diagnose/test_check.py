@@ -80,6 +80,17 @@ def test_a_good_flight_has_nothing_wrong():
     assert delay.figures["delay_s"] == pytest.approx(DELAY, abs=0.003)
 
 
+def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
+    """Half of the time without a payload that was a third of the whole: beside a flight that keeps it its thrust carries the same mass."""
+    columns = flight()
+    gone = columns["time"] > 0.5 * columns["time"][-1]
+    lighter = {**columns, "command": columns["command"] * np.where(gone, 2.0 / 3.0, 1.0)[:, None]}
+    kept = log_of(flight(seed=1))
+    attached = Channel(columns["time"], ~gone, "bool")
+    told = [check([kept, log_of(lighter, **more)]) for more in ({"attached": attached}, {})]
+    assert [any("the thrust's scale differs" in row.text for one in found for row in one.rows) for found in told] == [False, True]
+
+
 def test_noise_is_measured_beside_motion():
     log = log_of(flight())
     assert noise(log["pos_w"]) == pytest.approx([3e-4] * 3, rel=0.15)

@@ -64,6 +64,8 @@ def mass_of(log: FlightLog, known: Known = NOTHING) -> float | None:
     _, time, thrust = told
     acc = relations.on_grid(*valid(log["acc_b"]), time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
+    if "attached" in log and np.any(carries := log["attached"].hold(time) > 0.5):  # without its payload it is another mass
+        flies &= carries
     mass = float(np.mean(thrust[flies]) / np.mean(acc[flies])) if np.any(flies) and np.mean(acc[flies]) > 0.0 else 0.0
     return mass if mass > 0.0 else None
 
