@@ -60,15 +60,16 @@ def kernels_factors():
 
 def test_factors_are_the_grammars():
     scalars, vectors, k = kernels_factors()
+    known = grammar.Known(k)
     assert set(scalars) == set(grammar.SCALARS)
     for name, factor in grammar.SCALARS.items():
-        assert scalars[name] == pytest.approx(factor.values(k)[0], rel=1e-12), name
+        assert scalars[name] == pytest.approx(factor.read(known)[0], rel=1e-12), name
     assert set(vectors) == set(BLOCKS) == set(grammar.VECTORS)
     for block, of in grammar.VECTORS.items():
         assert set(vectors[block]) == set(of), block
         for name, factor in of.items():
             found = vectors[block][name]
-            np.testing.assert_allclose(found, factor.values(k)[0], atol=1e-12, err_msg=f"{block} {name}")
+            np.testing.assert_allclose(found, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}")
     assert names() == (tuple(scalars), {block: tuple(of) for block, of in vectors.items()})
 
 
