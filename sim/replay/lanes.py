@@ -54,8 +54,7 @@ class Recording:
 
 _BUILDS: dict = {}
 
-PIECES, LANES = 4, 16
-"""Of many lanes, pieces for each core of a CPU; of few, lanes in a piece, at least one for each core: a launch costs 0.1 ms."""
+PIECES = 4  # of the lanes for each core of a CPU
 
 FEW = 32
 """Lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes some 50 times as long."""
@@ -184,8 +183,7 @@ class Replay:
         def launch(first: int, last: int) -> None:
             wp.launch(self.kernel.replay, last - first, [*before, begin + first, *after], device="cpu")
 
-        pieces = min(PIECES * cores(), max(cores(), len(costs) // LANES))
-        in_pieces(launch, _shared_out(costs, pieces), cores())
+        in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
 
     @staticmethod
     def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
