@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from sim.arrays import runtime  # noqa: F401  starts Warp
-from sim.arrays import state as st
-from sim.arrays.cores import cores, in_pieces
-from sim.arrays.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
-from sim.effects.laws import check_laws, structure
+from sim.cores import cores, in_pieces
+from sim.kernels import runtime  # noqa: F401  starts Warp
+from sim.kernels import state as st
+from sim.kernels.laws import check_laws, structure
+from sim.kernels.quadrotor.queue import queue_depth
+from sim.kernels.randomize import build_reset
+from sim.kernels.step import build_step
+from sim.kernels.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
-from sim.quadrotor.queue import queue_depth
-from sim.randomize import build_reset
-from sim.step import build_step
 
 PIECES = 8
 """Number of pieces of a batch for each core of a CPU: a core that has other work for a while leaves its pieces to the rest."""
@@ -96,8 +96,8 @@ class HybridSim:
     Attributes:
         command: [N, rad/s], shape (E,) of vec4: collective thrust and body rates of the next step.
         release: shape (E,), int: non-zero asks for the release; the latch keeps it.
-        state: arrays of :data:`sim.arrays.state.STATE_FIELDS`.
-        out: arrays of :data:`sim.arrays.state.OUTPUT_FIELDS`.
+        state: arrays of :data:`sim.kernels.state.STATE_FIELDS`.
+        out: arrays of :data:`sim.kernels.state.OUTPUT_FIELDS`.
         vehicles: parameters of environment e at ``e % len(vehicles)``.
         goal_w: [m], shape (E,) of vec3: goals that :meth:`randomize` draws.
     """
@@ -132,7 +132,7 @@ class HybridSim:
             releases: likewise; default ``[params.release]``.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
             motors: by-pass the rate controller: commands are motor-speed set-points [rad/s]; a firmware flies the vehicle.
-            extensions: of :data:`sim.arrays.structs.EXTENSIONS`, to build in besides those that the parameters need.
+            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
             threads: at most, of a CPU; default all its cores. The bits do not depend on it.
 

@@ -1,7 +1,7 @@
 """Physical parameters of the vehicle, the rope and the release: frozen dataclasses, SI units.
 
 Each dataclass mirrors one TOML file of ``configs/``. The equations that the fields enter stand in the docstring of the
-class; the blocks of ``sim/quadrotor`` and ``sim/rope`` implement them in Warp, ``sim/reference`` implements them again,
+class; the blocks of ``sim/kernels/quadrotor`` and ``sim/kernels/rope`` implement them in Warp, ``sim/reference`` implements them again,
 independently, in float64. Every value below is documented as ``[unit]``; vectors are in the body frame (x forward,
 y left, z up) with the origin at the vehicle's centre of mass unless said otherwise.
 """
@@ -372,7 +372,7 @@ class SimParams:
 
 @dataclass(frozen=True)
 class LawParams:
-    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.effects.laws`.
+    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.kernels.laws`.
 
     It acts on the vehicle (force in the world frame, torque in the body's), on the payload, while it hangs and after, or in the
     rope's joint at the mount: a torque on the vehicle in the body frame, and the opposite one on the rope.

@@ -8,14 +8,14 @@ import math
 import numpy as np
 import warp as wp
 
-from sim.arrays import runtime  # noqa: F401  starts Warp
-from sim.arrays import state as st
-from sim.arrays.structs import Types, extensions_of, kinds_of, pack, pack_vehicle, types
+from sim.kernels import runtime  # noqa: F401  starts Warp
+from sim.kernels import state as st
+from sim.kernels.quadrotor.queue import push, queue_depth, split_delay
+from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration, blend, build_flow
+from sim.kernels.quadrotor.start import build_start
+from sim.kernels.step import SPEED_LIMIT
+from sim.kernels.structs import Types, extensions_of, kinds_of, pack, pack_vehicle, types
 from sim.params import GRAVITY, AirParams, VehicleParams
-from sim.quadrotor.queue import push, queue_depth, split_delay
-from sim.quadrotor.rigid_body import advance, angular_acceleration, blend, build_flow
-from sim.quadrotor.start import build_start
-from sim.step import SPEED_LIMIT
 
 INTEGRATORS = ("euler", "rk4")
 FIELDS = st.QUAD_FIELDS | {"queue": ("vec4", True), "status": ("int", False)}
@@ -159,7 +159,7 @@ class QuadSim:
     """Batched quadrotor: command queue, rate controller, motors, battery, aerodynamics, external wrench.
 
     All arrays live on the device and keep their addresses for life, so a captured graph of ``step`` or ``reset`` stays
-    valid. Bit :data:`sim.arrays.state.NONFINITE` of ``state.status`` tells that a step led to a bad state and was undone, or
+    valid. Bit :data:`sim.kernels.state.NONFINITE` of ``state.status`` tells that a step led to a bad state and was undone, or
     that its command was not finite and the last one was held.
 
     Attributes:

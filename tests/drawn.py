@@ -1,4 +1,4 @@
-"""A small renderer of fisheye frames in torch, written before `camera.scenes` and without it: one ray a pixel, no noise.
+"""A small renderer of fisheye frames in torch, written before `camera.detectors.scenes` and without it: one ray a pixel, no noise.
 
 Ground plane z = 0 with a chequered texture, goal square, ball.
 """

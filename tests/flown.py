@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from sim.arrays.structs import EXTENSIONS
 from sim.effects.effect import apply
 from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
+from sim.kernels.structs import EXTENSIONS
 from sim.params import PlantParams
 from tests.plants import paper_plant
 from tests.worlds.pilot import FreeFlight, Throw, Tracker

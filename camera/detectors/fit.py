@@ -30,10 +30,10 @@ from camera.detectors.learnt import (
     spread_of,
     views_about,
 )  # fmt: skip
+from camera.detectors.scenes.renderer import Renderer
+from camera.detectors.scenes.scene import Truth, lens_row, random_scenes, truth_of
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
-from camera.scenes.renderer import Renderer
-from camera.scenes.scene import Truth, lens_row, random_scenes, truth_of
 
 AWAY = 0.6
 """A place this many sizes from the thing or more shows something else."""

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from sim.arrays import state as st
-from sim.arrays.structs import EXTENSIONS, Types, make_struct
-from sim.effects.laws import build_laws
+from sim.kernels import state as st
+from sim.kernels.laws import build_laws
+from sim.kernels.quadrotor.rigid_body import build_flow
+from sim.kernels.quadrotor.thrust import rotor_thrust
+from sim.kernels.rope.chain import build_chain
+from sim.kernels.rope.coupling import build_coupled_step
+from sim.kernels.rope.loose import build_loose_step
+from sim.kernels.rope.payload import build_flight, build_payload
+from sim.kernels.rope.release import build_letting_go, build_step_in_flight
+from sim.kernels.structs import EXTENSIONS, Types, make_struct
 from sim.params import LawParams, SensingParams, VehicleParams
-from sim.quadrotor.rigid_body import build_flow
-from sim.quadrotor.thrust import rotor_thrust
 from sim.replay.sampling import build_sampling
-from sim.rope.chain import build_chain
-from sim.rope.coupling import build_coupled_step
-from sim.rope.loose import build_loose_step
-from sim.rope.payload import build_flight, build_payload
-from sim.rope.release import build_letting_go, build_step_in_flight
 
 EVERYTHING = frozenset(EXTENSIONS)
 """The replay has every extension built in, so that lanes may differ in all of them."""

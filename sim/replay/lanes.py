@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from sim.arrays import runtime  # noqa: F401  starts Warp
-from sim.arrays import state as st
-from sim.arrays.cores import cores, in_pieces
-from sim.arrays.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
-from sim.effects.laws import check_laws, structure
+from sim.cores import cores, in_pieces
+from sim.kernels import runtime  # noqa: F401  starts Warp
+from sim.kernels import state as st
+from sim.kernels.laws import check_laws, structure
+from sim.kernels.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.params import GRAVITY, PlantParams, SensingParams
 from sim.replay import kernel as rk
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from sim.arrays.structs import Types, make_struct
-from sim.quadrotor.rigid_body import quat_rate
+from sim.kernels.quadrotor.rigid_body import quat_rate
+from sim.kernels.structs import Types, make_struct
 from sim.replay.sensing import build_sensing
 
 

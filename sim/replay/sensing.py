@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
+from sim.kernels.structs import Types
 
 
 @wp.func

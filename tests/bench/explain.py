@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from sim.arrays.cores import cores
+from sim.cores import cores
 from tests.bench import start
 from visthrow.diagnose.inputs import opening
 from visthrow.diagnose.reporting import explain_cli

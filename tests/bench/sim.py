@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sim.arrays.state import OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim, tether_lengths
+from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
 from tests.bench import commands, start
 from tests.oracle.converged import converged
 from tests.simulators import fly

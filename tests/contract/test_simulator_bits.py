@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 from sim import hybrid
-from sim.arrays.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim
+from sim.kernels.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
 from sim.params import BodyParams
 from sim.standalone import QuadSim
 from tests.plants import paper_plant

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.arrays.state import OUTPUT_FIELDS, STATE_FIELDS
 from sim.hybrid import HybridSim
+from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
 from sim.standalone import QuadSim
 from tests.plants import paper_plant
 from tests.simulators import numerics, random_commands

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from sim.arrays.state import NONFINITE
+from sim.kernels.state import NONFINITE
 from tests.oracle.converged import OracleRun, converged
 from tests.plants import SCENES
 from tests.scenes import Scene, load_scene

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from sim import hybrid
-from sim.arrays.structs import EXTENSIONS, extensions_of
 from sim.hybrid import HybridSim
+from sim.kernels.structs import EXTENSIONS, extensions_of
 from sim.params import GRAVITY, AirParams
 from sim.reference.extras import ReferenceExtras
 from sim.reference.plant import ReferencePlant

@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import root
 from scipy.special import ellipk
 
-from sim.arrays.state import NONFINITE
 from sim.hybrid import HybridSim
+from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
 from sim.standalone import QuadSim
 from tests.plants import paper_plant, plain_vehicle

@@ -10,10 +10,10 @@ import pytest
 import torch
 import warp as wp
 
-from sim.arrays.state import FALLBACK, NONFINITE
-from sim.arrays.torch_bridge import TorchViews
 from sim.hybrid import HybridSim, tether_lengths
+from sim.kernels.state import FALLBACK, NONFINITE
 from sim.params import PlantParams
+from sim.torch_bridge import TorchViews
 from tests.simulators import numerics, random_commands
 from visthrow import config
 from visthrow.onboard import observations as ob

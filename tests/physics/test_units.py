@@ -7,7 +7,7 @@ import pytest
 
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
-from sim.quadrotor.units import Units, in_units
+from sim.units import Units, in_units
 from visthrow import config
 from visthrow.task import Experiment, TaskParams, plant_of
 from visthrow.task.fleet import TASK

@@ -8,9 +8,9 @@ import torch
 
 from camera.detectors.contours import Known
 from camera.detectors.learnt import Networks
+from camera.detectors.scenes.scene import Nuisances, Truth
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
-from camera.scenes.scene import Nuisances, Truth
 from sim.params import RopeParams
 from visthrow import cli, config
 from visthrow.cli import detector

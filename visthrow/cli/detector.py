@@ -130,7 +130,7 @@ def throw(args: argparse.Namespace) -> int:
 
 def _thrown(loaded, plant: str, looks: dict[str, Any], job) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Throws of one batch, in halls of their own, and what was found in how many frames."""
-    from camera.scenes.scene import Nuisances
+    from camera.detectors.scenes.scene import Nuisances
     from visthrow.throws.reference_protocol import fly_batch
     from visthrow.view.eyes import Eyes
 
@@ -147,8 +147,8 @@ def train(args: argparse.Namespace) -> int:
         VisthrowError: a folder that holds a training already, or none to go on from.
     """
     from camera.detectors.fit import Fit, FitParams
+    from camera.detectors.scenes.textures import photographs
     from camera.params import CameraParams
-    from camera.scenes.textures import photographs
 
     params = config.load(FitParams, config.find("detector", args.name), args.overrides)
     folder = Path(args.out)
@@ -184,10 +184,10 @@ def check(args: argparse.Namespace) -> int:
     """
     from camera.detectors.contours import Detector
     from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
+    from camera.detectors.scenes.renderer import Renderer
+    from camera.detectors.scenes.textures import HELD_OUT, photographs
     from camera.fisheye import Fisheye
     from camera.params import CameraParams
-    from camera.scenes.renderer import Renderer
-    from camera.scenes.textures import HELD_OUT, photographs
 
     if args.frames < 1 or Path(args.out or "sheet.png").suffix != ".png":
         raise VisthrowError(f"--frames {args.frames}, --out {args.out}; expected 1 or more, and a .png")
@@ -227,7 +227,7 @@ def mistaken(detectors: dict) -> dict[str, Any]:
     """Balls and squares that detectors report in photographs that show neither, nine cuts of each; nothing is told to them."""
     import cv2
 
-    from camera.scenes.textures import HELD_OUT, TRAINING, photographs
+    from camera.detectors.scenes.textures import HELD_OUT, TRAINING, photographs
 
     found: dict[str, Any] = {"looks": 0} | {name: {"ball": 0, "goal": 0} for name in detectors}
     for path in photographs(names=TRAINING + HELD_OUT):
@@ -297,11 +297,11 @@ def counted(
 ) -> tuple[dict[str, Count], list]:
     """Counts of each detector in random frames, and pictures of the first four with what the first detector found."""
     from camera.detectors.contours import detected_keypoints
+    from camera.detectors.scenes.scene import Nuisances, random_scenes, truth_of
     from camera.fisheye import Fisheye
-    from camera.imaging.overlay import draw_overlay
     from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, payload_keypoints
     from camera.mount import nominal_rot_cb
-    from camera.scenes.scene import Nuisances, random_scenes, truth_of
+    from camera.overlay import draw_overlay
 
     lens, eyes = Fisheye(camera.fisheye), KeypointCamera(replace(camera, noise=replace(camera.noise, invalid_reads="edge")))
     none = dict.fromkeys(Nuisances.__dataclass_fields__, 0.0)

@@ -15,7 +15,7 @@ SCHEMAS = {
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
-    "fleet": "sim.quadrotor.fleet:FleetParams",
+    "fleet": "sim.fleet:FleetParams",
     "ppo": "visthrow.task:PPOParams",
     "sweep": "visthrow.evidence.sweep.lists:SweepList",
     "hil": "hil.params:HilParams",

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from camera.params import CameraParams
+from sim.fleet import FleetParams
 from sim.params import (
     AirParams,
     LawParams,
@@ -19,7 +20,6 @@ from sim.params import (
     SimParams,
     VehicleParams,
 )
-from sim.quadrotor.fleet import FleetParams
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 

@@ -1,7 +1,7 @@
 """Experiments with a fleet: one policy for any vehicle of a class.
 
 The task of such an experiment is stated for a rope of ``fleet.rope_length`` and a total mass of ``fleet.total_mass``. Every vehicle is
-flown in units in which its own have these numbers (:mod:`sim.quadrotor.units`): the same task for all, targets, fence and rewards too,
+flown in units in which its own have these numbers (:mod:`sim.units`): the same task for all, targets, fence and rewards too,
 and control steps that are as long as the square root of the rope. What stays different is what makes vehicles different.
 
 A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the lens is twice as far from its middle, and
@@ -19,9 +19,9 @@ from typing import Any
 
 import torch
 
+from sim.fleet import draw
 from sim.params import GRAVITY, PlantParams
-from sim.quadrotor.fleet import draw
-from sim.quadrotor.units import FORCE, LENGTH, NONE, PLANT, RATE, TIME, Dimension, Units, in_units
+from sim.units import FORCE, LENGTH, NONE, PLANT, RATE, TIME, Dimension, Units, in_units
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob

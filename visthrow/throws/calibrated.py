@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from camera.keypoints import KEYPOINTS, KeypointCamera
-from sim.arrays.cores import cores
+from sim.cores import cores
 from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers
 from visthrow.onboard import actions as act

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sim.arrays.cores import cores as cores
+from sim.cores import cores as cores
 from visthrow.common.errors import DeviceError
 
 

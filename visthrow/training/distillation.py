@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
-from sim.arrays.torch_bridge import Replayed
+from sim.torch_bridge import Replayed
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob

@@ -15,9 +15,9 @@ from torch import Tensor
 from camera import history as hist
 from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints
 from camera.noise import StepDraw, apply_latency, apply_noise
-from sim.arrays.torch_bridge import TorchViews, on_torch_stream
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY
+from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from torch import Tensor
 
-from sim.arrays.state import COLLISION, NONFINITE
+from sim.kernels.state import COLLISION, NONFINITE
 from visthrow.task import BoundsParams
 
 Array = TypeVar("Array", Tensor, np.ndarray)
@@ -57,7 +57,7 @@ def negative(
     Args:
         p: bounds.
         pos_w, payload_w: [m], shape (E, 3). rot_wb: shape (E, 3, 3).
-        status: bits of :mod:`sim.arrays.state`, shape (E,).
+        status: bits of :mod:`sim.kernels.state`, shape (E,).
         latched: shape (E,), bool. time: since the start [s], shape (E,).
         landing_height: [m].
     """

@@ -11,12 +11,12 @@ import torch
 from camera.detectors.contours import Detector, Seen, detected_keypoints
 from camera.detectors.following import Following
 from camera.detectors.learnt import LearntDetector, Networks
+from camera.detectors.scenes.renderer import Renderer
+from camera.detectors.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
+from camera.detectors.scenes.textures import HELD_OUT, photographs
 from camera.fisheye import Fisheye
 from camera.keypoints import KEYPOINTS, KeypointCamera
 from camera.params import CameraParams
-from camera.scenes.renderer import Renderer
-from camera.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
-from camera.scenes.textures import HELD_OUT, photographs
 from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)
@@ -135,7 +135,7 @@ class Eyes:
         """
         import cv2
 
-        from camera.imaging.overlay import draw_overlay
+        from camera.overlay import draw_overlay
 
         chosen = [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 2 * columns).round().astype(int)]
         drawn = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import torch
 
-from camera.imaging.overlay import draw_overlay
 from camera.keypoints import KeypointCamera
+from camera.overlay import draw_overlay
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write

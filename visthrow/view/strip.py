@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from camera.imaging.overlay import draw_overlay
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
+from camera.overlay import draw_overlay
 from camera.params import CameraParams
 from visthrow.common import style
 from visthrow.common.errors import LogError

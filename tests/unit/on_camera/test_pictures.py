@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from camera.imaging.overlay import draw_overlay
-from camera.imaging.rectify import ViewParams, rectify, view_map
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
+from camera.overlay import draw_overlay
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
+from camera.rectify import ViewParams, rectify, view_map
 from tests.drawn import pixel_rays, render_scene
 
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)

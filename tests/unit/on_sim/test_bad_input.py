@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.arrays.structs import types
 from sim.hybrid import HybridSim, tether_lengths
+from sim.kernels.structs import types
 from sim.params import PlantParams
 from sim.standalone import QuadSim
 from tests.plants import paper_plant

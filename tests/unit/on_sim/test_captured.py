@@ -6,7 +6,7 @@ import gc
 import pytest
 import torch
 
-from sim.arrays.torch_bridge import captured
+from sim.torch_bridge import captured
 
 
 class Old:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.arrays.structs import make_struct, types
-from sim.effects import laws
-from sim.effects.laws import BLOCKS, check_laws, names
 from sim.hybrid import HybridSim
+from sim.kernels import laws
+from sim.kernels.laws import BLOCKS, check_laws, names
+from sim.kernels.structs import make_struct, types
 from sim.params import LawParams
 from tests.plants import paper_plant
 from visthrow import config

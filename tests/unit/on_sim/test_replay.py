@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.arrays.cores import _pool
-from sim.arrays.structs import EXTENSIONS
+from sim.cores import _pool
 from sim.hybrid import HybridSim
+from sim.kernels.structs import EXTENSIONS
 from sim.params import SensingParams
 from sim.replay import kernel as rk
 from sim.replay.lanes import _BUILDS, Recording, Replay, _shared_out

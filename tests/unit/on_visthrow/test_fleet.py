@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from sim.fleet import draw
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY
-from sim.quadrotor.fleet import draw
-from sim.quadrotor.units import Units, in_units
+from sim.units import Units, in_units
 from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from sim.effects.effect import apply
-from sim.effects.laws import check_laws
 from sim.effects.setting import Setting, generalised, specialised
+from sim.kernels.laws import check_laws
 from sim.params import LawParams
 from visthrow import config
 from visthrow.common.errors import DiagnoseError

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect
-from sim.effects.laws import LOWEST, SLOWEST
+from sim.kernels.laws import LOWEST, SLOWEST
 from visthrow.common import rotations
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window

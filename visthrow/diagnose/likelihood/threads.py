@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from sim.arrays.cores import cores as cores
+from sim.cores import cores as cores
 
 T = TypeVar("T")
 R = TypeVar("R")

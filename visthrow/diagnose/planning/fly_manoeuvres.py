@@ -7,7 +7,7 @@ import numpy as np
 
 from sim.effects.effect import apply
 from sim.params import PlantParams
-from sim.quadrotor.units import Units, in_units
+from sim.units import Units, in_units
 from visthrow.common import mocap
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import DiagnoseError, LogError

@@ -35,7 +35,7 @@ class Stretch:
         self._settle = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
         function()
         if device.startswith("cuda"):
-            from sim.arrays.torch_bridge import captured
+            from sim.torch_bridge import captured
 
             self._run = captured(function).replay
 
@@ -65,7 +65,7 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
     """
     import torch
 
-    from sim.arrays.torch_bridge import on_torch_stream
+    from sim.torch_bridge import on_torch_stream
 
     env, alg, steps, device = trainer.algorithm.env, trainer.algorithm.alg, trainer.experiment.ppo.steps, trainer.device
     observations = env.get_observations()

@@ -8,8 +8,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from sim.arrays.torch_bridge import Replayed, on_torch_stream
 from sim.params import GRAVITY
+from sim.torch_bridge import Replayed, on_torch_stream
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob

@@ -19,9 +19,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from sim.arrays.torch_bridge import on_torch_stream
+from sim.kernels.quadrotor.queue import queue_depth
 from sim.params import GRAVITY
-from sim.quadrotor.queue import queue_depth
+from sim.torch_bridge import on_torch_stream
 from visthrow.onboard import observations as ob
 from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv

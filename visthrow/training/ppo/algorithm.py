@@ -8,7 +8,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from sim.arrays.torch_bridge import captured
+from sim.torch_bridge import captured
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams

@@ -6,7 +6,7 @@ In torch each is some dozens of launches of small operations. Formulas are those
 
 import warp as wp
 
-from sim.arrays import runtime  # noqa: F401  starts Warp
+from sim.kernels import runtime  # noqa: F401  starts Warp
 
 LOWEST, HIGHEST = wp.constant(1e-5), wp.constant(1e-2)
 """Range of the adaptive learning rate."""

@@ -8,7 +8,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch import Tensor
 
-from sim.arrays.torch_bridge import captured, on_torch_stream
+from sim.torch_bridge import captured, on_torch_stream
 from visthrow.training.ppo import loss
 from visthrow.training.ppo.network import Network
 

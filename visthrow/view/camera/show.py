@@ -9,10 +9,10 @@ import torch
 
 from camera.calibrate.boards import find_board, reprojected
 from camera.fisheye import Fisheye
-from camera.imaging.overlay import draw_overlay
-from camera.imaging.rectify import ViewParams, rectify
 from camera.keypoints import KeypointCamera, keypoints
+from camera.overlay import draw_overlay
 from camera.params import CameraParams
+from camera.rectify import ViewParams, rectify
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import atomic_write
@@ -56,8 +56,8 @@ def _rendered(
     params: CameraParams, pos_w: torch.Tensor, rot_wb: torch.Tensor, ball_w: torch.Tensor, goal_w: torch.Tensor
 ) -> np.ndarray:
     """Frame of a grey hall with ball and goal square, BGR, uint8."""
-    from camera.scenes.renderer import Renderer
-    from camera.scenes.scene import posed_scenes
+    from camera.detectors.scenes.renderer import Renderer
+    from camera.detectors.scenes.scene import posed_scenes
 
     scenes = posed_scenes(params, pos_w[None], rot_wb[None], ball_w[None], goal_w[None], torch.tensor([True]))
     return np.ascontiguousarray(Renderer(params.fisheye, files=[], samples=SAMPLES).render(scenes)[0].numpy()[..., ::-1])

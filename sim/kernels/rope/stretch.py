@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
-from sim.rope.algebra import sym_mul
+from sim.kernels.rope.algebra import sym_mul
+from sim.kernels.structs import Types
 
 
 @wp.func

@@ -28,10 +28,10 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
-from sim.rope import stretch
-from sim.rope.algebra import sym_mul, tangent_basis
-from sim.rope.payload import LOADS
+from sim.kernels.rope import stretch
+from sim.kernels.rope.algebra import sym_mul, tangent_basis
+from sim.kernels.rope.payload import LOADS
+from sim.kernels.structs import Types
 
 
 @wp.func
@@ -101,7 +101,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
     Args:
         t: types of the wanted precision.
         segments: L.
-        extensions: names of :data:`sim.arrays.structs.EXTENSIONS` to build in.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
 
     Returns:
         Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and force of the whole chain

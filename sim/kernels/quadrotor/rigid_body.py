@@ -8,9 +8,9 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
+from sim.kernels.quadrotor import aero, battery, composer, controller, motor, thrust
+from sim.kernels.structs import Types
 from sim.params import VehicleParams
-from sim.quadrotor import aero, battery, composer, controller, motor, thrust
 
 CONTROLLERS = {
     "betaflight": controller.rate_controller_betaflight,
@@ -92,7 +92,7 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
     Args:
         t: types of the wanted precision.
         vehicle: its kinds are read here.
-        extensions: names of :data:`sim.arrays.structs.EXTENSIONS` to build in.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
         motors: in place of the vehicle's controller, commands are motor-speed set-points.
 
     Returns:

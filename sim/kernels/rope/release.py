@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
+from sim.kernels.structs import Types
 
 FLIGHT_STEP = 0.02
 """Largest step of a flight under drag [s]: RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it)."""

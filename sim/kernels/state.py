@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
-from sim.arrays.structs import QUAD_STATE, Types, make_struct
+from sim.kernels.structs import QUAD_STATE, Types, make_struct
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 """Attitude of a level vehicle, xyzw."""

@@ -2,12 +2,12 @@
 
 Each sample of a pixel has its own place in it, spread by the defocus, and its own instant within the exposure of its row, so that
 motion, rolling shutter and defocus need no code of their own. Colours are linear up to the sensor, which adds shot and read noise and
-the gamma. Rows of the arrays are described in `camera.scenes.scene.Scenes`. The same seed gives the same picture.
+the gamma. Rows of the arrays are described in `camera.detectors.scenes.scene.Scenes`. The same seed gives the same picture.
 """
 
 import warp as wp
 
-from camera.scenes import textures
+from camera.detectors.scenes import textures
 
 LENS_STEPS = wp.constant(12)
 """Newton's steps to the angle of a pixel; the lens is monotonic."""

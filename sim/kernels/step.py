@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from sim.arrays import state as st
-from sim.arrays.structs import Types
-from sim.effects.laws import build_laws
+from sim.kernels import state as st
+from sim.kernels.laws import build_laws
+from sim.kernels.quadrotor.queue import push, split_delay
+from sim.kernels.quadrotor.rigid_body import build_direct_flow, build_flow
+from sim.kernels.rope import release as rel
+from sim.kernels.rope.chain import build_chain
+from sim.kernels.rope.coupling import build_coupled_step
+from sim.kernels.rope.payload import build_flight, build_payload
+from sim.kernels.structs import Types
 from sim.params import PlantParams
-from sim.quadrotor.queue import push, split_delay
-from sim.quadrotor.rigid_body import build_direct_flow, build_flow
-from sim.rope import release as rel
-from sim.rope.chain import build_chain
-from sim.rope.coupling import build_coupled_step
-from sim.rope.payload import build_flight, build_payload
 
 SPEED_LIMIT = 1000.0  # [m/s], [rad/s]: beyond it a state is broken, not fast
 
@@ -41,8 +41,8 @@ def build_step(
     Args:
         t: types of the wanted precision.
         params: kinds and segment count are read here; all numbers are read by the kernel at run time.
-        direct: by-pass the blocks; see :func:`sim.quadrotor.rigid_body.build_direct_flow`.
-        extensions: names of :data:`sim.arrays.structs.EXTENSIONS` to build in; the others cost nothing.
+        direct: by-pass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost nothing.
         motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
     """
     real, vec3, vec4 = t.real, t.vec3, t.vec4

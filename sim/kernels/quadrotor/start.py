@@ -4,9 +4,9 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
+from sim.kernels.quadrotor.battery import open_circuit_voltage
+from sim.kernels.structs import Types
 from sim.params import VehicleParams
-from sim.quadrotor.battery import open_circuit_voltage
 
 
 @wp.func

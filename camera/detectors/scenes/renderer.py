@@ -5,9 +5,9 @@ from pathlib import Path
 
 import torch
 
+from camera.detectors.scenes.scene import Scenes
+from camera.detectors.scenes.textures import photographs, pyramid
 from camera.params import FisheyeParams
-from camera.scenes.scene import Scenes
-from camera.scenes.textures import photographs, pyramid
 
 
 class Renderer:
@@ -47,7 +47,7 @@ class Renderer:
         """
         import warp as wp
 
-        from camera.scenes.kernel import render
+        from camera.detectors.scenes.kernel import render
 
         p = self.lens
         image = torch.empty(scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device)
@@ -66,7 +66,7 @@ class Renderer:
             launch(slice(0, scenes.count))
             wp.synchronize_device(self.device)
             return image
-        wp.load_module(device=self.device, module="camera.scenes.kernel")
+        wp.load_module(device=self.device, module="camera.detectors.scenes.kernel")
         share = -(-scenes.count // torch.get_num_threads())  # Warp runs a launch on the CPU in the thread that asks for it
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
             list(threads.map(launch, (slice(at, at + share) for at in range(0, scenes.count, share))))

@@ -12,9 +12,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from sim.arrays.structs import Types, make_struct
+from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
+from sim.kernels.structs import Types, make_struct
 from sim.params import LawParams
-from sim.quadrotor.thrust import rotor_thrust_scaled
 
 LOWEST = 0.05  # height below which 1/z is held [m]
 MOST_LAWS = 4
@@ -201,7 +201,7 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
 
 def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
     """Scalars, and vectors by block, that a law may name."""
-    from sim.arrays.structs import types
+    from sim.kernels.structs import types
 
     t = types("float64")
     scalars, vectors = _factors(t, make_struct("Around", _around(t)))

@@ -1,7 +1,7 @@
 """A class of vehicles: one that is known, made larger or smaller as real ones are, and changed at random about that.
 
 Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the cube root of the mass, thrust as
-the mass, inertia as mass times arm squared, and times as the square root of the arm: this is :class:`sim.quadrotor.units.Units`
+the mass, inertia as mass times arm squared, and times as the square root of the arm: this is :class:`sim.units.Units`
 applied to the known vehicle. Every factor multiplies what that gives. What does not follow size, links and sensors, stays in seconds.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, require_positive
-from sim.quadrotor.units import Units, in_units
+from sim.units import Units, in_units
 
 Range = tuple[float, float]
 

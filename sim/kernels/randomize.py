@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from sim.arrays.structs import Types
+from sim.kernels.quadrotor.start import build_start
+from sim.kernels.structs import Types
 from sim.params import PlantParams
-from sim.quadrotor.start import build_start
 
 
 @dataclass(frozen=True)

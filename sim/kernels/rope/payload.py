@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from sim.arrays.structs import Types
-from sim.quadrotor import aero
+from sim.kernels.quadrotor import aero
+from sim.kernels.structs import Types
 
 LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})
 """Extensions that push at the payload."""

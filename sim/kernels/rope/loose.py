@@ -1,8 +1,8 @@
-"""Rope and payload in free flight after the release: the chain of :mod:`sim.rope.chain` without a vehicle."""
+"""Rope and payload in free flight after the release: the chain of :mod:`sim.kernels.rope.chain` without a vehicle."""
 
 import warp as wp
 
-from sim.arrays.structs import Types
+from sim.kernels.structs import Types
 
 
 def build_loose_step(t: Types, chain, payload):

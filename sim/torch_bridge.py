@@ -7,8 +7,8 @@ from typing import Any
 import torch
 import warp as wp
 
-from sim.arrays import state as st
 from sim.hybrid import HybridSim
+from sim.kernels import state as st
 
 
 class TorchViews:

@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from sim.arrays.structs import Types
-from sim.quadrotor.rigid_body import advance, angular_acceleration, blend
-from sim.rope.payload import LOADS
+from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration, blend
+from sim.kernels.rope.payload import LOADS
+from sim.kernels.structs import Types
 
 
 def build_root(t: Types):
-    """Solve for the root's acceleration, given what the chain asks for (``sim.rope.chain``).
+    """Solve for the root's acceleration, given what the chain asks for (``sim.kernels.rope.chain``).
 
     Returns:
         Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` -> acceleration of the centre of mass

@@ -1,1 +1,0 @@
-"""Images of the fisheye camera: rectified views, overlays."""
