@@ -9,7 +9,9 @@ from typing import Any
 
 from tests.bench import start
 from visthrow.baseline import front, thrower
-from visthrow.evidence.report.baseline_units import BOUNDS, FRONT_TARGET, FRONT_THROWS, TARGETS
+from visthrow.baseline.front import FRONT_TARGET, FRONT_THROWS
+from visthrow.baseline.thrower import BOUNDS
+from visthrow.task.measurement import TARGETS
 from visthrow.throws import results
 
 

@@ -17,8 +17,7 @@ from visthrow import config
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.mpc import MPC, MPCParams, SolverError
 from visthrow.baseline.pendulum import Pendulum
-from visthrow.baseline.plan import Plan
-from visthrow.baseline.release import landing_point
+from visthrow.baseline.plan import Plan, landing_point
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.task import Experiment
@@ -40,19 +39,12 @@ TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
 
 @dataclass(frozen=True, kw_only=True)
 class Flown(Throws):
-    """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model.
+    """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model."""
 
-    Attributes:
-        position_error: of the payload at separation against the planned release [m], shape (N,).
-        velocity_error: the same [m/s], shape (N,).
-        tracking: root mean square distance of the payload from the path until the release [m], shape (N,).
-        step_times: of all steps of the controller [s], shape (K,).
-    """
-
-    position_error: np.ndarray
-    velocity_error: np.ndarray
-    tracking: np.ndarray
-    step_times: np.ndarray
+    position_error: np.ndarray  # of the payload at separation against the planned release [m], shape (N,)
+    velocity_error: np.ndarray  # the same [m/s], shape (N,)
+    tracking: np.ndarray  # root mean square distance of the payload from the path until the release [m], shape (N,)
+    step_times: np.ndarray  # of all steps of the controller [s], shape (K,)
 
 
 def _off(plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray) -> dict[str, np.ndarray]:
@@ -93,21 +85,13 @@ def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
     return state
 
 
-def fly_pendulum(
-    plan: Plan, count: int = 10, seed: int = 0, landing_height: float = 0.04, params: MPCParams | None = None
-) -> Flown:
-    """Fly a plan in the pendulum that the controller believes in.
+def fly_pendulum(plan: Plan, count: int = 10, seed: int = 0, landing_height: float = 0.04) -> Flown:
+    """Fly a plan so many times in the pendulum that the controller believes in; the landing's height [m] is the payload's centre's.
 
-    A throw fails when the controller's programme is not solved, the cable slackens or the payload falls short.
-
-    Args:
-        plan: of the throw; the release comes at its time, within a control period if need be.
-        count: throws.
-        seed: of the starts.
-        landing_height: of the payload's centre at impact [m].
-        params: of the controller.
+    A throw fails when the controller's programme is not solved, the cable slackens or the payload falls short. The release comes
+    at the plan's time, within a control period if need be.
     """
-    params = params or MPCParams()
+    params = MPCParams()
     controller = MPC(plan.model, params)
     steps, horizon = math.ceil(plan.path.duration / params.period - 1e-6), params.stages
     last = plan.path.duration - (steps - 1) * params.period
@@ -183,21 +167,11 @@ def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
     return Delays(*across, experiment.release.lag if compensation in ("release", "both") else 0.0)
 
 
-def look_ahead(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, delays: Delays) -> np.ndarray:
-    """Predict states from when they were measured to when a command given now takes effect.
+def look_ahead(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, begin: float, end: float = 0.0) -> np.ndarray:
+    """Predict states, shape (E, 16), under the commands that were given from ``begin`` to ``end`` [s] ago, each held for a period [s].
 
-    Args:
-        model: of the prediction.
-        state: as measured, ``delays.measurement`` ago, shape (E, 16).
-        sent: commands given one period ago, two periods ago and so on, shape (K, E, 4).
-        period: of the commands [s].
-        delays: to look across.
+    ``sent``: commands given one period ago, two periods ago and so on, shape (K, E, 4).
     """
-    return _under(model, state, sent, period, delays.measurement + delays.command, 0.0)
-
-
-def _under(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, begin: float, end: float) -> np.ndarray:
-    """Predict states under the commands that were given from ``begin`` to ``end`` [s] ago, each held for a period."""
     age = begin
     while age > end + 1e-9:
         k = max(math.ceil(age / period - 1e-9), 1)
@@ -207,9 +181,7 @@ def _under(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, 
     return state
 
 
-def _started(
-    name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
-) -> tuple[Plant, np.ndarray]:  # fmt: skip
+def _started(name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str) -> tuple[Plant, np.ndarray]:
     """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m], shape (3,)."""
     task, start = experiment.task, config.load(RandomizationParams, config.find("start", "hover"))
     if name == "hybrid":
@@ -228,12 +200,7 @@ class Controllers(Pilots):
     """
 
     def __init__(self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int) -> None:
-        """Begin in hover.
-
-        Args:
-            plan: of the throw. experiment: whose limits, mount and delays they are.
-            period: of the commands [s]. delays: to make up for. count: E.
-        """
+        """Begin in hover, with the experiment's limits, mount and release; commands come each period [s]."""
         self.plan, self.delays, self.period, action = plan, delays, period, experiment.task.action
         self.params = MPCParams(period=period, max_thrust=action.max_thrust, max_rate=action.max_rate)
         self.latch = round((plan.path.duration - delays.release) / period)
@@ -251,7 +218,8 @@ class Controllers(Pilots):
         """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has failed, and is held."""
         command, k, n = held.copy(), self._period, self.params.stages
         sent = np.stack([*flight.commands[: -SENT - 1 : -1], *[self._hover] * (SENT - len(flight.commands))])
-        state = look_ahead(self.plan.model, self._estimated(seen, sent), sent, self.period, self.delays)
+        span = self.delays.measurement + self.delays.command
+        state = look_ahead(self.plan.model, self._estimated(seen, sent, span), sent, self.period, span)
         reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
         for e in np.flatnonzero(flight.flown):
             try:
@@ -262,13 +230,12 @@ class Controllers(Pilots):
         self._period += 1
         return Decision(command, np.full(len(command), k >= self.latch), _normalised(self.params, command))
 
-    def _estimated(self, seen: Snapshot, sent: np.ndarray) -> np.ndarray:
+    def _estimated(self, seen: Snapshot, sent: np.ndarray, span: float) -> np.ndarray:
         """State now: the model's prediction from the period before, corrected by what is measured."""
         measured = pendulum_state(seen, np.array(self.experiment.rope.mount))
         if self._estimate is None:
             self._estimate = measured
-        span = self.delays.measurement + self.delays.command
-        then = _under(self.plan.model, self._estimate, sent, self.period, span + self.period, span)
+        then = look_ahead(self.plan.model, self._estimate, sent, self.period, span + self.period, span)
         side = np.sign((then[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
         measured[:, pm.QUAT] *= side
         estimate = then + TRUST * (measured - then)
@@ -323,14 +290,10 @@ def fly_plant(
     :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller.
 
     Args:
-        plan: of the throw.
-        plant_name: of the plant.
-        experiment: whose plant, bounds and delays they are.
+        plan, plant_name, experiment: whose plant, bounds and delays they are.
         delays: that the controller makes up for; ``Delays()`` for none.
-        count: throws, flown as one batch.
-        seed: of everything random.
-        batch: number of the batch on a reference plant, as :mod:`visthrow.throws.reference_protocol` counts them.
-        device: of the training simulator.
+        count: throws, flown as one batch, whose number on a reference plant is ``batch``.
+        seed, device: of everything random, and of the training simulator.
     """
     plant, home = _started(plant_name, experiment, plan.target, batch, count, seed, device)
     pilots = Controllers(plan, experiment, plant.period, delays, count)

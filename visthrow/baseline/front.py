@@ -10,6 +10,9 @@ SPEEDS = (1.7, 2.2, 2.5, 2.9)
 WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3))
 """Duration and energy weights of the sweep; the last three are the paper's."""
 
+FRONT_TARGET, FRONT_THROWS = 2.0, 10
+"""Target of the sweep (the paper, Table IV) [m], and throws of a setting, as in the paper."""
+
 PAPER_FRONT = (
     (2.2, 50e3, 0.005, 0.413, 1.285, 0.044, 0.143),
     (2.2, 30e3, 0.005, 0.252, 1.394, 0.059, 0.100),

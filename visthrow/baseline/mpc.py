@@ -59,15 +59,7 @@ class MPC:
     """Controller of one vehicle."""
 
     def __init__(self, model: Pendulum, params: MPCParams | None = None) -> None:
-        """Build the programme's pattern; it is factorised symbolically once.
-
-        Args:
-            model: what is predicted.
-            params: horizon, weights, bounds.
-
-        Raises:
-            ModuleNotFoundError: piqp is not installed.
-        """
+        """Build the programme's pattern; it is factorised symbolically once. ModuleNotFoundError where piqp is not installed."""
         import piqp
 
         self.model, self.params = model, params or MPCParams()
@@ -76,12 +68,9 @@ class MPC:
         weights = np.concatenate([self.params.state_weights, self.params.input_weights])
         self._weights = np.concatenate([np.tile(weights, n), self.params.state_weights])
         self._rows_columns()
-        low, high = np.full(size, -np.inf), np.full(size, np.inf)
-        most = np.array(self.params.max_rate)
-        for k in range(n):
-            part = slice(k * WIDTH + STATES, (k + 1) * WIDTH)
-            low[part] = [self.params.min_thrust, *-most]
-            high[part] = [self.params.max_thrust, *most]
+        free, last, most = np.full(STATES, np.inf), np.full(STATES, np.inf), np.array(self.params.max_rate)
+        low = np.concatenate([*[np.r_[-free, self.params.min_thrust, -most]] * n, -last])
+        high = np.concatenate([*[np.r_[free, self.params.max_thrust, most]] * n, last])
         self._bounds = low, high
         self._solver = piqp.SparseSolver()
         settings = self._solver.settings
@@ -119,14 +108,11 @@ class MPC:
         self._matrix.data[:] = np.concatenate([np.ones(STATES), values])[self._order]
 
     def step(self, state: np.ndarray, reference: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """One real-time iteration.
+        """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming period, shape (4,).
 
         Args:
-            state: now, shape (16,).
+            state: now.
             reference: states (N + 1, 16) and inputs (N, 4) at the ends of the stages, from now on.
-
-        Returns:
-            Command [N, rad/s] for the coming period, shape (4,).
 
         Raises:
             SolverError: The programme was not solved; the message carries the solver's status.
@@ -144,18 +130,13 @@ class MPC:
         target = _same_side(target, self._states)
         moved, by_state, by_input = pm.linearise(self.model, self._states[:n], self._inputs, self.params.period)
         self._fill(by_state, by_input)
-        free = (
-            moved
-            - np.einsum("kij,kj->ki", by_state, self._states[:n])
-            - np.einsum("kij,kj->ki", by_input, self._inputs)
-        )
+        free = moved - np.einsum("kij,kj->ki", by_state, self._states[:n]) - np.einsum("kij,kj->ki", by_input, self._inputs)
         wanted = np.concatenate([np.concatenate([target[:n], effort], axis=1).ravel(), target[n]])
         solution = self._solve(-self._weights * wanted, np.concatenate([state, free.ravel()]))
         stages = solution[: n * WIDTH].reshape(n, WIDTH)
-        states = np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]])
-        inputs = stages[:, STATES:]
+        states, inputs = np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]]), stages[:, STATES:]
         command = inputs[0].copy()
-        self._states, self._inputs = self._moved_on(states, inputs)
+        self._move_on(states, inputs)
         self.step_time = time.perf_counter() - began
         return command
 
@@ -177,13 +158,12 @@ class MPC:
         self._solver.setup(cost, linear, self._matrix, right, x_l=low, x_u=high)
         self._ready = True
 
-    def _moved_on(self, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The solution one period later, its last input held; directions and quaternions back at unit length."""
-        inputs = np.concatenate([inputs[1:], inputs[-1:]])
-        states = np.concatenate([states[1:], pm.step(self.model, states[-1], inputs[-1], self.params.period)[None]])
+    def _move_on(self, states: np.ndarray, inputs: np.ndarray) -> None:
+        """Keep the solution as of one period later, its last input held; directions and quaternions back at unit length."""
+        self._inputs = np.concatenate([inputs[1:], inputs[-1:]])
+        self._states = np.concatenate([states[1:], pm.step(self.model, states[-1], inputs[-1], self.params.period)[None]])
         for part in (DIR, QUAT):
-            states[:, part] /= np.linalg.norm(states[:, part], axis=1, keepdims=True)
-        return states, inputs
+            self._states[:, part] /= np.linalg.norm(self._states[:, part], axis=1, keepdims=True)
 
 
 def _same_side(target: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -29,11 +29,7 @@ _TINY = 1e-30
 
 @dataclass(frozen=True)
 class Pendulum:
-    """Masses [kg] and the length of the cable from its mount to the payload's centre [m].
-
-    Raises:
-        ValueError: One of them is not positive.
-    """
+    """Masses [kg] and the length of the cable from its mount to the payload's centre [m]; ValueError where one is not positive."""
 
     vehicle_mass: float
     payload_mass: float
@@ -57,16 +53,7 @@ def pendulum_of(plant: PlantParams) -> Pendulum:
 
 
 def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Rate of change of states.
-
-    Args:
-        model: masses and length.
-        state: components first, shape (16, ...); complex numbers pass through.
-        control: thrust [N] and body rates [rad/s], shape (4, ...).
-
-    Returns:
-        Shape (16, ...).
-    """
+    """Rate of change of states, shape (16, ...), under thrust [N] and body rates [rad/s], shape (4, ...); complex numbers pass through."""
     qx, qy, qz, wx, wy, wz, x, y, z, w = state[6:]
     thrust, p, q, r = control
     bx, by, bz = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
@@ -100,17 +87,7 @@ def _advance(model: Pendulum, state: np.ndarray, control: np.ndarray, period: fl
 
 
 def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float, substeps: int = 1) -> np.ndarray:
-    """Advance states under constant inputs.
-
-    Args:
-        model: masses and length.
-        state: shape (..., 16).
-        control: shape (..., 4).
-        period: [s].
-        substeps: Runge-Kutta steps that the period is cut into.
-
-    Returns:
-        Shape (..., 16).
+    """Advance states, shape (..., 16), under constant inputs, shape (..., 4), over a period [s] in so many Runge-Kutta steps.
 
     Raises:
         ValueError: Arrays of other widths.
@@ -125,21 +102,12 @@ def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float,
 def linearise(
     model: Pendulum, state: np.ndarray, control: np.ndarray, period: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One Runge-Kutta step and its Jacobians by complex steps, exact to rounding.
-
-    Args:
-        model: masses and length.
-        state: shape (K, 16).
-        control: shape (K, 4).
-        period: [s].
+    """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex steps, exact to rounding.
 
     Returns:
         Next states (K, 16), Jacobians by state (K, 16, 16) and by input (K, 16, 4).
 
     Source: Squire and Trapp, "Using complex variables to estimate derivatives of real functions", SIAM Review 1998.
-
-    Raises:
-        ValueError: Arrays of other widths.
     """
     state, control = _checked(state, control)
     both = np.concatenate([state.T, control.T])  # (20, K)

@@ -16,6 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.special import perm
 
 from sim.params import GRAVITY
 from visthrow.baseline.pendulum import Pendulum
@@ -95,15 +96,7 @@ class Spline:
         return float(self.times.sum())
 
     def sample(self, time: np.ndarray, derivatives: int = 6) -> np.ndarray:
-        """Payload's position and derivatives.
-
-        Args:
-            time: since the start [s], shape (T,).
-            derivatives: how many, the position included; 2 or more.
-
-        Returns:
-            In m/s^n, shape (T, derivatives, 3).
-        """
+        """Payload's position and derivatives [m/s^n] at times since the start [s], shape (T,): shape (T, 2 or more derivatives, 3)."""
         time = np.atleast_1d(np.asarray(time, dtype=float))
         inside = np.clip(time, 0.0, self.duration)
         starts = np.concatenate([[0.0], np.cumsum(self.times)])
@@ -116,36 +109,25 @@ class Spline:
         return out
 
 
-@lru_cache(maxsize=16)
-def _factors(derivatives: int) -> tuple[np.ndarray, np.ndarray]:
-    """Factor and power of t in the n-th derivative of t^k, shape (derivatives, 8) each."""
-    n, k = np.arange(derivatives)[:, None], np.arange(ORDER)[None, :]
-    factor = np.ones((derivatives, ORDER))
-    for i in range(derivatives - 1):
-        factor = np.where(n > i, factor * (k - i), factor)
-    return np.maximum(factor, 0.0), np.maximum(k - n, 0)
+def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
+    """Derivatives of the monomials t^0 to t^7 at times, shape (T, derivatives, 8)."""
+    n, k = np.arange(derivatives)[:, None], np.arange(ORDER)
+    return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
 
 
-def _rows(time: np.ndarray, derivatives: int) -> np.ndarray:
-    """Derivatives of the monomials at times, shape (T, derivatives, 8)."""
-    factor, power = _factors(derivatives)
-    return factor * (time[:, None] ** np.arange(ORDER))[:, power]
+BEGINS, ENDS = _rows(np.array([0.0, 1.0]))
+"""The same where a segment begins and where it ends, in units of its time."""
 
 
-def through(
-    start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray
-) -> Spline:
-    """Spline from rest through waypoints to the release.
+@lru_cache(maxsize=4)
+def _sample_rows(samples: int) -> np.ndarray:
+    return _rows((np.arange(samples) + 0.5) / samples)
 
-    Args:
-        start: [m], shape (D,); D is the dimension of space.
-        waypoints: [m], shape (3, D).
-        end: [m], shape (D,).
-        velocity: at the end [m/s], shape (D,).
-        times: of the four segments [s], shape (4,).
 
-    Raises:
-        PlanError: A time is not positive.
+def through(start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> Spline:
+    """Spline from rest at a start [m], shape (D,), through waypoints, shape (3, D), to an end with a velocity [m/s], shape (D,).
+
+    The times are those of the four segments [s], shape (4,); PlanError where one is not positive.
     """
     times = np.asarray(times, dtype=float)
     if times.shape != (SEGMENTS,) or not np.all(times > 0.0):
@@ -154,38 +136,25 @@ def through(
     return Spline(times, solved / (times[:, None] ** np.arange(ORDER))[:, :, None])
 
 
-def _coefficients(
-    start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray
-) -> np.ndarray:
+def _coefficients(start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Coefficients in units of each segment's time, which keeps the matrix well conditioned; B paths at once.
 
     Waypoints (B, 3, D), times (B, 4); returns (B, 4, 8, D).
     """
-    ends, begins = _unit_rows()
     size, count = SEGMENTS * ORDER, len(times)
     matrix, right = np.zeros((count, size, size)), np.zeros((count, size, len(start)))
-    matrix[:, :SMOOTH, :ORDER], right[:, 0] = begins, start
+    matrix[:, :SMOOTH, :ORDER], right[:, 0] = BEGINS, start
     row = SMOOTH
     for i in range(SEGMENTS - 1):
         here, there = slice(i * ORDER, (i + 1) * ORDER), slice((i + 1) * ORDER, (i + 2) * ORDER)
-        matrix[:, row, here], right[:, row] = ends[0], waypoints[:, i]
-        matrix[:, row + 1 : row + 1 + SMOOTH, here] = ends[:SMOOTH]
+        matrix[:, row, here], right[:, row] = ENDS[0], waypoints[:, i]
+        matrix[:, row + 1 : row + 1 + SMOOTH, here] = ENDS
         ratio = (times[:, i] / times[:, i + 1])[:, None] ** np.arange(SMOOTH)
-        matrix[:, row + 1 : row + 1 + SMOOTH, there] = -ratio[:, :, None] * begins
+        matrix[:, row + 1 : row + 1 + SMOOTH, there] = -ratio[:, :, None] * BEGINS
         row += 1 + SMOOTH
-    matrix[:, row:, -ORDER:] = ends[:END]
+    matrix[:, row:, -ORDER:] = ENDS[:END]
     right[:, row], right[:, row + 1] = end, velocity * times[:, -1:]
     return np.linalg.solve(matrix, right).reshape(count, SEGMENTS, ORDER, -1)
-
-
-@lru_cache(maxsize=1)
-def _unit_rows() -> tuple[np.ndarray, np.ndarray]:
-    return _rows(np.array([1.0]), SMOOTH)[0], _rows(np.array([0.0]), SMOOTH)[0]
-
-
-@lru_cache(maxsize=4)
-def _sample_rows(samples: int) -> np.ndarray:
-    return _rows((np.arange(samples) + 0.5) / samples, SMOOTH)
 
 
 def residuals(
@@ -194,11 +163,8 @@ def residuals(
     """Objective of B planar paths (along the throw, up) as sums of squares.
 
     Args:
-        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2).
-        times: of the segments [s], shape (B, 4).
-        params: weights and bounds.
-        model: whose thrust is bounded.
-        samples: of each segment.
+        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2), of times [s], shape (B, 4).
+        times, params, model, samples: of each segment.
 
     Returns:
         ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose squares add up to each part of the objective.
@@ -232,21 +198,14 @@ def residuals(
 
 
 def optimise(
-    model: Pendulum,
-    start_w: np.ndarray,
-    end_w: np.ndarray,
-    velocity_w: np.ndarray,
-    params: PlanParams,
+    model: Pendulum, start_w: np.ndarray, end_w: np.ndarray, velocity_w: np.ndarray, params: PlanParams,
     tick: tuple[float, float] = (0.02, 0.0),
-) -> Spline:
-    """Plan the payload's path.
+) -> Spline:  # fmt: skip
+    """Plan the payload's path from hover to the release.
 
     Args:
-        model: whose thrust the bounds are on.
-        start_w: hover [m], shape (3,).
-        end_w: release [m], shape (3,), in the vertical plane of start and velocity.
-        velocity_w: at release [m/s], shape (3,), not vertical.
-        params: weights and bounds.
+        model, params: whose thrust the bounds are on.
+        start_w, end_w: [m], shape (3,), in a vertical plane with ``velocity_w`` [m/s], which is not vertical.
         tick: period and offset [s]: the duration is the offset and a whole number of periods, so that a controller of that
             period can release at its end.
 
@@ -261,9 +220,8 @@ def optimise(
     aside = np.linalg.norm((end_w - start_w) - basis.T @ (basis @ (end_w - start_w)))
     if not aside < 1e-6:
         raise PlanError(f"the release lies {aside:g} m beside the plane of start and velocity; expected it within")
-    end, velocity = basis @ (end_w - start_w), basis @ velocity_w
-    height = np.array([0.0, start_w[2]])
-    begin, end = height, end + height
+    begin, velocity = np.array([0.0, start_w[2]]), basis @ velocity_w
+    end = basis @ (end_w - start_w) + begin
 
     def build(x: np.ndarray, total: float) -> tuple[np.ndarray, np.ndarray]:
         ratio = np.exp(np.concatenate([np.zeros((len(x), 1)), x[:, -(SEGMENTS - 1) :]], axis=1))
@@ -288,11 +246,7 @@ def optimise(
 
 
 def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, np.ndarray]:
-    """Least squares at each duration, from several starts on a coarse grid, then on the fine one about the best.
-
-    Returns:
-        Objective, duration and variables of the best.
-    """
+    """Objective, duration and variables of the best: at several starts on a coarse grid of durations, then on the fine one about it."""
 
     def improve(x: np.ndarray, total: float) -> tuple[np.ndarray, float]:
         def slope(x: np.ndarray) -> np.ndarray:
@@ -309,12 +263,9 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
 
 
 def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """Shorten a path step by step, each from the one before, until the objective is :data:`HOPELESS` times the best.
+    """The best of a path that is shortened step by step, each from the one before, till the objective is :data:`HOPELESS` times the best.
 
     From a long path down, the vehicle never turns over: short plans have local optima in which it does.
-
-    Returns:
-        Objective, duration and variables of the best.
     """
     best = (np.inf, float(totals[0]), x)
     for total in totals:
@@ -334,24 +285,16 @@ def _ticks(high: float, low: float, period: float, offset: float) -> np.ndarray:
 
 def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float) -> np.ndarray:
     """Waypoints on the single septic with the same ends, up to the third derivative, that takes a total time [s]."""
-    begins, ends = _unit_rows()[1][:4], _unit_rows()[0][:4]
     right = np.zeros((ORDER, len(begin)))
     right[0], right[4], right[5] = begin, end, velocity * total
-    unit = np.linalg.solve(np.concatenate([begins, ends]), right)
+    unit = np.linalg.solve(np.concatenate([BEGINS[:4], ENDS[:4]]), right)
     return _rows(np.arange(1, SEGMENTS) / SEGMENTS, 1)[:, 0] @ unit
 
 
 def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whole state and input of the pendulum along a payload's path.
+    """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path, position and five derivatives, shape (T, 6, 3).
 
     The attitude is the shortest turn from level to the thrust's direction.
-
-    Args:
-        model: masses and length.
-        path: position and five derivatives, shape (T, 6, 3).
-
-    Returns:
-        States (T, 16) and inputs (T, 4).
 
     Raises:
         PlanError: The payload falls freely, where the cable has no direction.
@@ -372,9 +315,7 @@ def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.nd
     return state, np.column_stack([np.linalg.norm(force, axis=1), rates])
 
 
-def _thrust(
-    model: Pendulum, chain: np.ndarray, up: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _thrust(model: Pendulum, chain: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path (6, T, D)."""
     _, _, acc, jerk, snap, crackle = chain
     unit = _unit(acc + up, jerk, snap, crackle)

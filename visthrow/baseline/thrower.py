@@ -1,8 +1,9 @@
 """The baseline as one more thrower: sets of throws as units of work, for ``visthrow compare`` and ``visthrow report``."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,12 @@ from visthrow import config
 from visthrow.baseline import NAME
 from visthrow.baseline.fly import delays_of, fly_pendulum, fly_plant
 from visthrow.baseline.pendulum import pendulum_of
-from visthrow.baseline.plan import Plan, plan_throw
-from visthrow.baseline.release import default_release
+from visthrow.baseline.plan import Plan, default_release, plan_throw
 from visthrow.baseline.spline import PlanParams, payload_bounds_only
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
-from visthrow.training.device import resolve
+from visthrow.training import device
 
 OWN = "pendulum"
 """The controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`."""
@@ -30,6 +30,10 @@ MADE_UP = {
 """Compensations that are compared, of :data:`visthrow.baseline.fly.COMPENSATIONS`."""
 
 
+BOUNDS = ("payload and thrust", "payload")
+"""What plans bound: ours, and the payload alone as the paper's do."""
+
+
 def title_of(plant: str, compensation: str) -> str:
     """What a row is called: plant and condition never go unsaid."""
     return "TO+MPC, own model (ideal)" if plant == OWN else f"TO+MPC, {MADE_UP[compensation]}"
@@ -38,22 +42,19 @@ def title_of(plant: str, compensation: str) -> str:
 def unit(
     plant: str, compensation: str, target: float, throws: int, seed: int = 0, *,
     height: float | None = None, speed: float | None = None, w_t: float | None = None, rho: float | None = None,
-    bounds: str = "payload and thrust",
+    bounds: str = BOUNDS[0],
     config_name: str = "state", overrides: Sequence[str] = (), batch: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
-    """Unit of throws with the baseline.
+    """Unit of so many throws with the baseline at a target [m] along x.
 
     Args:
-        plant: :data:`OWN`, or of :data:`visthrow.throws.plants.PLANTS`.
+        plant: :data:`OWN`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the number of the batch.
         compensation: of :data:`visthrow.baseline.fly.COMPENSATIONS`; "none" in the own model.
-        target: [m] along x.
-        throws: how many.
-        seed: of starts and noise.
-        height: of the payload at release [m]. speed: at release [m/s]; default the learnt policy's.
-        w_t: duration weight; rho: energy weight; default those of :class:`visthrow.baseline.spline.PlanParams`.
-        bounds: "payload and thrust", or "payload" as in the paper.
-        config_name: train config whose plant is flown; overrides: its changes.
-        batch: number of the batch on a reference plant.
+        target, throws, seed: of starts and noise.
+        height, speed: of the payload at release [m], [m/s]; default the learnt policy's.
+        w_t, rho: weights of duration and energy; default those of :class:`visthrow.baseline.spline.PlanParams`.
+        bounds: of :data:`BOUNDS`. config_name: train config whose plant is flown. overrides: its changes.
+        batch: see above.
     """
     default_height, default_speed = default_release(target)
     params = PlanParams()
@@ -79,16 +80,10 @@ def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
 
 
 @lru_cache(maxsize=64)
-def _plan(name: str, overrides: tuple[str, ...], *how: Any) -> Plan:
-    return plan_of(_experiment(name, overrides), *how)
-
-
-def plan_of(
-    experiment: Experiment, target: float, height: float, speed: float, w_t: float, rho: float, bounds: str
-) -> Plan:
+def plan_of(experiment: Experiment, target: float, height: float, speed: float, w_t: float, rho: float, bounds: str) -> Plan:
     """The plan of a unit, whose entries the arguments are."""
     params = replace(PlanParams(), duration=w_t, energy=rho)
-    params = params if bounds == "payload and thrust" else payload_bounds_only(params)
+    params = params if bounds == BOUNDS[0] else payload_bounds_only(params)
     return plan_throw(
         pendulum_of(plant_of(experiment)), target, height, speed, params, experiment.release.landing_height,
         experiment.sim.control_period, experiment.release.lag,
@@ -97,17 +92,15 @@ def plan_of(
 
 def fly_unit(wanted: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Plan and fly a unit; returns columns of the throws, and the planned duration [s] and times of the controller's steps [ms]."""
-    name, overrides = wanted["config"], tuple(wanted["overrides"])
-    experiment = _experiment(name, overrides)
-    how = (wanted[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds"))
-    plan = _plan(name, overrides, *how)
+    experiment = _experiment(wanted["config"], tuple(wanted["overrides"]))
+    plan = plan_of(experiment, *(wanted[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds")))
     count, seed = wanted["throws"], wanted["seed"]
     if wanted["plant"] == OWN:
         flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
     else:
         delays = delays_of(experiment, wanted["compensation"])
-        device = resolve("auto") if wanted["plant"] == "hybrid" else "cpu"
-        flown = fly_plant(plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"], device)
+        where = device.resolve("auto") if wanted["plant"] == "hybrid" else "cpu"
+        flown = fly_plant(plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"], where)
     columns = columns_of(flown)
     columns.pop("step_times", None)  # as many as throws by chance
     extra = {"planned": round(plan.duration, 6)}
@@ -116,29 +109,12 @@ def fly_unit(wanted: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, A
     return columns, extra
 
 
-def compared(
-    plant: str, targets: Sequence[float], throws: int, seed: int, folder: str, processes: int = 1,
-    config_name: str = "state", overrides: Sequence[str] = (), say=lambda text: None,
-) -> dict[str, list[Result]]:  # fmt: skip
-    """Throws in the own model and on a plant under each compensation.
+def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
+    """Plant and compensation of a table's rows: the own model, and each plant under each compensation."""
+    return [(OWN, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
 
-    Args:
-        plant: of :data:`visthrow.throws.plants.PLANTS`.
-        targets: [m] along x.
-        throws: a row.
-        seed: of starts and noise.
-        folder: of the units' results while they are made.
-        processes: that work at once.
-        config_name: train config whose plant is flown; overrides: its changes.
-        say: told of the progress.
 
-    Returns:
-        Row's name -> a result a target.
-    """
-    how = {"config_name": config_name, "overrides": overrides}
-    rows = {
-        title_of(*row): [units(*row, target, throws, seed, **how) for target in targets]
-        for row in [(OWN, "none"), *((plant, compensation) for compensation in MADE_UP)]
-    }
-    found = work([u for row in rows.values() for part in row for u in part], folder, fly_unit, None, processes, say)
-    return {name: [join(found[key_of(u)] for u in part)[0] for part in row] for name, row in rows.items()}
+def flown(sets: Sequence[list[dict[str, Any]]], folder: str | Path, say: Callable[[str], None]) -> list[Result]:
+    """Results of sets of units, the batches of each joined; those that the folder holds are not flown again."""
+    found = work([u for part in sets for u in part], folder, fly_unit, None, device.cores(), lambda text: say(f"TO+MPC: {text}"))
+    return [join(found[key_of(u)] for u in part)[0] for part in sets]

@@ -60,31 +60,28 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.baseline import thrower
     from visthrow.cli import compare
     from visthrow.common.storage import writable
-    from visthrow.evidence.report import baseline_units, result_set, trade
+    from visthrow.evidence.report import result_set, trade
     from visthrow.evidence.report.throws import SHORT
     from visthrow.throws import results
     from visthrow.throws.plants import known_plant
-    from visthrow.training.device import cores
     from visthrow.view import page
     from visthrow.view.parts import Section
 
     compare.check(args.targets, args.throws)
     for plant in args.plants:
         known_plant(plant)
-    out, bounds = Path(args.out), baseline_units.BOUNDS[args.payload_bounds]
+    out, bounds = Path(args.out), thrower.BOUNDS[args.payload_bounds]
     writable(out)
     if args.quick:
         args.throws, args.plants = min(args.throws, 2), []
     by_target, swept = list(_by_target(args, bounds)), [] if args.no_sweep else list(_swept(args, bounds))
-    units = [unit for row in by_target for unit in row] + swept
-    known = results.work(units, out / "throws", thrower.fly_unit, None, cores(), lambda text: status(f"TO+MPC: {text}"))
-    rows = [results.join(known[results.key_of(unit)] for unit in row)[0] for row in by_target]
-    made, found = [Section("baseline", "By target", (trade.by_target(rows),))], [known[results.key_of(unit)] for unit in units]
+    found = thrower.flown(by_target + swept, out / "throws", status)
+    rows, front = found[: len(by_target)], found[len(by_target) :]
+    made = [Section("baseline", "By target", (trade.by_target(rows),))]
     if swept:
         policies = [_thrown(name, args) for name in args.policies]
         kinds = [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]
         shown = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
-        front = results.join(known[results.key_of(unit)] for unit in swept)
         names = [result.unit["policy"] for result in policies]
         made.append(trade.front_section(result_set.ResultSet((*front, *policies)), shown, names))
         found += policies
@@ -109,27 +106,26 @@ def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str,
     releases = _releases(args)
     for target in args.targets:
         height, speed = releases.get(target, (None, None))
-        for plant, made_up in [(thrower.OWN, "none"), *((plant, made_up) for plant in args.plants for made_up in thrower.MADE_UP)]:
-            yield thrower.units(plant, made_up, target, args.throws, height=height, speed=speed, **_how(args, bounds))
+        for row in thrower.rows(args.plants):
+            yield thrower.units(*row, target, args.throws, height=height, speed=speed, **_how(args, bounds))
 
 
-def _swept(args: argparse.Namespace, bounds: str) -> Iterator[dict[str, Any]]:
-    """Units of the sweep: in the own model and, all delays made up for, on the plants."""
+def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
+    """Units of each setting of the sweep: in the own model and, all delays made up for, on the plants."""
     from visthrow.baseline import front, thrower
-    from visthrow.evidence.report.baseline_units import FRONT_TARGET
 
     speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
     for speed in speeds:
         for w_t, rho in weights:
             for plant, made_up in [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]:
                 how = {"speed": speed, "w_t": w_t, "rho": rho, **_how(args, bounds)}
-                yield from thrower.units(plant, made_up, FRONT_TARGET, args.throws, **how)
+                yield thrower.units(plant, made_up, front.FRONT_TARGET, args.throws, **how)
 
 
 def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
     if not args.release_from:
         return {}
-    from visthrow.baseline.release import measure
+    from visthrow.baseline.plan import measure
     from visthrow.throws.loading import load_policy
 
     loaded = load_policy(args.release_from)
@@ -139,14 +135,13 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
 
 def _thrown(name: str, args: argparse.Namespace) -> Any:
     """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
-    from visthrow.evidence.report.baseline_units import FRONT_TARGET
+    from visthrow.baseline.front import FRONT_TARGET
+    from visthrow.cli.compare import throw_hybrid
     from visthrow.throws import results
     from visthrow.throws.loading import load_policy
-    from visthrow.training.protocol import throw
 
     loaded, count = load_policy(name), 10 if args.quick else POLICY_THROWS
-    status(f"throwing with {loaded.name}")
-    flown = throw(loaded.experiment, loaded.policy.actor(count), FRONT_TARGET, count, "cpu", args.seed)
+    ((flown,),) = throw_hybrid([loaded], [FRONT_TARGET], count, "cpu", args.seed)
     layout = loaded.policy.contract["observation"]["layout"]
     unit = results.policy_unit(loaded.name, "", layout, "hybrid", FRONT_TARGET, count, args.seed)
     return results.Result(unit, results.columns_of(flown))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visthrow.baseline import NAME
-from visthrow.common.arguments import add_common, add_out
+from visthrow.common.arguments import add_common, add_conditions, add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 from visthrow.common.workers import status
@@ -33,27 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "controller's own model, an idealised bound, and on the plant with no, most or all of the known delays\n"
         "made up for.\n"
     )
-    kinds = "shipped names, policy files, or baseline (default: state vision)"
-    parser.add_argument("policies", metavar="POLICY", nargs="*", help=kinds)
-    parser.add_argument(
-        "--from", dest="runs", nargs="+", metavar="RUN", help="throw nothing: take the throws of HIL runs from their folders"
-    )
-    parser.add_argument(
-        "--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]"
-    )
-    parser.add_argument(
-        "--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)"
-    )
-    plants = "hybrid (the training simulator, with all its noise), reference, or reference-realistic"
-    parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
-    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
-    parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of each policy's own")
-    allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length); told above the table"
-    parser.add_argument("--allow", action="append", default=[], metavar="KEY", help=f"{allow}; may be repeated")
-    parser.add_argument(
-        "--calibrate", action="store_true",
-        help="begin each throw with a hover that calibrates its camera, as the runner does (vision policies, plant hybrid)",
-    )  # fmt: skip
+    add = parser.add_argument
+    add("policies", metavar="POLICY", nargs="*", help="shipped names, policy files, or baseline (default: state vision)")
+    add("--from", dest="runs", nargs="+", metavar="RUN", help="throw nothing: take the throws of HIL runs from their folders")
+    add("--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]")
+    add("--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)")
+    add_conditions(parser, "each policy's")
+    hover = "begin each throw with a hover that calibrates its camera, as the runner does (vision policies, plant hybrid)"
+    add("--calibrate", action="store_true", help=hover)
     add_out(parser, "out/compare", "for table, CSV and plot")
     add_common(parser)
 
@@ -91,14 +78,16 @@ def run(args: argparse.Namespace) -> int:
     if NAME in wanted:
         entries += throw_baseline(args)
     departures = {item.name: item.departures for item in loaded if item.departures}
-    title, rows = title_of(args.plant, args.seed) + departures_note(loaded), rows_of(entries)
+    notes = [
+        f"; {name} flown with {', '.join(f'{key} = {value!r}' for key, value in of.items())}, trained otherwise"
+        for name, of in departures.items()
+    ]
+    title, rows = title_of(args.plant, args.seed) + "".join(notes), rows_of(entries)
     told = {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures}
     return _tell(args, entries, rows, told, title)
 
 
-def _tell(
-    args: argparse.Namespace, entries: Sequence[Entry], rows: Sequence[dict], told: dict, title: str, *more: str | None
-) -> int:
+def _tell(args: argparse.Namespace, entries: Sequence[Entry], rows: Sequence[dict], told: dict, title: str, *more: str | None) -> int:
     """Print and write a table; ``told`` is its JSON, ``more`` subtitle and note of :func:`write`."""
     from visthrow.common.storage import write_json
 
@@ -111,11 +100,7 @@ def _tell(
 
 
 def _from_runs(args: argparse.Namespace) -> int:
-    """Print and write the table of the throws in folders of HIL runs.
-
-    Raises:
-        ConfigError: policies were named as well.
-    """
+    """Print and write the table of the throws in folders of HIL runs; ConfigError where policies were named as well."""
     from visthrow.throws import from_runs
 
     if args.policies:
@@ -143,37 +128,25 @@ def throw_baseline(args: argparse.Namespace) -> list[Entry]:
     from visthrow.baseline import thrower
     from visthrow.task.measurement import Throws
     from visthrow.throws.reference_protocol import FIELDS
-    from visthrow.training.device import cores
 
+    rows, how = thrower.rows([args.plant]), {"config_name": args.config or "state", "overrides": args.overrides}
+    sets = [thrower.units(*row, target, args.throws, args.seed, **how) for row in rows for target in args.targets]
     with tempfile.TemporaryDirectory() as folder:
-        found = thrower.compared(
-            args.plant, args.targets, args.throws, args.seed, folder, cores(), args.config or "state", args.overrides,
-            lambda text: status(f"TO+MPC: {text}"),
-        )
+        found = thrower.flown(sets, folder, status)
     status("")
-    own = thrower.title_of(thrower.OWN, "none")
-    return [
-        Entry(
-            name, "TO+MPC" if name == own else "",
-            [Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in row],
-        )
-        for name, row in found.items()
-    ]  # fmt: skip
+    throws = [Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in found]
+    each = len(args.targets)
+    layouts = ("TO+MPC" if plant == thrower.OWN else "" for plant, _ in rows)
+    return [Entry(thrower.title_of(*row), layout, throws[i * each : (i + 1) * each]) for i, (row, layout) in enumerate(zip(rows, layouts))]
 
 
 def check(targets: Sequence[float], throws: int) -> None:
-    """Refuse what cannot be thrown.
-
-    Raises:
-        ConfigError: no throws, or a target that is no distance or further than a vehicle may fly.
-    """
+    """Refuse no throws, and a target that is no distance or further than a vehicle may fly, with a ConfigError."""
     if throws < 1:
         raise ConfigError(f"--throws {throws}; expected 1 or more")
     for target in targets:
         if not (math.isfinite(target) and 0.0 <= target <= 3.0):
-            raise ConfigError(
-                f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m"
-            )
+            raise ConfigError(f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m")
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
 
@@ -208,24 +181,10 @@ def title_of(plant: str, seed: int) -> str:
     return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
 
 
-def departures_note(loaded: Sequence) -> str:
-    """End of a heading that says under which other conditions than its training's each policy was flown."""
-    notes = [
-        f"{item.name} flown with {', '.join(f'{key} = {value!r}' for key, value in item.departures.items())}, trained otherwise"
-        for item in loaded
-        if item.departures
-    ]
-    return "".join(f"; {note}" for note in notes)
-
-
 def rows_of(entries: Sequence[Entry]) -> list[dict]:
     """Summaries, target after target, throwers side by side."""
-    count = len(entries[0].throws)
-    return [
-        {"policy": entry.name, "layout": entry.layout, **entry.throws[column].summary()}
-        for column in range(count)
-        for entry in entries
-    ]
+    columns = zip(*(entry.throws for entry in entries))
+    return [{"policy": entry.name, "layout": entry.layout, **of.summary()} for column in columns for entry, of in zip(entries, column)]
 
 
 def report(title: str, rows: Sequence[dict], note: str | None = None) -> str:
@@ -241,16 +200,14 @@ def write(
 ) -> list[Path]:  # fmt: skip
     """Write Markdown, CSV and scatter plot; returns their paths."""
     from visthrow.common.storage import atomic_write
+    from visthrow.throws.plants import PLANTS
     from visthrow.view import figures, tables
 
     stem = f"compare-{plant}"
     paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
     atomic_write(paths[0], report(title, rows, note))
     atomic_write(paths[1], tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]))
-    from visthrow.throws.plants import PLANTS
-
-    if subtitle is None:
-        subtitle = f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
+    subtitle = subtitle or f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
     panels = [
         (f"target {of.target:.1f} m", [(e.name, e.throws[i].landing_w[e.throws[i].success] - (of.target, 0.0)) for e in entries])
         for i, of in enumerate(entries[0].throws)

@@ -9,13 +9,12 @@ from visthrow.common.arguments import add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 
-THROWS, TARGETS = 100, (1.5, 2.0, 2.5)
-"""In the training simulator, for each policy; ``--throws`` asks for another number."""
+THROWS = 100
+"""At each of compare's targets in the training simulator, for each policy; ``--throws`` asks for another number."""
 
 REFERENCE_THROWS, REFERENCE_TARGETS = 6, (2.0,)
 """On the reference plant, for each policy; one such throw costs seconds."""
 
-POLICIES = ("state", "vision")
 SEED = 0
 
 
@@ -39,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if args.throws < 1:
         raise ConfigError(f"--throws {args.throws}; expected 1 or more")
     begin, few = time.perf_counter(), min(args.throws, REFERENCE_THROWS)
-    loaded = [load_policy(name) for name in POLICIES]
+    loaded = [load_policy(name) for name in compare.DEFAULT_POLICIES]
     folder = Path(args.out)
     writable(folder)
     if importlib.util.find_spec("mujoco") is None:
@@ -70,14 +69,14 @@ def _here(loaded: list, folder: Path, throws: int) -> list[Path]:
     paths = fly.write(folder, log, loaded[1].experiment)
     print(fly.summary_text(log) + "\n")
     print(f"{throws} throws a policy and target in the training simulator ...", flush=True)
-    return paths + _tabled(loaded, compare.throw_hybrid(loaded, TARGETS, throws, "cpu", SEED), "hybrid", folder)
+    return paths + _tabled(loaded, compare.throw_hybrid(loaded, compare.DEFAULT_TARGETS, throws, "cpu", SEED), "hybrid", folder)
 
 
 def _tabled(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
     from visthrow.view.tables import markdown
 
-    entries = compare.entries_of(loaded, POLICIES, throws)
+    entries = compare.entries_of(loaded, compare.DEFAULT_POLICIES, throws)
     title, rows = compare.title_of(plant, SEED), compare.rows_of(entries)
     print(markdown(rows, title), flush=True)
     return compare.write(folder, entries, rows, plant, title)

@@ -90,11 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def throw(args: argparse.Namespace) -> int:
-    """Throw on pictures and print the landing errors.
-
-    Raises:
-        VisthrowError: no throws, no such plant, or a policy that sees no keypoints.
-    """
+    """Throw on pictures and print the landing errors; VisthrowError for no throws, no such plant, or a policy that sees no keypoints."""
     from visthrow.common.workers import done
     from visthrow.task.measurement import Throws
     from visthrow.throws.loading import load_policy
@@ -141,11 +137,7 @@ def _thrown(loaded, plant: str, looks: dict[str, Any], job) -> tuple[dict[str, n
 
 
 def train(args: argparse.Namespace) -> int:
-    """Train and write the weights.
-
-    Raises:
-        VisthrowError: a folder that holds a training already, or none to go on from.
-    """
+    """Train and write the weights; VisthrowError where the folder holds a training already, or none to go on from."""
     from camera.detectors.fit import Fit, FitParams
     from camera.detectors.scenes.textures import photographs
     from camera.params import CameraParams
@@ -177,11 +169,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> int:
-    """Detect in frames of each nuisance with both detectors and print what became of them.
-
-    Raises:
-        VisthrowError: fewer than one frame, or a picture that is no .png or cannot be written.
-    """
+    """Detect in frames of each nuisance with both detectors and print what became of them; VisthrowError for numbers that make no sense."""
     from camera.detectors.contours import Detector
     from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
     from camera.detectors.scenes.renderer import Renderer
@@ -192,18 +180,19 @@ def check(args: argparse.Namespace) -> int:
     if args.frames < 1 or Path(args.out or "sheet.png").suffix != ".png":
         raise VisthrowError(f"--frames {args.frames}, --out {args.out}; expected 1 or more, and a .png")
     camera = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
-    lens = Fisheye(camera.fisheye)
     renderer = Renderer(camera.fisheye, resolve(args.device), photographs(args.textures, HELD_OUT))
-    learnt = LearntDetector(lens, camera.payload_radius, camera.goal_side, networks=Networks.load(args.weights or SHIPPED))
-    detectors = {"learnt": learnt, "opencv": Detector(lens, camera.payload_radius, camera.goal_side)}
-    table, rows = {}, []
+    networks, table, rows = Networks.load(args.weights or SHIPPED), {}, []
+
+    def both(camera: CameraParams) -> dict[str, Detector]:
+        parts = Fisheye(camera.fisheye), camera.payload_radius, camera.goal_side
+        return {"learnt": LearntDetector(*parts, networks=networks), "opencv": Detector(*parts)}
+
+    detectors = both(camera)
     for level, nuisances in LEVELS.items():
         if level == OTHER_LENS:
             camera = replace(camera, fisheye=replace(camera.fisheye, **BENT))
-            parts = Fisheye(camera.fisheye), camera.payload_radius, camera.goal_side
-            detectors = {"learnt": LearntDetector(*parts, networks=learnt.networks), "opencv": Detector(*parts)}
-        counts, pictures = counted(camera, renderer, detectors, nuisances, args.frames, args.seed, args.known)
-        table[level] = {name: count.figures() for name, count in counts.items()}
+            detectors = both(camera)
+        table[level], pictures = counted(camera, renderer, detectors, nuisances, args.frames, args.seed, args.known)
         rows.append(pictures)
         _print(level, table[level], first=len(rows) == 1)
     table["neither"] = mistaken(detectors)
@@ -244,39 +233,27 @@ def mistaken(detectors: dict) -> dict[str, Any]:
     return found
 
 
-class Count:
-    """What became of the frames of one nuisance, by one detector."""
+def figures_of(rows: list[tuple[str, bool, bool, float, float]], spent: list[float]) -> dict[str, float]:
+    """Recall, precision, median and 95th percentile of the pixel error by kind; median time [s]; mean probability less the hits.
 
-    def __init__(self) -> None:
-        self.there, self.reports, self.hits = ({"ball": 0, "goal": 0} for _ in range(3))
-        self.errors: dict[str, list[float]] = {"ball": [], "goal": []}
-        self.told: list[tuple[float, bool]] = []  # probability of a report, and whether it was a hit
-        self.spent: list[float] = []
-
-    def add(self, kind: str, there: bool, off: float | None, probability: float) -> None:
-        """Count one thing in one frame; ``off``: mean error of its points [px], None where nothing was reported."""
-        self.there[kind] += there
-        if off is None:
-            return
-        hit = there and off < HIT
-        self.reports[kind] += 1
-        self.hits[kind] += hit
-        self.told.append((probability, hit))
-        if hit:
-            self.errors[kind].append(off)
-
-    def figures(self) -> dict[str, float]:
-        """Recall, precision, median and 95th percentile of the pixel error by kind; median time [s]; mean probability less the hits."""
-        found: dict[str, float] = {}
-        for kind in ("ball", "goal"):
-            errors = self.errors[kind] or [math.nan]
-            found |= {
-                f"{kind}_there": self.there[kind], f"{kind}_recall": self.hits[kind] / max(self.there[kind], 1),
-                f"{kind}_precision": self.hits[kind] / max(self.reports[kind], 1),
-                f"{kind}_median_px": float(np.median(errors)), f"{kind}_p95_px": float(np.percentile(errors, 95)),
-            }  # fmt: skip
-        told = np.array(self.told or [(math.nan, False)], float)
-        return found | {"seconds": float(np.median(self.spent)), "overconfidence": float(told[:, 0].mean() - told[:, 1].mean())}
+    Args:
+        rows: of each frame and kind: the kind, whether it was there, whether it was reported, the mean error of its points [px], and
+            the probability that was reported.
+        spent: times of the frames [s].
+    """
+    found: dict[str, float] = {}
+    hits = np.array([there and reported and off < HIT for _, there, reported, off, _ in rows])
+    _, was_there, reports, errors, probabilities = map(np.array, zip(*rows))
+    for kind in ("ball", "goal"):
+        own = np.array([row[0] == kind for row in rows])
+        off = errors[own & hits] if np.any(own & hits) else np.array([math.nan])
+        there, reported, hit = (int(np.sum(own & of)) for of in (was_there, reports, hits))
+        found |= {
+            f"{kind}_there": there, f"{kind}_recall": hit / max(there, 1), f"{kind}_precision": hit / max(reported, 1),
+            f"{kind}_median_px": float(np.median(off)), f"{kind}_p95_px": float(np.percentile(off, 95)),
+        }  # fmt: skip
+    over = float(probabilities[reports].mean() - hits[reports].mean()) if np.any(reports) else math.nan
+    return found | {"seconds": float(np.median(spent)), "overconfidence": over}
 
 
 def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator):
@@ -294,8 +271,8 @@ def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator)
 
 def counted(
     camera, renderer, detectors: dict, nuisances: dict[str, float], frames: int, seed: int, known: str
-) -> tuple[dict[str, Count], list]:
-    """Counts of each detector in random frames, and pictures of the first four with what the first detector found."""
+) -> tuple[dict[str, dict[str, float]], list]:
+    """Figures of each detector in random frames, and pictures of the first four with what the first detector found."""
     from camera.detectors.contours import detected_keypoints
     from camera.detectors.scenes.scene import Nuisances, random_scenes, truth_of
     from camera.fisheye import Fisheye
@@ -305,7 +282,7 @@ def counted(
 
     lens, eyes = Fisheye(camera.fisheye), KeypointCamera(replace(camera, noise=replace(camera.noise, invalid_reads="edge")))
     none = dict.fromkeys(Nuisances.__dataclass_fields__, 0.0)
-    counts, pictures = {name: Count() for name in detectors}, []
+    rows, spent, pictures = {name: [] for name in detectors}, {name: [] for name in detectors}, []
     for first in range(0, frames, 8):
         number = 7_000_000 + 1000 * seed + first
         scenes = random_scenes(camera, renderer.textures, min(8, frames - first), number, Nuisances(**none | nuisances))
@@ -319,15 +296,15 @@ def counted(
             for name, detector in detectors.items():
                 begin = time.perf_counter()
                 seen = detector.detect(image, knows)
-                counts[name].spent.append(time.perf_counter() - begin)
+                spent[name].append(time.perf_counter() - begin)
                 points, valid = detected_keypoints(eyes, seen, rot_wc @ nominal_rot_cb(camera.mount).numpy())
                 off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)
                 for kind, part in (("ball", slice(GOAL_KEYPOINTS, None)), ("goal", slice(0, GOAL_KEYPOINTS))):
                     thing, there = getattr(seen, kind), bool(getattr(truth, f"{kind}_seen")[e])
-                    counts[name].add(kind, there, None if thing is None else float(off[part].mean()), getattr(thing, "score", 0.0))
+                    rows[name].append((kind, there, thing is not None, float(off[part].mean()), getattr(thing, "score", 0.0)))
                 if name == next(iter(detectors)) and len(pictures) < 4:
                     pictures.append(draw_overlay(eyes, points, valid, np.ascontiguousarray(image)))
-    return counts, pictures
+    return {name: figures_of(rows[name], spent[name]) for name in detectors}, pictures
 
 
 def _print(level: str, figures: dict[str, dict[str, float]], first: bool) -> None:

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from visthrow.common.arguments import add_common, add_out
+from visthrow.common.arguments import add_common, add_conditions, add_out
 from visthrow.onboard.shipped import find_policy
 
 FILES = {
@@ -25,35 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow fly --plant reference-realistic       on the stand-in for a real vehicle (about a minute)\n"
         "\nThe vehicle hovers until the swing is quiet, the policy throws, the hover controller brings it back.\n"
     )
-    parser.add_argument(
-        "--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)"
-    )
-    parser.add_argument(
-        "--target",
-        type=float,
-        nargs="+",
-        default=[2.0],
-        metavar="M",
-        help="distance ahead, or x and y [m] (default: 2.0)",
-    )
-    plants = "hybrid (the training simulator, the default), reference, or reference-realistic"
-    parser.add_argument("--plant", default="hybrid", metavar="NAME", help=plants)
-    parser.add_argument("--seed", type=int, default=0, help="of start, measurements and plant (default: 0)")
-    parser.add_argument("--config", metavar="NAME", help="fly in this train config instead of the policy's own")
-    parser.add_argument(
-        "--pixels", choices=("learnt", "contours"), help="keypoints by a detector from rendered pictures, in place of projected ones"
-    )
+    add = parser.add_argument
+    add("--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)")
+    add("--target", type=float, nargs="+", default=[2.0], metavar="M", help="distance ahead, or x and y [m] (default: 2.0)")
+    add_conditions(parser, "the policy's")
+    pixels = "keypoints by a detector from rendered pictures, in place of projected ones"
+    add("--pixels", choices=("learnt", "contours"), help=pixels)
     saved = "write the policy as it is flown here: one for any vehicle becomes one for this vehicle, as hil takes it"
-    parser.add_argument("--save", metavar="FILE", help=saved)
+    add("--save", metavar="FILE", help=saved)
     add_out(parser, "out/fly", "for the files")
-    parser.add_argument(
-        "--allow", action="append", default=[], metavar="KEY",
-        help="fly although the config breaks this part of the policy's contract, for instance rope.length; may be repeated",
-    )  # fmt: skip
-    parser.add_argument(
-        "--export", action="append", default=[], metavar="FILE",
-        help="also write the flight for other programs: .mcap (Foxglove), .parquet or .csv; may be repeated",
-    )  # fmt: skip
+    export = "also write the flight for other programs: .mcap (Foxglove), .parquet or .csv; may be repeated"
+    add("--export", action="append", default=[], metavar="FILE", help=export)
     add_common(parser)
 
 
@@ -62,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     find_policy(args.policy)  # said before anything heavy is imported
     from visthrow.common.errors import ConfigError
     from visthrow.common.storage import writable, write_json
+    from visthrow.logs.export import FORMATS
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import known_plant
     from visthrow.throws.recorded import check_goal, fly
@@ -70,8 +53,10 @@ def run(args: argparse.Namespace) -> int:
     known_plant(args.plant)
     if len(args.target) > 2:
         raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
+    formats = (*FORMATS, ".mcap")
     for path in args.export:
-        check_format(path)
+        if Path(path).suffix not in formats:
+            raise ConfigError(f"--export {path}: ending '{Path(path).suffix}'; expected one of {', '.join(formats)}")
     for override in args.overrides:
         if override.startswith("task.noise.command"):
             raise ConfigError(f"--set {override}: fly sends commands as they are, without training's noise; compare throws with it")
@@ -120,19 +105,6 @@ def write(folder: Path, log, experiment) -> list[Path]:
     return paths
 
 
-def check_format(path: str) -> None:
-    """Refuse a file to export to whose ending no writer has.
-
-    Raises:
-        ConfigError: the message names the endings.
-    """
-    from visthrow.common.errors import ConfigError
-    from visthrow.logs.export import FORMATS
-
-    if Path(path).suffix not in (*FORMATS, ".mcap"):
-        raise ConfigError(f"--export {path}: ending '{Path(path).suffix}'; expected one of {', '.join((*FORMATS, '.mcap'))}")
-
-
 def export(path: str, log, experiment) -> None:
     """Write a flight for other programs, by the ending of the path."""
     from visthrow.logs import export as tables
@@ -149,10 +121,7 @@ def summary_text(log) -> str:
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]
     plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"
-    lines = [
-        f"policy '{log.meta['policy']}' on {plant}",
-        f"hover   {start:.2f} s until the swing was quiet",
-    ]
+    lines = [f"policy '{log.meta['policy']}' on {plant}", f"hover   {start:.2f} s until the swing was quiet"]
     if "separation" in times:
         at = log["separation"].values[0]
         lines.append(

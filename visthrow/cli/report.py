@@ -12,6 +12,9 @@ TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
 UNITS = "throws"
 """Folder of single results, in the output folder."""
 
+QUICK_LIST = "quick"
+"""List of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and ``gap`` made."""
+
 NO_REFERENCE = ('runs.shipped.throws=["own"]',)
 """Changes of the quick list where MuJoCo is not installed."""
 
@@ -78,7 +81,6 @@ def quick(out: Path, jobs: int) -> None:
     """
     from importlib.util import find_spec
 
-    from visthrow.evidence.report import baseline_units
     from visthrow.evidence.sweep.pool import Local, Pool
     from visthrow.evidence.sweep.units import load_list
     from visthrow.throws import results
@@ -87,8 +89,8 @@ def quick(out: Path, jobs: int) -> None:
     if find_spec("mujoco") is None:
         changes = NO_REFERENCE
         _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
-    local = Local(baseline_units.QUICK_LIST, folder, ["cpu"], jobs, changes)
-    outcome = Pool(load_list(baseline_units.QUICK_LIST, changes), folder, local, _say).run(None)
+    local = Local(QUICK_LIST, folder, ["cpu"], jobs, changes)
+    outcome = Pool(load_list(QUICK_LIST, changes), folder, local, _say).run(None)
     if outcome.failed:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
         raise VisthrowError(f"throws failed: {reasons}; all that was printed is in {folder / 'logs'}")
@@ -99,7 +101,17 @@ def quick(out: Path, jobs: int) -> None:
         return
     from visthrow.baseline.thrower import fly_unit
 
-    results.work(baseline_units.quick(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
+    results.work(quick_units(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
+
+
+def quick_units() -> list[dict]:
+    """Few throws of the baseline, for a look within minutes."""
+    from visthrow.baseline.front import FRONT_TARGET
+    from visthrow.baseline.thrower import OWN, unit
+    from visthrow.task.measurement import TARGETS
+
+    own = [unit(OWN, "none", target, 5) for target in TARGETS]
+    return own + [unit("hybrid", compensation, FRONT_TARGET, 10) for compensation in ("both", "delay")]
 
 
 def _say(text: str) -> None:
@@ -120,13 +132,13 @@ def sections(found) -> list:
     """Return the sections, each followed by what somebody wrote beside its data."""
     from dataclasses import replace
 
-    from visthrow.evidence.report import ablations, beyond, gap, origin, throws, trade
+    from visthrow.evidence.report import ablations, beyond, gap, throws, trade
     from visthrow.view.parts import Text
 
     made = [
         throws.throws_section(found), throws.vision_section(found), ablations.section(found), trade.baseline_section(found),
         trade.front_section(found), gap.section(found), beyond.section(found), beyond.training_section(found),
-        origin.section(found),
+        beyond.origin_section(found),
     ]  # fmt: skip
     return [
         replace(s, parts=(*s.parts, *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p))) for s in made

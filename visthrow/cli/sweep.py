@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 DEFAULT_OUT = "runs/sweep"
 ACTIONS = ("run", "status", "collect", "work")
@@ -45,35 +46,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, tell, collect."""
-    actions = {"run": _run, "status": _status, "collect": _collect, "work": _work}
-    return actions[args.action](args)
-
-
-def _run(args: argparse.Namespace) -> int:
-    from visthrow.common.arguments import EXIT_INTERRUPTED
     from visthrow.common.errors import ConfigError
-    from visthrow.evidence.sweep.pool import Local, Pool
+    from visthrow.evidence.sweep import record
     from visthrow.evidence.sweep.units import load_list
+
+    if args.action == "run" and args.minutes is not None and args.minutes <= 0:
+        raise ConfigError(f"--minutes {args.minutes:g}; expected more than 0")
+    work, out = load_list(args.list, tuple(args.overrides)), Path(args.out)
+    if args.action == "status":
+        lines, done = record.status(work, out)
+        print("\n".join(lines))
+        return 0 if done else 1
+    if args.action == "collect":
+        for path in record.collect(work, out, Path(args.records or out / "records")):
+            print(path)
+        return 0
+    return _run(args, work, out) if args.action == "run" else _work(args, work, out)
+
+
+def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
+    from visthrow.common.arguments import EXIT_INTERRUPTED
+    from visthrow.evidence.sweep.pool import Local, Pool
     from visthrow.training import device
 
-    if args.minutes is not None and args.minutes <= 0:
-        raise ConfigError(f"--minutes {args.minutes:g}; expected more than 0")
-    changes = tuple(args.overrides)
-    work, out = load_list(args.list, changes), Path(args.out)
-    jobs = args.jobs or device.cores()
-    begin = time.monotonic()
+    changes, jobs, begin = tuple(args.overrides), args.jobs or device.cores(), time.monotonic()
 
     def say(text: str) -> None:
         print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)
 
-    with _Terminated():
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a batch system's signal also ends in checkpoints
+    try:
         if args.slurm is not None:
-            starter = _cluster(args, out, jobs, changes)
-            outcome = Pool(work, out, starter, say).run()
+            outcome = Pool(work, out, _cluster(args, out, jobs, changes), say).run()
         else:
-            names = args.devices.split(",")
-            starter = Local(args.list, out, [device.resolve(name) for name in names], jobs, changes)
+            starter = Local(args.list, out, [device.resolve(name) for name in args.devices.split(",")], jobs, changes)
             outcome = Pool(work, out, starter, say).run(args.minutes)
+    finally:
+        signal.signal(signal.SIGTERM, before)
     for name, reason in outcome.failed.items():
         print(f"{name} failed: {reason}; all it printed is in {out / 'logs'}", file=sys.stderr)
     if outcome.stopped:
@@ -83,7 +92,7 @@ def _run(args: argparse.Namespace) -> int:
     return 1 if outcome.failed else 0
 
 
-def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str, ...]):
+def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str, ...]) -> Any:
     from visthrow.common.errors import ConfigError
     from visthrow.evidence.sweep.cluster import Cluster
 
@@ -97,26 +106,15 @@ def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str,
     return Cluster(args.list, out, "slurm", int(args.devices), jobs, args.minutes, changes, options)
 
 
-class _Terminated:
-    """SIGTERM read as Ctrl-C while it is entered, so that a batch system's signal also ends in checkpoints."""
-
-    def __enter__(self) -> None:
-        self._before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-    def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGTERM, self._before)
-
-
-def _work(args: argparse.Namespace) -> int:
+def _work(args: argparse.Namespace, work: Any, out: Path) -> int:
     from visthrow.common.errors import ConfigError
-    from visthrow.evidence.sweep.units import load_list
-    from visthrow.evidence.sweep.work import work
+    from visthrow.evidence.sweep.work import work as do
 
     if not args.units:
         raise ConfigError("sweep work: no --units; expected ids as `visthrow sweep run` gives them")
     if args.parent:
         threading.Thread(target=_follow, args=(args.parent,), daemon=True).start()
-    return work(load_list(args.list, tuple(args.overrides)), Path(args.out), args.units.split(","), args.device, args.minutes)
+    return do(work, out, args.units.split(","), args.device, args.minutes)
 
 
 def _follow(parent: int) -> None:
@@ -124,22 +122,3 @@ def _follow(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
     os.kill(os.getpid(), signal.SIGINT)
-
-
-def _status(args: argparse.Namespace) -> int:
-    from visthrow.evidence.sweep.record import status
-    from visthrow.evidence.sweep.units import load_list
-
-    lines, done = status(load_list(args.list, tuple(args.overrides)), Path(args.out))
-    print("\n".join(lines))
-    return 0 if done else 1
-
-
-def _collect(args: argparse.Namespace) -> int:
-    from visthrow.evidence.sweep.record import collect
-    from visthrow.evidence.sweep.units import load_list
-
-    out = Path(args.out)
-    for path in collect(load_list(args.list, tuple(args.overrides)), out, Path(args.records or out / "records")):
-        print(path)
-    return 0

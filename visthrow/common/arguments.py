@@ -13,24 +13,13 @@ EXIT_INTERRUPTED = 130
 
 
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
-    """Add the options that commands share: ``--device``, ``--set``, ``--json``.
-
-    Args:
-        parser: Of the command.
-        device: Whether the command computes on a device; read ``args.device`` through ``visthrow.training.device.resolve``.
-        json: Whether the command prints a table; write it to ``args.json`` as well where that is not None.
-    """
+    """Add the options that commands share: ``--set``, ``--device`` (see ``visthrow.training.device.resolve``) and ``--json``."""
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
         help="change one value of the configuration, for instance --set vehicle.body.mass=0.25; may be repeated",
     )  # fmt: skip
     if device:
-        parser.add_argument(
-            "--device",
-            default="auto",
-            metavar="NAME",
-            help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)",
-        )
+        parser.add_argument("--device", default="auto", metavar="NAME", help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)")
     if json:
         parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
 
@@ -38,6 +27,16 @@ def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bo
 def add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
     """Add ``--out``: the folder of what a command writes."""
     parser.add_argument("--out", default=default, metavar="FOLDER", help=f"{what} (default: {default})")
+
+
+def add_conditions(parser: argparse.ArgumentParser, whose: str) -> None:
+    """Add what throws are flown under: ``--plant``, ``--seed``, ``--config``, ``--allow``."""
+    add = parser.add_argument
+    add("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, the default), reference, or reference-realistic")
+    add("--seed", type=int, default=0, help="of starts, noise and plant (default: 0)")
+    add("--config", metavar="NAME", help=f"fly in this train config instead of {whose} own")
+    allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length), which is told; may be repeated"
+    add("--allow", action="append", default=[], metavar="KEY", help=allow)
 
 
 def add_commands(parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any) -> None:

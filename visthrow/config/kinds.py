@@ -17,7 +17,7 @@ SCHEMAS = {
     "train": "visthrow.task:Experiment",
     "fleet": "sim.fleet:FleetParams",
     "ppo": "visthrow.task:PPOParams",
-    "sweep": "visthrow.evidence.sweep.lists:SweepList",
+    "sweep": "visthrow.evidence.sweep:SweepList",
     "hil": "hil.params:HilParams",
     "diagnose": "visthrow.diagnose.inputs.setup:Setup",
     "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",

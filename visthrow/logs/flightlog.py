@@ -91,6 +91,11 @@ class Channel:
         for name, array in (("time", time), ("values", values), ("valid", valid)):
             object.__setattr__(self, name, array)
 
+    def at(self, time: float) -> np.ndarray:
+        """Return the value at a time [s], linear between samples."""
+        columns = self.values.reshape(len(self.time), -1).T
+        return np.array([np.interp(time, self.time, column) for column in columns]).reshape(self.values.shape[1:])
+
     def hold(self, time: np.ndarray) -> np.ndarray:
         """Return the last valid sample at or before each time (the first one where there is none yet).
 

@@ -7,16 +7,8 @@ from sim.params import GRAVITY, AirParams, RopeParams
 STEP = 0.02  # largest of RK4 [s]; 1e-8 m off a tennis ball's path after a second
 
 
-def flown(
-    rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray, time: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity of payloads after ``time`` of flight under gravity, drag, side force, lift and wind.
-
-    Args:
-        rope: whose payload it is.
-        air: wind.
-        pos_w: [m], shape (E, 3). vel_w: [m/s], shape (E, 3). time: [s], shape (E,).
-    """
+def flown(rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position [m] and velocity [m/s] of payloads, shape (E, 3), after flights [s], shape (E,), under gravity, wind, air forces."""
     time = np.asarray(time, dtype=float)[:, None]
     if not (rope.payload_drag or rope.payload_side or rope.payload_lift):
         fall = np.array([0.0, 0.0, -GRAVITY])

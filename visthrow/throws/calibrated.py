@@ -27,14 +27,9 @@ SETTLE = 3.0
 
 
 def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | None = None) -> Callable[[ThrowEnv], TensorDict]:
-    """What :func:`visthrow.training.protocol.throw` begins with.
+    """What :func:`visthrow.training.protocol.throw` begins with; ConfigError for another layout than vision, or goals that move.
 
-    Args:
-        experiment: of a vision policy.
-        kept: takes the calibration of each throw; None where there was none, and keypoints stay as they came.
-
-    Raises:
-        ConfigError: another layout than vision, or goals that move.
+    ``kept`` takes the calibration of each throw; None where there was none, and keypoints stay as they came.
     """
     seen = experiment.task.observation
     if seen.layout != "vision" or experiment.task.target.moves:
@@ -99,8 +94,6 @@ def _solve(task: tuple) -> Calibration | None:
 
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
     contract = contract_of(experiment)
-    found: list[Calibration | None] = [None] * len(hovered)
     with Workers(_solve, [(one, experiment.camera, contract) for one in hovered], cores(), "calibrations") as workers:
-        for place, result in workers:
-            found[place] = result
-    return found
+        found = dict(workers)
+    return [found[place] for place in range(len(hovered))]

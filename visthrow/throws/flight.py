@@ -46,10 +46,10 @@ class Pilots(ABC):
     """Who throws with E vehicles; the children decide."""
 
     def __init__(self, experiment: Experiment, goal_w: np.ndarray, first_action: np.ndarray, goal_vel_w: np.ndarray | None = None):
-        """Begin before the throw.
+        """Begin before the throw, within the experiment's bounds.
 
         Args:
-            experiment: with the bounds of the throw.
+            experiment: see above.
             goal_w: at its start [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
             first_action: normalised command of the hover before, shape (E, 4 or 5).
         """
@@ -59,7 +59,6 @@ class Pilots(ABC):
     @abstractmethod
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
         """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
-
 
     def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
         """Vehicles that are not to throw if the hover ended here, and why; called each period of the hover before the throw."""
@@ -80,8 +79,7 @@ class Policies(Pilots):
             draws: state policies too have a camera, to be drawn.
             eyes: whose rendered pictures keypoints come from; None: they are what measured poses project to.
         """
-        self.eyes, self._waited = eyes, 0
-        self._lost: dict[int, str] = {}
+        self.eyes, self._waited, self._lost = eyes, 0, {}
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
@@ -96,8 +94,7 @@ class Policies(Pilots):
         return self._lost
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
-        outs, goal_w = [], flight.goal_at(seen.time)
-        looked = None
+        outs, goal_w, looked = [], flight.goal_at(seen.time), None
         if self.eyes is not None:  # nobody looks any more once all have let go
             looked = self.eyes.look(flight.plant.exposed, seen, goal_w, seen.attached) if np.any(flight.flown) else self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
@@ -119,15 +116,10 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Phase:
-    """Part of a flight.
+    """Part of a flight."""
 
-    Attributes:
-        throws: whether the pilots fly, or the hover controller, which begins with empty integrals.
-        over: asked after each period.
-    """
-
-    throws: bool
-    over: Callable[["Flight"], bool]
+    throws: bool  # whether the pilots fly, or the hover controller, which begins with empty integrals
+    over: Callable[["Flight"], bool]  # asked after each period
 
 
 def throw(seconds: float | None = None) -> Phase:

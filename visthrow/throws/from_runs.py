@@ -20,11 +20,7 @@ NOTE = (
 
 
 def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
-    """Logs of all throws of some runs.
-
-    Raises:
-        LogError: a folder without throws, or a damaged log.
-    """
+    """Logs of all throws of some runs; LogError for a folder without throws, or a damaged log."""
     logs: list[FlightLog] = []
     for folder in map(Path, folders):
         found = sorted(folder.glob(PATTERN))
@@ -39,11 +35,7 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
 
 
 def entries(logs: list[FlightLog]) -> list[Entry]:
-    """An entry a policy, its throws by the distance of their goals; policies of one name and other content are told apart.
-
-    Raises:
-        LogError: a log that holds no throw.
-    """
+    """An entry a policy, its throws by the distance of their goals; policies of one name and other content are told apart."""
     groups: dict[tuple[str, str, str], dict[float, list[FlightLog]]] = {}
     for log in logs:
         try:
@@ -70,12 +62,9 @@ def _offset(log: FlightLog) -> np.ndarray:
 
 def _throws(target: float, logs: list[FlightLog]) -> Throws:
     """Throws at one distance; landing points along the throw and across it, from where the vehicle hovered."""
-    rows = [_row(log) for log in logs]
-    columns = np.array(rows, dtype=float).reshape(-1, 5)
-    success = np.isfinite(columns[:, 2])
-    return Throws(
-        target, success, columns[:, :2], columns[:, 2], columns[:, 3], np.full(len(rows), np.nan), columns[:, 4]
-    )
+    columns = np.array([_row(log) for log in logs], dtype=float).reshape(-1, 5)
+    error, duration, smooth = columns.T[2:]
+    return Throws(target, np.isfinite(error), columns[:, :2], error, duration, np.full(len(logs), np.nan), smooth)
 
 
 def _row(log: FlightLog) -> tuple[float, ...]:

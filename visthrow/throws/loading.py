@@ -15,16 +15,12 @@ from visthrow.task.fleet import specialised
 
 @dataclass(frozen=True)
 class Loaded:
-    """A policy, what to call it, and the experiment (plant, camera, task) that it is flown in.
-
-    Attributes:
-        departures: where that experiment breaks the policy's contract by allowance: dotted key -> the value flown with.
-    """
+    """A policy, what to call it, and the experiment (plant, camera, task) that it is flown in."""
 
     name: str
     policy: Policy
     experiment: Experiment
-    departures: dict[str, Any] = field(default_factory=dict)
+    departures: dict[str, Any] = field(default_factory=dict)  # where that breaks the contract by allowance: dotted key -> value flown with
 
 
 def load_policy(
@@ -68,15 +64,15 @@ def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) 
 
     Raises:
         PolicyError: the policy does not carry its config.
-        ConfigError: a wrong override.
     """
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
         raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
-    text = toml_text.dumps(config.without_none({**trained, "ppo": _learning(policy)}))
-    return config.loads(
-        Experiment, text, [*trained.get("flown", ()), *overrides], name=f"{path} (the config it was trained with)"
-    )
+    # Learning parameters are today's: they play no part in flight, and an older policy may lack a newer one.
+    layout = policy.contract.get("observation", {}).get("layout", "state")
+    learning = config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)
+    text = toml_text.dumps(config.without_none({**trained, "ppo": learning}))
+    return config.loads(Experiment, text, [*trained.get("flown", ()), *overrides], name=f"{path} (the config it was trained with)")
 
 
 def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
@@ -86,12 +82,6 @@ def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
     jitter = trained.get("latency_jitter", 0.0)
     inside = low - jitter <= seen.latency[0] - seen.latency_jitter and seen.oldest <= high + jitter
     return ("observation.latency", "observation.latency_jitter") if inside else ()
-
-
-def _learning(policy: Policy) -> dict[str, Any]:
-    """Learning parameters of today's config: they play no part in flight, and an older policy may lack a newer one."""
-    layout = policy.contract.get("observation", {}).get("layout", "state")
-    return config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)
 
 
 def unique_names(loaded: list[Loaded]) -> list[str]:

@@ -29,16 +29,8 @@ class LooseRope:
         offset_w: joints from the ball's centre, mount end first [m], shape (L, 3). velocity_w: [m/s], shape (L, 3).
     """
 
-    def __init__(
-        self, points_w: np.ndarray, velocity_w: np.ndarray, ball_w: np.ndarray, ball_vel_w: np.ndarray
-    ) -> None:
-        """Take over a rope.
-
-        Args:
-            points_w: joints, upper end first, lower end last [m], shape (L + 1, 3).
-            velocity_w: theirs [m/s], shape (L + 1, 3).
-            ball_w: the ball's centre [m], shape (3,). ball_vel_w: [m/s], shape (3,).
-        """
+    def __init__(self, points_w: np.ndarray, velocity_w: np.ndarray, ball_w: np.ndarray, ball_vel_w: np.ndarray) -> None:
+        """Take over a rope of joints [m], [m/s], upper end first, shape (L + 1, 3), and its ball's centre [m], [m/s], shape (3,)."""
         self.offset_w = np.array(points_w[:-1], dtype=float) - ball_w
         self.velocity_w = np.array(velocity_w[:-1], dtype=float) - ball_vel_w
         ends = np.vstack((self.offset_w, np.zeros(3)))
@@ -55,14 +47,10 @@ class LooseRope:
             self.velocity_w, self.offset_w = (moved - self.offset_w) / h, moved
 
     def sink(self, duration: float, ground: float) -> None:
-        """Fall and come to rest while the ball lies still.
+        """Fall and come to rest for a time [s] while the ball lies still, its centre over a ground of this height [m].
 
         From the ball outwards each joint goes to its link's length from the one before (Mueller, Kim, Chentanez, Fast
         simulation of inextensible hair and fur, 2012): not accurate, but it rests on the ground wherever it starts.
-
-        Args:
-            duration: [s].
-            ground: height of the ground from the ball's centre [m].
         """
         count = max(1, round(duration / SINKING_STEP))
         h = duration / count
@@ -77,17 +65,13 @@ class LooseRope:
     def _with_links(self, moved: np.ndarray) -> np.ndarray:
         """Put positions back onto the links, along the links' directions before the step."""
         before = np.diff(np.vstack((self.offset_w, np.zeros(3))), axis=0)
-        size = len(before)
+        weight = np.append(np.full(len(before) - 1, 2.0), 1.0)  # the ball does not give way
         for _ in range(ITERATIONS):
             now = np.diff(np.vstack((moved, np.zeros(3))), axis=0)
             excess = np.sum(now * now, axis=1) - self._lengths**2
-            jacobian = np.zeros((size, size))
-            index = np.arange(size)
-            weight = np.full(size, 2.0)
-            weight[-1] = 1.0  # the ball does not give way
-            jacobian[index, index] = 2.0 * weight * np.sum(now * before, axis=1)
-            jacobian[index[1:], index[:-1]] = -2.0 * np.sum(now[1:] * before[:-1], axis=1)
-            jacobian[index[:-1], index[1:]] = -2.0 * np.sum(now[:-1] * before[1:], axis=1)
+            jacobian = np.diag(2.0 * weight * np.sum(now * before, axis=1))
+            jacobian += np.diag(-2.0 * np.sum(now[1:] * before[:-1], axis=1), -1)
+            jacobian += np.diag(-2.0 * np.sum(now[:-1] * before[1:], axis=1), 1)
             push = np.linalg.solve(jacobian, excess)[:, None] * before
             moved = moved + push
             moved[1:] -= push[:-1]

@@ -26,11 +26,7 @@ PLANTS = {
 
 
 def known_plant(name: str) -> str:
-    """Return a name of :data:`PLANTS`.
-
-    Raises:
-        ConfigError: no plant of that name.
-    """
+    """Return a name of :data:`PLANTS`; ConfigError for another."""
     if name not in PLANTS:
         raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
     return name
@@ -80,23 +76,14 @@ class HybridPlant:
     name = "hybrid"
 
     def __init__(
-        self,
-        experiment: Experiment,
-        count: int = 1,
-        seed: int = 0,
-        device: str = "cpu",
-        noise: NoiseParams | None = None,
-        latency: tuple[float, float] = (0.0, 0.0),
-        start: RandomizationParams | None = None,
-        motors: bool = False,
-    ) -> None:
-        """Build the simulator.
+        self, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu", noise: NoiseParams | None = None,
+        latency: tuple[float, float] = (0.0, 0.0), start: RandomizationParams | None = None, motors: bool = False,
+    ) -> None:  # fmt: skip
+        """Build the simulator of an experiment's plant.
 
         Args:
-            experiment: whose plant it is.
-            count: E.
+            experiment, count, device: see above; E; "cpu" or "cuda:0".
             seed: of the measurements' noise.
-            device: "cpu" or "cuda:0".
             noise: of the measurements, in each quantity's SI unit as in training; None for none.
             latency: range that each vehicle's age of measurements is drawn from at a reset [s].
             start: with it, vehicles, ropes and starts are those of :func:`visthrow.training.protocol.throw` with the same seed and
@@ -125,8 +112,7 @@ class HybridPlant:
         self._begin()
 
     def _begin(self) -> None:
-        self.time = 0.0
-        count = self.count
+        self.time, count = 0.0, self.count
         self._state: Snapshot | None = None  # since the last step; made when somebody asks
         self._latched, self._separation = np.zeros(count, bool), np.full(count, np.nan)
         self._ropes: list[LooseRope | None] = [None] * count
@@ -158,13 +144,9 @@ class HybridPlant:
         self.time += self.period
 
     def hold(self, names: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-        """Put bodies and ropes back to where an earlier call found them; motors and battery go on.
+        """Put bodies and ropes back to where an earlier call found them, or only look; motors and battery go on.
 
-        Args:
-            names: what that call returned; None only looks.
-
-        Returns:
-            State arrays of bodies and ropes.
+        Takes and returns state arrays of bodies and ropes.
         """
         self._state = None
         for name, value in (names or {}).items():
@@ -259,7 +241,6 @@ class HybridPlant:
         return self._erring(self.state)
 
     def _erring(self, now: Snapshot) -> Snapshot:
-        """A state with the error of the last measurement."""
         if self.noise is None:
             return now
         error = self._error
@@ -280,19 +261,12 @@ class ReferenceAdapter:
     """The reference plant, with the pinned extras or with none but the latency and drag that the policy was trained for."""
 
     def __init__(self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True) -> None:
-        """Build the plant.
-
-        Args:
-            experiment: whose plant it is.
-            count: E.
-            seed: of everything random.
-            realistic: with the extras of ``configs/vehicle/reference_realistic.toml``.
-        """
+        """Build the plant; a realistic one has the extras of ``configs/vehicle/reference_realistic.toml``."""
         from sim.reference.extras import ReferenceExtras
         from sim.reference.plant import ReferencePlant
 
-        known = {"payload_drag": experiment.rope.payload_drag}
-        trained = ReferenceExtras(mocap_latency=float(np.mean(experiment.task.observation.latency)), **known)
+        latency = float(np.mean(experiment.task.observation.latency))
+        trained = ReferenceExtras(mocap_latency=latency, payload_drag=experiment.rope.payload_drag)
         extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic")) if realistic else trained
         self.name = "reference-realistic" if realistic else "reference"
         self.params, self.count = plant_of(experiment), count
@@ -315,11 +289,7 @@ class ReferenceAdapter:
 
 
 def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu") -> Plant:
-    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and latency.
-
-    Raises:
-        ConfigError: no plant of that name.
-    """
+    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and latency."""
     if known_plant(name) == "hybrid":
         return HybridPlant(experiment, count, seed, device, experiment.task.noise, experiment.task.observation.latency)
     return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")

@@ -29,18 +29,10 @@ MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "pa
 
 
 class Recording(Recorder):
-    """A flight log of each vehicle: what is true at each period's beginning, and what is sent then.
-
-    Attributes:
-        recorders: one a vehicle.
-    """
+    """A flight log of each vehicle, ``recorders``: what is true at each period's beginning, and what is sent then."""
 
     def __init__(self, names: Sequence[str], count: int, meta: dict[str, Any]) -> None:
-        """Start empty.
-
-        Args:
-            names: standard channels that a snapshot has. count: of vehicles. meta: of every log.
-        """
+        """Start empty, with standard channels that a snapshot has."""
         self.names, self.recorders = names, [FlightRecorder(meta) for _ in range(count)]
 
     def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
@@ -51,17 +43,12 @@ class Recording(Recorder):
 
 
 class _Full(Recording):
-    """Everything of one vehicle: the rope down to the ground and what the camera sees too.
-
-    Attributes:
-        latch: when the release was asked for [s]; None before.
-    """
+    """Everything of one vehicle: the rope down to the ground, what the camera sees, and when the release was asked for, ``latch`` [s]."""
 
     def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:
         truth = ("payload_vel_w", "motor_speed", "battery_voltage", "attached")
         super().__init__((*MEASURED, *truth), 1, meta)
-        self.pilots = pilots
-        self.latch: float | None = None
+        self.pilots, self.latch = pilots, None
         for name, unit in MEASURED.items():
             self.recorders[0].declare(f"measured_{name}", unit, "body" if name == "rate_b" else "world")
         self._resting: LooseRope | None = None
@@ -118,9 +105,7 @@ def fly(
     Args:
         loaded: policy and experiment.
         goal_w: on the ground [m], shape (3,).
-        plant_name: of :data:`visthrow.throws.plants.PLANTS`.
-        seed: of start, plant and measurements.
-        device: of the training simulator.
+        plant_name: of :data:`visthrow.throws.plants.PLANTS`. seed: of start, plant and measurements. device: of the training simulator.
         eyes: of one vehicle, whose rendered pictures keypoints come from; recorded are those that the policy was shown.
 
     Returns:
@@ -151,22 +136,15 @@ def fly(
 
 
 def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
-    """Refuse a goal that no throw reaches.
-
-    Raises:
-        ConfigError: not three finite numbers, or further than the vehicle may fly.
-    """
+    """Refuse a goal that is not three finite numbers, or further than the vehicle may fly, with a ConfigError."""
     goal_w = np.asarray(goal_w, dtype=float)
     limit = loaded.experiment.task.bounds.horizontal
     if goal_w.shape != (3,) or not np.all(np.isfinite(goal_w)):
         raise ConfigError(f"goal {goal_w}; expected three finite numbers [m]")
-    distance = float(np.hypot(*goal_w[:2]))
-    trained = loaded.experiment.task.start.goal_radius
+    distance, trained = float(np.hypot(*goal_w[:2])), loaded.experiment.task.start.goal_radius
     if distance > limit:
-        raise ConfigError(
-            f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m, and '{loaded.name}' was "
-            f"trained on goals within {trained:g} m"
-        )
+        where = f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m"
+        raise ConfigError(f"{where}, and '{loaded.name}' was trained on goals within {trained:g} m")
 
 
 def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dict[str, Any]:
@@ -212,7 +190,6 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     recorder.meta |= {"times": times, "result": result}
     log = recorder.log()
     if "separation" in times:
-        payload, begins = log["payload_pos_w"], np.array([times["separation"]])
-        at = np.column_stack([np.interp(begins, payload.time, payload.values[:, i]) for i in range(3)])
-        log.channels["separation"] = Channel(begins, at, "m", "world")
+        begins = times["separation"]
+        log.channels["separation"] = Channel(np.array([begins]), log["payload_pos_w"].at(begins)[None], "m", "world")
     return log

@@ -60,9 +60,7 @@ def batch_plant(
     return make_plant(plant_name, experiment, count, int(seeds.generate_state(1)[0])), np.random.default_rng(seeds)
 
 
-def place_in_hover(
-    plant: Plant, experiment: Experiment, start: RandomizationParams, rng: np.random.Generator
-) -> np.ndarray:
+def place_in_hover(plant: Plant, experiment: Experiment, start: RandomizationParams, rng: np.random.Generator) -> np.ndarray:
     """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m], shape (3,)."""
     home = np.array([0.0, 0.0, start.spawn_height])
     spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (plant.count, 3))
@@ -72,13 +70,7 @@ def place_in_hover(
 
 
 def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes | None" = None) -> dict[str, np.ndarray]:
-    """Fly one batch.
-
-    Args:
-        loaded: the policies; those that share the batch are trained for one plant.
-        plant_name: of :data:`visthrow.throws.plants.PLANTS`.
-        job: target, count and seed.
-        eyes: of as many vehicles, whose rendered pictures keypoints come from.
+    """Fly one batch of policies that are trained for one plant, on the rendered pictures of ``eyes`` where there are any.
 
     Returns:
         :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws first, and ``goal_w`` where goals
@@ -114,9 +106,7 @@ def batches(throws: int, size: int = BATCH) -> list[tuple[int, int]]:
     return [(first // size, min(size, throws - first)) for first in range(0, throws, size)]
 
 
-def plan(
-    policies: int, targets: Sequence[float], throws: int, seed: int, together: bool = False, size: int = BATCH
-) -> list[Job]:
+def plan(policies: int, targets: Sequence[float], throws: int, seed: int, together: bool = False, size: int = BATCH) -> list[Job]:
     """Cut throws of each policy at each target into batches, with all policies in one batch or each in its own."""
     groups = [tuple(range(policies))] if together else [(i,) for i in range(policies)]
     cut = batches(throws, size)
@@ -134,14 +124,10 @@ class Throwing(Workers):
         self, loaded: Sequence[Loaded], targets: Sequence[float], throws: int, plant_name: str, seed: int,
         processes: int | None = None, together: bool = False, size: int = BATCH,
     ) -> None:  # fmt: skip
-        """Start.
+        """Start so many throws of each policy at each target [m] along x.
 
         Args:
-            loaded: the policies.
-            targets: [m] along x.
-            throws: of each policy at each target.
-            plant_name: of :data:`visthrow.throws.plants.PLANTS`.
-            seed: of everything random.
+            loaded, targets, throws, plant_name, seed: of everything random.
             processes: default one a core, and no more than there are batches.
             together: fly all policies in one batch, which is cheaper for a few throws; they must share a plant.
             size: throws of a policy in a batch; fewer are sooner done where there are more cores. Other sizes, other draws.
@@ -159,11 +145,7 @@ class Throwing(Workers):
         super().__init__(flown, self.jobs, processes or cores(), "throws on the reference plant")
 
     def results(self, show: bool = True) -> list[list[Throws]]:
-        """Wait, with a progress line on a terminal.
-
-        Returns:
-            For each policy, a :class:`visthrow.task.measurement.Throws` a target.
-        """
+        """Wait, with a progress line on a terminal; returns for each policy a :class:`visthrow.task.measurement.Throws` a target."""
         self.label *= show
         found = dict(self)
         parts = [found[index] for index in range(len(self.jobs))]

@@ -36,18 +36,14 @@ DIGITS = 4
 class Result:
     """Throws of one unit.
 
-    Attributes:
-        unit: what they depend on.
-        columns: one row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m], ``duration`` [s] and whatever
-            else was measured; NaN where a throw failed.
-        provenance: commit, command, time [UTC], seconds of work.
-        extra: further figures of the whole unit.
+    Its columns have a row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m], ``duration`` [s] and whatever else
+    was measured; NaN where a throw failed.
     """
 
-    unit: dict[str, Any]
+    unit: dict[str, Any]  # what they depend on
     columns: dict[str, np.ndarray]
-    provenance: dict[str, Any] = field(default_factory=dict)
-    extra: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)  # commit, command, time [UTC], seconds of work
+    extra: dict[str, Any] = field(default_factory=dict)  # further figures of the whole unit
 
     @property
     def key(self) -> str:
@@ -65,10 +61,7 @@ class Result:
 
     @property
     def miss(self) -> np.ndarray:
-        """Landing points of the successful throws relative to the target [m], shape (N, 2): along x, to the left.
-
-        Where the target moves it is meant where it was at impact (column ``goal_w``).
-        """
+        """Landing points of the successful throws from the target, or where it was at impact [m], shape (N, 2): along x, to the left."""
         goal = self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
         return self.of("landing_w") - goal
 
@@ -96,19 +89,14 @@ def policy_unit(
     policy: str, weights: str, layout: str, plant: str, target: float, throws: int, seed: int = 0, *,
     run: str = "", variant: str = "full", train_seed: int | None = None, departures: dict[str, Any] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Unit of throws with a learnt policy.
+    """Unit of so many throws with a learnt policy at a target [m] along x.
 
     Args:
-        policy: what it is called.
-        weights: :func:`hash_of` its file.
-        layout: "state" or "vision".
-        plant: of :data:`visthrow.throws.plants.PLANTS`.
-        target: [m] along x.
-        throws: how many.
-        seed: of starts and noise.
-        run: training config.
+        policy, weights: what it is called, and :func:`hash_of` its file.
+        layout, plant: "state" or "vision"; of :data:`visthrow.throws.plants.PLANTS`.
+        target, throws, seed: of starts and noise.
+        run, train_seed: config and seed of its training.
         variant: "full", or the name of what the training lacked or had more of.
-        train_seed: of the training.
         departures: config key -> value, where the throws are flown under other conditions than the policy's own.
     """
     return {
@@ -126,31 +114,19 @@ def columns_of(throws: Any) -> dict[str, np.ndarray]:
 
 
 def save(folder: str | Path, result: Result) -> Path:
-    """Write one result as ``<key>.json``.
-
-    Raises:
-        StorageError: the place cannot be written.
-    """
+    """Write one result as ``<key>.json``."""
     path = Path(folder) / f"{result.key}.json"
-    write_compact(path, _to_json(result))
+    write_line(path, _to_json(result))
     return path
 
 
-def write_compact(path: str | Path, value: Any) -> None:
-    """Write JSON with one line a result, atomically."""
-    if isinstance(value, dict) and "results" in value:
-        lines = ",\n".join(json.dumps(item, allow_nan=False, separators=(",", ":")) for item in value["results"])
-        atomic_write(path, f'{{"results": [\n{lines}\n]}}\n')
-    else:
-        atomic_write(path, json.dumps(value, allow_nan=False) + "\n")
+def write_line(path: str | Path, value: Any) -> None:
+    """Write JSON in one line, atomically."""
+    atomic_write(path, json.dumps(value, allow_nan=False) + "\n")
 
 
 def load(path: str | Path) -> list[Result]:
-    """Read the results of one file, a single one or a packed record.
-
-    Raises:
-        StorageError: not such a file.
-    """
+    """Read the results of one file, a single one or a packed record; StorageError where it is no such file."""
     try:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
         return [_from_json(item) for item in value.get("results", [value])]
@@ -199,29 +175,21 @@ def _joined(group: list[Result]) -> Result:
 def pack(results: Iterable[Result], path: str | Path) -> None:
     """Write results into one file, sorted by what they are, so that the same results give the same file."""
     ordered = sorted(results, key=lambda result: json.dumps(result.unit, sort_keys=True))
-    write_compact(path, {"results": [_to_json(result) for result in ordered]})
+    lines = ",\n".join(json.dumps(_to_json(result), allow_nan=False, separators=(",", ":")) for result in ordered)
+    atomic_write(path, f'{{"results": [\n{lines}\n]}}\n')
 
 
 def work(
-    units: Sequence[dict[str, Any]],
-    folder: str | Path,
-    function: Callable[[dict[str, Any]], tuple[dict[str, np.ndarray], dict[str, Any]]],
-    known: dict[str, Result] | None = None,
-    processes: int = 1,
-    say: Callable[[str], None] = lambda text: None,
-) -> dict[str, Result]:
-    """Do what is not done yet.
+    units: Sequence[dict[str, Any]], folder: str | Path, function: Callable[[dict], tuple[dict[str, np.ndarray], dict[str, Any]]],
+    known: dict[str, Result] | None = None, processes: int = 1, say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Result]:  # fmt: skip
+    """Do what the folder does not hold yet, in order, in so many processes at once; returns the results of all units by key.
 
     Args:
-        units: in the order in which they are wanted.
-        folder: of the finished ones.
+        units, folder: what is wanted, and where each result is written when it is done.
         function: of a unit, importable by its name; returns columns and extra figures.
         known: results from elsewhere, by key; they count as done.
-        processes: that work at once; 1 works in this one.
-        say: told of the progress.
-
-    Returns:
-        Results of all units by key.
+        processes, say: 1 works in this one; told of the progress.
     """
     results = {**load_all([folder]), **(known or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
@@ -242,18 +210,12 @@ def finish(folder: str | Path, function: Callable, commit: str, command: str, un
         "commit": commit, "command": command, "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": round(time.perf_counter() - begin, 2),
     }  # fmt: skip
-    result = Result(unit, columns, origin, extra)
-    save(folder, result)
-    return load(Path(folder) / f"{result.key}.json")[0]
+    return load(save(folder, Result(unit, columns, origin, extra)))[0]
 
 
 def _to_json(result: Result) -> dict[str, Any]:
-    return {
-        "unit": result.unit,
-        "throws": {name: _plain(value) for name, value in result.columns.items()},
-        "provenance": result.provenance,
-        "extra": result.extra,
-    }
+    throws = {name: _plain(value) for name, value in result.columns.items()}
+    return {"unit": result.unit, "throws": throws, "provenance": result.provenance, "extra": result.extra}
 
 
 def _plain(value: np.ndarray) -> list:

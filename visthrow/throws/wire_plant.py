@@ -3,7 +3,7 @@
 ``hil`` imports no simulator; it is given ``"visthrow.throws.wire_plant:make"``.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,14 +13,9 @@ from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
-PERIOD = 0.005
-"""Step of the plant behind the wire [s]: commands that come between two control periods wait no longer than this."""
-
-
 MECHANISM = 0.06
 """From the trip of the latch to separation behind a firmware [s]: a quick servo, so that the firmware's own delay has room
 within the lag that the policies were trained with."""
-
 
 CARRIED = 0.8
 """Share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all where it stands too high."""
@@ -30,19 +25,14 @@ class WirePlant:
     """One vehicle with its payload; NumPy in and out, batch axis left out.
 
     Attributes:
-        period: of a step [s]. home_w: hover point [m]. mass: with and without payload [kg].
-        max_thrust: that a thrust of 1 stands for [N].
+        period: of a step [s]: commands that come between two control periods wait no longer than this.
+        home_w: hover point [m]. mass: with and without payload [kg]. max_thrust: that a thrust of 1 stands for [N].
     """
 
-    period = PERIOD
+    period = 0.005
 
     def __init__(self, experiment: Experiment, seed: int) -> None:
-        """Put the vehicle near its hover point, the rope swinging a little.
-
-        Args:
-            experiment: whose plant it is.
-            seed: of the start.
-        """
+        """Put the vehicle near its hover point, the rope swinging a little."""
         self._plant = self._built(experiment)
         self.home_w = np.array([0.0, 0.0, experiment.task.start.spawn_height])
         self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
@@ -55,20 +45,14 @@ class WirePlant:
 
     def _fine(self, experiment: Experiment) -> Experiment:
         """The experiment with this plant's period, nothing measured late."""
-        observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0))
-        return dataclasses.replace(
-            experiment,
-            sim=dataclasses.replace(experiment.sim, control_period=self.period),
-            task=dataclasses.replace(experiment.task, observation=observation),
-        )
+        observation = replace(experiment.task.observation, latency=(0.0, 0.0))
+        sim, task = replace(experiment.sim, control_period=self.period), replace(experiment.task, observation=observation)
+        return replace(experiment, sim=sim, task=task)
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
 
-        Args:
-            command: see above.
-            release: whether the latch trips in this period, or has before.
-            after: from the period's beginning to that [s].
+        ``release``: whether the latch trips in this period, so long after its beginning [s], or has before.
         """
         first = release and not self._plant.state.latched[0]
         self._plant.step(np.asarray(command)[None], np.array([release]))
@@ -100,12 +84,7 @@ class WirePlant:
 
 
 def make(policy: str, seed: int) -> WirePlant:
-    """The plant that a policy was trained on.
-
-    Args:
-        policy: a shipped name or a file.
-        seed: of the start.
-    """
+    """The plant that a policy, a shipped name or a file, was trained on."""
     return WirePlant(load_policy(policy).experiment, seed)
 
 
@@ -148,10 +127,9 @@ class MotorPlant(WirePlant):
         self.quat_wb, self.rate_b = self._now["quat_wb"], self._now["rate_b"]
 
     def _built(self, experiment: Experiment) -> HybridPlant:
-        queue = dataclasses.replace(experiment.vehicle.queue, delay=0.0)  # the firmware's own path comes in its place
-        vehicle = dataclasses.replace(experiment.vehicle, queue=queue)
-        release = dataclasses.replace(experiment.release, lag=MECHANISM)
-        return HybridPlant(self._fine(dataclasses.replace(experiment, vehicle=vehicle, release=release)), motors=True)
+        queue = replace(experiment.vehicle.queue, delay=0.0)  # the firmware's own path comes in its place
+        vehicle, release = replace(experiment.vehicle, queue=queue), replace(experiment.release, lag=MECHANISM)
+        return HybridPlant(self._fine(replace(experiment, vehicle=vehicle, release=release)), motors=True)
 
     @property
     def held(self) -> bool:
@@ -175,10 +153,5 @@ class MotorPlant(WirePlant):
 
 
 def make_motors(policy: str, seed: int) -> MotorPlant:
-    """The plant that a policy was trained on, flown by motor commands.
-
-    Args:
-        policy: a shipped name or a file.
-        seed: of the start.
-    """
+    """The plant that a policy was trained on, flown by motor commands."""
     return MotorPlant(load_policy(policy).experiment, seed)

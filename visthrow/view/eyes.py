@@ -17,6 +17,7 @@ from camera.detectors.scenes.textures import HELD_OUT, photographs
 from camera.fisheye import Fisheye
 from camera.keypoints import KEYPOINTS, KeypointCamera
 from camera.params import CameraParams
+from visthrow.common.storage import atomic_write
 from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)
@@ -45,17 +46,12 @@ class Eyes:
         self, params: CameraParams, mount_b: Sequence[float], below: float, count: int, seed: int, device: str = "cpu",
         by: str = "learnt", samples: int = 4, nuisances: Nuisances | None = None, weights: str | None = None, keep: bool = False,
     ) -> None:  # fmt: skip
-        """Draw the halls.
+        """Draw the halls; ValueError for another detector, no weights, no photographs.
 
         Args:
             params: camera. mount_b: of the rope [m], body frame. below: the ball's centre hangs so far below it [m].
-            count: E. seed: of halls and sensors. device: of the renderer.
-            by: one of `BY`. samples: rays a pixel.
-            nuisances: of the pictures; left out, all. weights: of the learnt detector; left out, those that are shipped.
-            keep: whether frames are kept.
-
-        Raises:
-            ValueError: another detector, no weights, no photographs.
+            count: E. seed: of halls and sensors. device: of the renderer. by: one of `BY`. samples: rays a pixel.
+            nuisances: left out, all. weights: of the learnt detector; left out, those that are shipped. keep: whether frames are kept.
         """
         if by not in BY:
             raise ValueError(f"detector '{by}'; expected one of {', '.join(BY)}")
@@ -69,9 +65,8 @@ class Eyes:
             self.detector: Detector = LearntDetector(lens, params.payload_radius, params.goal_side, networks=networks)
         else:
             self.detector = Detector(lens, params.payload_radius, params.goal_side)
-        self.camera = KeypointCamera(params)
+        self.camera, self._looks = KeypointCamera(params), 0
         self._hall: Scenes | None = None
-        self._looks = 0
         self._followed: list[Following] = []
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
@@ -79,15 +74,11 @@ class Eyes:
         self._hits = {name: np.zeros(count, int) for name in THINGS}  # looks of each vehicle in which it was found
 
     def look(self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take and look at a picture of each vehicle.
+        """Take and look at a picture of each vehicle: normalised keypoints, float32, shape (E, 8, 2), and validity, shape (E, 8).
 
         Args:
             now: truth, a `visthrow.throws.plants.Snapshot`. measured: likewise, what poses tell: attitude and height help the detector.
-            goal_w: [m], shape (E, 3).
-            carried: which payloads hang, shape (E,).
-
-        Returns:
-            Normalised keypoints, float32, shape (E, 8, 2), and validity, shape (E, 8).
+            goal_w: [m], shape (E, 3). carried: which payloads hang, shape (E,).
         """
         pictures = self.renderer.render(self._scenes(now, goal_w, np.asarray(carried)), self._looks).cpu().numpy()
         self._looks += 1
@@ -101,7 +92,7 @@ class Eyes:
             one, ok = detected_keypoints(self.camera, seen, rots[e])
             points[e], valid[e] = one.numpy(), ok.numpy()
             if e == 0 and self._keep:
-                self.frames.append((np.ascontiguousarray(pictures[0, ..., ::-1]), one, ok))
+                self.frames.append((picture, one, ok))
         self.seen = points, valid
         return points, valid
 
@@ -128,19 +119,15 @@ class Eyes:
         return self._followed[e].take(seen, rot_wc, stamp)
 
     def sheet(self, path: Path, columns: int = 3) -> Path:
-        """Draw six of the kept frames, spread over the throw, with what was found; returns the path.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Draw six of the kept frames, spread over the throw, with what was found; returns the path."""
         import cv2
 
         from camera.overlay import draw_overlay
 
         chosen = [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 2 * columns).round().astype(int)]
         drawn = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]
-        if not cv2.imwrite(str(path), np.vstack([np.hstack(drawn[:columns]), np.hstack(drawn[columns:])])):
-            raise OSError(f"{path} cannot be written")
+        sheet = np.vstack([np.hstack(drawn[:columns]), np.hstack(drawn[columns:])])
+        atomic_write(path, cv2.imencode(".png", sheet)[1].tobytes())
         return path
 
     def _scenes(self, now: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
@@ -148,10 +135,7 @@ class Eyes:
         tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
         rot = rotation_from_quat(tensor(now.quat_wb))
         plain = posed_scenes(self.params, tensor(now.pos_w), rot, tensor(now.payload_pos_w), tensor(goal_w), torch.from_numpy(carried))
-        if self._hall is None:
-            draw = Draw(*self._draw)
-            self._hall = dressed(plain, draw, self.renderer.textures, self._nuisances)
-        hall = self._hall
+        hall = self._hall = self._hall or dressed(plain, Draw(*self._draw), self.renderer.textures, self._nuisances)
         rate = tensor(now.rate_b)
         turned = rate @ self.camera.rot_cb.T
         lens = torch.linalg.cross(rate, self.camera.position_b.expand(self.count, 3))

@@ -76,16 +76,16 @@ def _axes(count: int, columns: int, width: float, height: float, more: float, sh
     return figure, axes
 
 
-def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float | None = None, log: bool = False) -> bytes:
-    """Values with intervals, one below the other; crosses stand for the paper's.
+def _labelled(axes: Any, below: str | None, left: str, **look: Any) -> None:
+    """Name the outer axes of a grid."""
+    for axis in axes[-1] if below else ():
+        axis.set_xlabel(below, **look)
+    for axis in axes[:, 0]:
+        axis.set_ylabel(left, **look)
 
-    Args:
-        rows: from the top.
-        xlabel: with unit.
-        series: names of the colours.
-        zero: where a line stands that an interval is to be compared with.
-        log: a logarithmic axis.
-    """
+
+def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float | None = None, log: bool = False) -> bytes:
+    """Values with intervals, one below the other; crosses stand for the paper's, a line at ``zero`` for what they are compared with."""
     style.use()
     import matplotlib.pyplot as plt
 
@@ -94,20 +94,18 @@ def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float 
     figure, axis = plt.subplots(figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained")
     shown = {}
     for row in rows:
-        colour, marker = _look(row.series)
+        (colour, marker), value, paper = _look(row.series), row.interval, row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
-        value = row.interval
         axis.plot([value.low, value.high], [y, y], "-", color=colour, lw=2.2, solid_capstyle="butt", alpha=0.55)
         shown[row.series] = axis.plot(value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3)[0]
-        if row.paper is not None:
-            above = y + 0.14
-            ends = [max(row.paper.low, 0.1 * row.paper.value) if log else row.paper.low, row.paper.high]
-            axis.plot(ends, [above, above], "-", color=style.QUIET, lw=1.0)
-            shown[len(series)] = axis.plot(row.paper.value, above, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
+        if paper is not None:
+            ends = [max(paper.low, 0.1 * paper.value) if log else paper.low, paper.high]
+            axis.plot(ends, [y + 0.14] * 2, "-", color=style.QUIET, lw=1.0)
+            shown[len(series)] = axis.plot(paper.value, y + 0.14, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
     if zero is not None:
         axis.axvline(zero, color=style.QUIET, lw=1.0, ls=(0, (4, 3)), zorder=1)
     if log:
-        _log_axis(axis.xaxis, "x", axis)
+        _log_axis(axis, "x")
     axis.set_yticks([-i for i in range(len(names))], names)
     axis.set_ylim(-len(names) + 0.45, 0.55)
     axis.tick_params(axis="y", length=0)
@@ -115,16 +113,16 @@ def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float 
     axis.set_axisbelow(True)
     axis.set_xlabel(xlabel)
     if len(shown) > 1:
-        names = [*series, "the paper's vehicle"]
-        keys = sorted(shown)
+        keys, names = sorted(shown), [*series, "the paper's vehicle"]
         figure.legend([shown[key] for key in keys], [names[key] for key in keys], loc="outside right upper")
     return png_of(figure)
 
 
-def _log_axis(which, name: str, axis) -> None:
+def _log_axis(axis, name: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     getattr(axis, f"set_{name}scale")("log")
+    which = getattr(axis, f"{name}axis")
     which.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     which.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     which.set_minor_formatter(NullFormatter())
@@ -133,9 +131,7 @@ def _log_axis(which, name: str, axis) -> None:
 def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3, heading: str = "") -> bytes:
     """Landing points from above, the throw upwards.
 
-    Args:
-        panels: title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
-        columns: panels side by side. heading: above all of them.
+    A panel is a title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
     """
     far = max((np.abs(points).max() for _, series in panels for _, points in series if len(points)), default=0.2)
     half = float(np.clip(1.06 * far, 0.12, 0.7))
@@ -149,10 +145,7 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
             _landings(axis, points, half, i, label)
         axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
         axis.set_title(title, fontsize=10.5 if columns <= 3 else 8.5)
-    for axis in axes[-1]:
-        axis.set_xlabel("lateral, to the right [m]")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("along the throw [m]")
+    _labelled(axes, "lateral, to the right [m]", "along the throw [m]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     if len(labels) > 1:
         figure.legend(handles, labels, loc=f"outside {'lower' if heading else 'upper'} center", ncols=min(len(labels), 3))
@@ -168,10 +161,8 @@ def _target(axis, half: float) -> None:
         if radius < half:
             axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.8, ls=(0, (4, 3)), zorder=1))
         if 0.3 * half < radius < half:
-            axis.annotate(
-                f"{radius:g} m", (0.7071 * radius, -0.7071 * radius), fontsize=7.5, color=style.QUIET, xytext=(2, -2),
-                textcoords="offset points", ha="left", va="top", zorder=2,
-            )  # fmt: skip
+            place = {"xytext": (2, -2), "textcoords": "offset points", "ha": "left", "va": "top", "zorder": 2}
+            axis.annotate(f"{radius:g} m", (0.7071 * radius, -0.7071 * radius), fontsize=7.5, color=style.QUIET, **place)
     axis.plot(0, 0, "+", color=style.INK, ms=12, mew=1.4, zorder=5)
     axis.grid(True)
     axis.set_axisbelow(True)
@@ -217,7 +208,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
             axis.text(0.03, 0.02, said, transform=axis.transAxes, fontsize=7.5, color=style.QUIET, va="bottom")
         axis.set_title(panel.title, fontsize=10.5)
         axis.set_xlabel("from start to landing [s]")
-        _log_axis(axis.yaxis, "y", axis)
+        _log_axis(axis, "y")
         axis.grid(True, which="major")
     axes[0, 0].set_ylabel("mean landing error [m]")
     figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=2, fontsize=9)
@@ -239,11 +230,10 @@ def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3, log: bool = F
         axis.grid(True)
         axis.set_axisbelow(True)
         if log:
-            _log_axis(axis.yaxis, "y", axis)
+            _log_axis(axis, "y")
         else:
             axis.set_ylim(bottom=0.0)
-    for axis in axes[:, 0]:
-        axis.set_ylabel(ylabel)
+    _labelled(axes, None, ylabel)
     if len(labels) > 1:
         figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=min(len(labels), 4 if columns > 1 else 2))
     return png_of(figure)
@@ -265,12 +255,9 @@ def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:
     for axis, (title, runs) in zip(axes.flat, groups):
         for i, run in enumerate(runs):
             axis.plot(run[0] / 1e6, run[1], color=style.COLOURS[i % len(style.COLOURS)], lw=1.2)
-        _log_axis(axis.yaxis, "y", axis)
+        _log_axis(axis, "y")
         axis.set_title(title, fontsize=7.5)
         axis.tick_params(labelsize=7.5)
         axis.grid(True, which="major")
-    for axis in axes[-1]:
-        axis.set_xlabel("million steps", fontsize=8)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("error [m]", fontsize=8)
+    _labelled(axes, "million steps", "error [m]", fontsize=8)
     return png_of(figure)

@@ -57,12 +57,7 @@ Message = tuple[float, str, str, dict[str, Any]]
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
-    """Write a flight, whole or not at all.
-
-    Args:
-        path: The file.
-        log: Of :func:`visthrow.throws.recorded.fly`, or of a run.
-        experiment: For the camera and the ball's size, as of :func:`visthrow.view.rerun_view.write`.
+    """Write a flight of :func:`visthrow.throws.recorded.fly`, or of a run, whole or not at all.
 
     Raises:
         LogError: The package mcap is not installed, or the log has no sample.
@@ -91,17 +86,19 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
     """Messages of a whole flight, topic after topic."""
+
+    def placed(time: float, topic: str, pose: dict[str, Any]) -> Message:
+        return time, topic, "foxglove.PoseInFrame", {"timestamp": _stamp(time - begin), "frame_id": "world", "pose": pose}
+
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)
         for time, place, turn in zip(log["pos_w"].time, log["pos_w"].values, turns, strict=True):
             moved = {"parent_frame_id": "world", "child_frame_id": "vehicle", "translation": _xyz(place), "rotation": _xyzw(turn)}
             yield time, "/tf", "foxglove.FrameTransform", {"timestamp": _stamp(time - begin), **moved}
-            pose = {"position": _xyz(place), "orientation": _xyzw(turn)}
-            yield time, "/vehicle", "foxglove.PoseInFrame", {"timestamp": _stamp(time - begin), "frame_id": "world", "pose": pose}
+            yield placed(time, "/vehicle", _pose(place, turn))
     for name, topic in (("payload_pos_w", "/payload"), ("goal_w", "/goal")):
         for time, place in _rows(log, name):
-            pose = {"position": _xyz(place), "orientation": _xyzw((0.0, 0.0, 0.0, 1.0))}
-            yield time, topic, "foxglove.PoseInFrame", {"timestamp": _stamp(time - begin), "frame_id": "world", "pose": pose}
+            yield placed(time, topic, _pose(place))
     for time, row in _rows(log, "command"):
         yield time, "/command", "visthrow.Command", dict(zip(("thrust_n", "rate_x", "rate_y", "rate_z"), map(float, row), strict=True))
     yield from _scene(log, experiment, begin)
@@ -120,14 +117,14 @@ def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
     width, side = 2.0 * experiment.rope.payload_radius, experiment.camera.goal_side
     things: list[tuple[str, str, Any]] = [
         ("cable_points_w", "rope", lambda row: {"lines": [{
-            "type": 0, "pose": _placed((0.0, 0.0, 0.0)), "thickness": 0.006, "scale_invariant": False, "points": [_xyz(p) for p in row],
+            "type": 0, "pose": _pose((0.0, 0.0, 0.0)), "thickness": 0.006, "scale_invariant": False, "points": [_xyz(p) for p in row],
             "color": _rgba(0.35, 0.3, 0.25), "colors": [], "indices": [],
         }]}),
         ("payload_pos_w", "ball", lambda row: {"spheres": [{
-            "pose": _placed(row), "size": _xyz([width] * 3), "color": _rgba(0.8, 0.85, 0.1),
+            "pose": _pose(row), "size": _xyz([width] * 3), "color": _rgba(0.8, 0.85, 0.1),
         }]}),
         ("goal_w", "goal", lambda row: {"cubes": [{
-            "pose": _placed(row), "size": _xyz([side, side, 0.004]), "color": _rgba(0.2, 0.7, 0.3),
+            "pose": _pose(row), "size": _xyz([side, side, 0.004]), "color": _rgba(0.2, 0.7, 0.3),
         }]}),
     ]  # fmt: skip
     for name, entity, shape in things:
@@ -172,8 +169,8 @@ def _xyzw(values: Any) -> dict[str, float]:
     return dict(zip("xyzw", map(float, values), strict=True))
 
 
-def _placed(place: Any) -> dict[str, Any]:
-    return {"position": _xyz(place), "orientation": _xyzw((0.0, 0.0, 0.0, 1.0))}
+def _pose(place: Any, turn: Any = (0.0, 0.0, 0.0, 1.0)) -> dict[str, Any]:
+    return {"position": _xyz(place), "orientation": _xyzw(turn)}
 
 
 def _rgba(red: float, green: float, blue: float) -> dict[str, float]:

@@ -19,27 +19,17 @@ def _marked(text: str) -> str:
     return _CODE.sub(r"<code>\1</code>", _BOLD.sub(r"<b>\1</b>", html.escape(text, quote=False)))
 
 
-def _inline(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-
-
 def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """The whole page; it loads nothing from elsewhere.
-
-    Raises:
-        ModuleNotFoundError: jinja2 is not installed.
-    """
+    """The whole page; it loads nothing from elsewhere."""
     import jinja2
     import markupsafe
 
     template = resources.files("visthrow.view").joinpath("page.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["marked"] = lambda text: markupsafe.Markup(_marked(text))
-    environment.filters["inline"] = _inline
+    environment.filters["inline"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     environment.tests |= {
-        "text": lambda part: isinstance(part, Text),
-        "grid": lambda part: isinstance(part, Grid),
-        "picture": lambda part: isinstance(part, Picture),
+        name: lambda part, kind=kind: isinstance(part, kind) for name, kind in (("text", Text), ("grid", Grid), ("picture", Picture))
     }
     return environment.from_string(template).render(title=title, lead=lead, sections=sections, version=__version__)
 

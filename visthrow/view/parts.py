@@ -59,6 +59,15 @@ class Section:
     parts: tuple[Text | Grid | Picture, ...] = field(default=())
 
 
+Part = Text | Grid | Picture
+
+
+def section(name: str, title: str, *parts: Part | None, missing: Sequence[str] = (), head: str = "Not thrown yet") -> Section:
+    """A section of the parts that there are; at its end what is missing."""
+    said = "; ".join(dict.fromkeys(missing))
+    return Section(name, title, (*filter(None, parts), *([Text(f"{head}: {said}.", "missing")] if said else [])))
+
+
 def png_of(figure, dpi: float = 150.0) -> bytes:
     """Bytes of a matplotlib figure, which is closed."""
     import matplotlib.pyplot as plt

@@ -31,12 +31,7 @@ FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
-    """Write a flight as a ``.rrd`` file with a blueprint that lays out the viewer.
-
-    Args:
-        path: The file.
-        log: a flight of :func:`visthrow.throws.recorded.fly`.
-        experiment: for the sizes of vehicle, ball and camera.
+    """Write a flight of :func:`visthrow.throws.recorded.fly` as a ``.rrd`` file with a blueprint that lays out the viewer.
 
     Raises:
         StorageError: the place cannot be written.
@@ -46,13 +41,9 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 
 def show(address: str, name: str, log: FlightLog, experiment: Any, landings_w: np.ndarray) -> None:
-    """Send a flight to a viewer as a recording of its own.
+    """Send a flight to the viewer at an address (:func:`visthrow.view.live.served`) as a recording of its own.
 
-    Args:
-        address: of a viewer; see :func:`visthrow.view.live.served`.
-        name: of the recording.
-        log, experiment: as of :func:`write`.
-        landings_w: where other throws came down, to be drawn with it [m], shape (N, 2).
+    Where other throws came down is drawn with it: ``landings_w`` [m], shape (N, 2).
     """
     stream = rr.RecordingStream("visthrow", recording_id=name)
     stream.connect_grpc(address, default_blueprint=blueprint(np.array(log.meta["goal_w"]), set(log.channels)))
@@ -76,11 +67,7 @@ def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
 
 @contextmanager
 def recording(path: str | Path, layout: rrb.Blueprint | None = None) -> Iterator[rr.RecordingStream]:
-    """Give a stream whose content becomes a ``.rrd`` file, whole or not at all.
-
-    Args:
-        path: The file.
-        layout: of the viewer that opens it; None leaves it to the viewer.
+    """Give a stream whose content becomes a ``.rrd`` file, whole or not at all, with the layout of the viewer that opens it.
 
     Raises:
         StorageError: the place cannot be written.
@@ -116,19 +103,11 @@ TRAILS = (
 
 
 def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
-    """Send what does not move: ground, shapes, strokes, the camera's field of view.
-
-    Args:
-        stream: where to.
-        goal_w: target [m], shape (3,).
-        experiment: for the sizes of vehicle, ball and camera.
-    """
+    """Send what does not move: ground, shapes, strokes, the camera's field of view; the target is at ``goal_w`` [m], shape (3,)."""
     goal = np.asarray(goal_w, dtype=float)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     middle, reach = 0.5 * goal[:2], 0.5 * np.abs(goal[:2]) + FIELD
-    floor = rr.Boxes3D(
-        centers=[[*middle, -0.011]], half_sizes=[[*reach, 0.01]], colors=[[232, 230, 224]], fill_mode="solid"
-    )
+    floor = rr.Boxes3D(centers=[[*middle, -0.011]], half_sizes=[[*reach, 0.01]], colors=[[232, 230, 224]], fill_mode="solid")
     stream.log("world/ground", floor, static=True)
     half = experiment.camera.goal_side / 2.0
     corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
@@ -149,29 +128,20 @@ def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
 def send(stream: rr.RecordingStream, log: FlightLog) -> None:
     """Send all that moves, from a whole flight or from a piece of one; see :func:`still` for the rest."""
     if "pos_w" in log and "quat_wb" in log:
-        pose = rr.Transform3D.columns(translation=log["pos_w"].values, quaternion=_at_times(log, "quat_wb", "pos_w"))
+        pose = rr.Transform3D.columns(translation=log["pos_w"].values, quaternion=log["quat_wb"].hold(log["pos_w"].time))
         stream.send_columns("world/vehicle", [_times(log, "pos_w")], pose)
-    if "payload_pos_w" in log:
-        moved = rr.Transform3D.columns(translation=log["payload_pos_w"].values)
-        stream.send_columns("world/ball", [_times(log, "payload_pos_w")], moved)
     if "cable_points_w" in log:
-        rope = log["cable_points_w"].values.astype(np.float32)
-        columns = rr.LineStrips3D.columns(strips=list(rope))
+        columns = rr.LineStrips3D.columns(strips=list(log["cable_points_w"].values.astype(np.float32)))
         stream.send_columns("world/rope", [_times(log, "cable_points_w")], columns)
-    if "goal_w" in log:
-        there = rr.Transform3D.columns(translation=log["goal_w"].values)
-        stream.send_columns("world/goal", [_times(log, "goal_w")], there)
+    for name, entity in (("payload_pos_w", "world/ball"), ("goal_w", "world/goal")):
+        if name in log:
+            stream.send_columns(entity, [_times(log, name)], rr.Transform3D.columns(translation=log[name].values))
     if "keypoints" in log:
         _image(stream, log)
     _signals(stream, log)
     for time, state, reason in log.meta.get("events", ()):
         stream.set_time(TIMELINE, duration=time - log.meta["times"]["policy_start"])
         stream.log("events", rr.TextLog(f"{state}: {reason}", level="WARN" if state == "abort" else "INFO"))
-
-
-def _at_times(log: FlightLog, name: str, of: str) -> np.ndarray:
-    """Samples of one channel at the times of another."""
-    return log[name].hold(log[of].time)
 
 
 def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
@@ -186,10 +156,10 @@ def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
     rotors = experiment.vehicle.rotors
     hubs = np.column_stack((rotors.x, rotors.y, np.full(4, rotors.z)))
     arms = [np.vstack(([0.0, 0.0, rotors.z], hub)) for hub in hubs]
-    dark = colour_code(style.VEHICLE)
-    stream.log("world/vehicle/arms", rr.LineStrips3D(arms, radii=0.005, colors=[dark]), static=True)
-    hub_size = [[0.028, 0.018, 0.014]]
-    stream.log("world/vehicle/body", rr.Boxes3D(half_sizes=hub_size, colors=[dark], fill_mode="solid"), static=True)
+    dark = [colour_code(style.VEHICLE)]
+    stream.log("world/vehicle/arms", rr.LineStrips3D(arms, radii=0.005, colors=dark), static=True)
+    body = rr.Boxes3D(half_sizes=[[0.028, 0.018, 0.014]], colors=dark, fill_mode="solid")
+    stream.log("world/vehicle/body", body, static=True)
     discs = rr.Ellipsoids3D(
         centers=hubs + [0, 0, 0.008], half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4, fill_mode="solid",
         colors=[colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],  # the front ones stand out
@@ -199,27 +169,18 @@ def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
 
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
     """A line that grows from the policy's start to the landing."""
-    times, channel = log.meta["times"], log[name]
-    rows = np.flatnonzero(
-        (channel.time >= times["policy_start"] - 1e-9) & (channel.time <= times.get("landing", np.inf) + 0.02)
-    )
-    rows = rows[1:]
-    if not len(rows):
-        return
-    first = rows[0] - 1
-    strips = [channel.values[first : row + 1].astype(np.float32) for row in rows]
-    column = rr.TimeColumn(TIMELINE, duration=channel.time[rows] - times["policy_start"])
-    stream.send_columns(entity, [column], rr.LineStrips3D.columns(strips=strips))
+    times, time = log.meta["times"], log[name].time
+    rows = np.flatnonzero((time >= times["policy_start"] - 1e-9) & (time <= times.get("landing", np.inf) + 0.02))[1:]
+    if len(rows):
+        strips = [log[name].values[rows[0] - 1 : row + 1].astype(np.float32) for row in rows]
+        column = rr.TimeColumn(TIMELINE, duration=time[rows] - times["policy_start"])
+        stream.send_columns(entity, [column], rr.LineStrips3D.columns(strips=strips))
 
 
 def trail(stream: rr.RecordingStream, name: str, time: float, points: np.ndarray) -> None:
     """Send the line that a body has left so far, for flights that are still going on.
 
-    Args:
-        stream: where to.
-        name: channel of :data:`TRAILS`.
-        time: of its end [s], zero as in the logs sent.
-        points: [m], shape (N, 3).
+    Its channel is one of :data:`TRAILS`, its end at a time [s], zero as in the logs sent; points [m], shape (N, 3).
     """
     stream.set_time(TIMELINE, duration=time)
     entity = next(entity for channel, entity, _ in TRAILS if channel == name)
@@ -274,15 +235,15 @@ def _points(stream, log: FlightLog, entity: str, points: np.ndarray, shown: np.n
 def _outline(stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, box: bool) -> None:
     """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a box's edges."""
     whole = valid.all(axis=1)
-    strips = []
-    for p in points[whole]:
-        if box:
-            left, top, right, bottom = p[0, 0], p[1, 1], p[2, 0], p[3, 1]
-            p = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-        strips.append(np.vstack((p, p[:1])).astype(np.float32))
-    if strips:
-        columns = rr.LineStrips2D.columns(strips=strips).partition(whole.astype(int))
-        stream.send_columns(entity, [_times(log, "keypoints")], columns)
+    if not whole.any():
+        return
+    corners = points[whole]
+    if box:
+        x, y = corners[:, [0, 2, 2, 0], 0], corners[:, [1, 1, 3, 3], 1]
+        corners = np.stack((x, y), axis=-1)
+    closed = np.concatenate((corners, corners[:, :1]), axis=1).astype(np.float32)
+    columns = rr.LineStrips2D.columns(strips=list(closed)).partition(whole.astype(int))
+    stream.send_columns(entity, [_times(log, "keypoints")], columns)
 
 
 def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
@@ -324,21 +285,11 @@ def _paler(colour: str) -> str:
 
 
 def blueprint(goal: np.ndarray, channels: set[str]) -> rrb.Blueprint:
-    """Layout of the viewer.
-
-    Args:
-        goal: target [m], shape (3,).
-        channels: names of those that there are.
-    """
+    """Layout of the viewer for a target [m], shape (3,), and the channels that there are."""
     middle = np.array([0.5 * goal[0], 0.5 * goal[1], 0.9])
     eye = rrb.EyeControls3D(position=middle + [0.3, -3.4, 0.9], look_target=middle, eye_up=[0.0, 0.0, 1.0])
-    scene = rrb.Spatial3DView(
-        origin="world",
-        name="Throw",
-        background=[245, 246, 248],
-        eye_controls=eye,
-        line_grid=rrb.LineGrid3D(visible=False),
-    )
+    plain = {"background": [245, 246, 248], "line_grid": rrb.LineGrid3D(visible=False)}
+    scene = rrb.Spatial3DView(origin="world", name="Throw", eye_controls=eye, **plain)
     bounds = rrb.VisualBounds2D(x_range=[-106, 106], y_range=[-106, 106])
     image = rrb.Spatial2DView(origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds)
     live = "state" in channels

@@ -28,39 +28,19 @@ PIXELS = 480  # of the camera's picture as drawn
 GHOST_EVERY = 0.06  # between the faint earlier poses [s]
 
 
-def instants(log: FlightLog) -> list[tuple[str, float]]:
-    """Captions and times [s] of the four views.
-
-    Raises:
-        LogError: the flight has no release or landing.
-    """
-    times = log.meta["times"]
-    if "separation" not in times or "landing" not in times:
-        raise LogError(
-            f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}"
-        )
-    start, separation = times["policy_start"], times["separation"]
-    return [
-        ("Hover", start),
-        ("Accelerate", start + 0.55 * (separation - start)),
-        ("Release", separation),
-        ("Landing", times["landing"]),
-    ]
-
-
 def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
-    """Draw the strip.
-
-    Args:
-        path: PNG file.
-        log: a flight with release and landing.
-        camera: whose keypoints the log holds.
+    """Draw the strip of a flight, whose keypoints are the camera's, as a PNG file.
 
     Raises:
         LogError: the flight has no release or landing.
         StorageError: the place cannot be written.
     """
-    views = instants(log)
+    times = log.meta["times"]
+    if "separation" not in times or "landing" not in times:
+        raise LogError(f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}")
+    start, separation = times["policy_start"], times["separation"]
+    halfway = start + 0.55 * (separation - start)
+    views = [("Hover", start), ("Accelerate", halfway), ("Release", separation), ("Landing", times["landing"])]
     style.use()
     import matplotlib.pyplot as plt
 
@@ -74,13 +54,15 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
         left = LEFT + column * (PANEL + GAP)
         axis = figure.add_axes((left / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
         _side_view(axis, log, time, side, column)
-        axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - views[0][1]:.2f} s", loc="left")
+        axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - start:.2f} s", loc="left")
         axis = figure.add_axes((left / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
         all_seen &= _camera_view(axis, log, lens, time, first=column == 0)
     texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
     quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
-    figure.text(y=1.0 - 0.54 / height, s=_subline(log), **quiet)
+    where = f"Flown on {log.meta['plant_meaning']}" if log.meta["plant"] == "poses" else f"Simulated on {log.meta['plant_meaning']}"
+    drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
+    figure.text(y=1.0 - 0.54 / height, s=f"{where}, seen from the side. {drawn}", **quiet)
     unseen = "" if all_seen else "; a cross: outside the field of view"
     field = f"{camera.fisheye.fov_deg:g}°"
     note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball{unseen}"
@@ -96,50 +78,29 @@ def _headline(log: FlightLog) -> str:
     )
 
 
-def _subline(log: FlightLog) -> str:
-    where = f"Flown on {log.meta['plant_meaning']}" if log.meta["plant"] == "poses" else f"Simulated on {log.meta['plant_meaning']}"
-    drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
-    return f"{where}, seen from the side. {drawn}"
-
-
 def drawn_larger(camera: CameraParams) -> CameraParams:
     """Return the lens on fewer pixels, on which the overlay's strokes are thicker."""
     lens = camera.fisheye
     scale = PIXELS / max(lens.width, lens.height)
-    fewer = dataclasses.replace(
-        lens,
-        width=round(scale * lens.width),
-        height=round(scale * lens.height),
-        fx=scale * lens.fx,
-        fy=scale * lens.fy,
-        cx=scale * (lens.cx + 0.5) - 0.5,
-        cy=scale * (lens.cy + 0.5) - 0.5,
-    )
-    return dataclasses.replace(camera, fisheye=fewer)
+    size = {"width": round(scale * lens.width), "height": round(scale * lens.height)}
+    focus = {"fx": scale * lens.fx, "fy": scale * lens.fy, "cx": scale * (lens.cx + 0.5) - 0.5, "cy": scale * (lens.cy + 0.5) - 0.5}
+    return dataclasses.replace(camera, fisheye=dataclasses.replace(lens, **size, **focus))
 
 
 def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
-    paths = []
-    for name in ("pos_w", "payload_pos_w"):
-        time = log[name].time
-        paths.append(log[name].values[(time >= times["policy_start"]) & (time <= times["landing"] + 0.02)])
+    paths = [
+        of.values[(of.time >= times["policy_start"]) & (of.time <= times["landing"] + 0.02)]
+        for of in (log["pos_w"], log["payload_pos_w"])
+    ]
     x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
     top = max(path[:, 2].max() for path in paths)
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 
 
-def _at(log: FlightLog, name: str, time: float) -> np.ndarray:
-    """Value at a time, linear between samples."""
-    channel = log[name]
-    flat = channel.values.reshape(len(channel.time), -1)
-    at = [np.interp(time, channel.time, flat[:, i]) for i in range(flat.shape[1])]
-    return np.array(at).reshape(channel.values.shape[1:])
-
-
 def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, float], column: int) -> None:
-    from matplotlib.patches import Rectangle
+    from matplotlib.patches import Circle, Rectangle
 
     left, right, top = side
     times, goal = log.meta["times"], log.meta["goal_w"]
@@ -152,41 +113,31 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
     else:
         axis.set_ylabel("height [m]")
         axis.set_xlabel("distance ahead [m]")
-        axis.annotate(
-            "target",
-            (goal[0], 0.0),
-            xytext=(0, 6),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            color=style.GOAL,
-            fontsize=9,
-        )
+        above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center", "va": "bottom"}
+        axis.annotate("target", (goal[0], 0.0), color=style.GOAL, fontsize=9, **above)
     axis.tick_params(length=2.5)
     for past in np.arange(times["policy_start"], time - 0.03, GHOST_EVERY):
         _vehicle(axis, log, past, 0.16)
     payload = log["payload_pos_w"]
     seen = (payload.time >= times["policy_start"]) & (payload.time < time)
-    path = np.vstack([payload.values[seen], _at(log, "payload_pos_w", time)])
+    path = np.vstack([payload.values[seen], log["payload_pos_w"].at(time)])
     when = np.append(payload.time[seen], time)
     carried, flown = when <= times["separation"] + 1e-6, when >= times["separation"] - 0.02
     axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
     if np.count_nonzero(flown) > 1:
         axis.plot(path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3)
     if log["cable_points_w"].time[-1] > time - 0.05:  # poses tell nothing of a rope that has let go
-        rope = _at(log, "cable_points_w", time)
+        rope = log["cable_points_w"].at(time)
         axis.plot(rope[:, 0], rope[:, 2], color=style.ROPE, lw=1.3, zorder=4)
     _vehicle(axis, log, time, 1.0)
-    ball = _at(log, "payload_pos_w", time)
-    from matplotlib.patches import Circle
-
+    ball = log["payload_pos_w"].at(time)
     axis.add_patch(Circle((ball[0], ball[2]), 0.033, color=style.PAYLOAD, lw=0, zorder=6))
 
 
 def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
     """Arms and rotor discs as seen along y."""
-    pos = _at(log, "pos_w", time)
-    rot = matrix_of_quat(_at(log, "quat_wb", time)[None])[0]
+    pos = log["pos_w"].at(time)
+    rot = matrix_of_quat(log["quat_wb"].at(time)[None])[0]
     reach = ARM / np.sqrt(2.0)
     for sx in (1.0, -1.0):
         hub = pos + rot @ np.array([sx * reach, 0.0, BLADE_HEIGHT])
@@ -203,7 +154,7 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     """Keypoints of the true poses at a time, named in the first view; returns whether all are seen."""
 
     def one(name: str) -> torch.Tensor:
-        return torch.tensor(_at(log, name, time)[None], dtype=torch.float32)
+        return torch.tensor(log[name].at(time)[None], dtype=torch.float32)
 
     rot = torch.tensor(matrix_of_quat(one("quat_wb").numpy().astype(float)), dtype=torch.float32)
     goal = torch.tensor([log.meta["goal_w"]], dtype=torch.float32)

@@ -43,38 +43,23 @@ COLUMNS = (
 
 
 def markdown(rows: Sequence[dict], title: str) -> str:
-    """Table of summaries.
-
-    Args:
-        rows: :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and ``layout`` added.
-        title: what was measured where.
-    """
+    """Table of summaries, :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and ``layout`` added."""
     return f"{title}\n\n{aligned(COLUMNS, [_cells(row) for row in rows], heads=1)}\n"
 
 
 def _cells(row: dict) -> tuple[str, ...]:
     paper = PAPER.get((row["layout"], row["target"]))
-    beside = "-" if paper is None else f"{paper[0]:.3f} ± {paper[1]:.3f}, {paper[2]:.3f} ± {paper[3]:.3f}"
+    beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
     head = (row["policy"], f"{row['target']:.1f}", str(row["throws"]))
     success = f"{100 * row['success']:.1f} %"
     if not row["success"]:
         return (*head, "-", "-", success, "-", "-", beside)
-    return (
-        *head, _spread(row, "error"), _spread(row, "duration"), success,
-        f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", beside,
-    )  # fmt: skip
-
-
-def _spread(row: dict, name: str) -> str:
-    return f"{row[f'{name}_mean']:.3f} ± {row[f'{name}_std']:.3f}"
+    error, duration = (f"{row[f'{name}_mean']:.3f} ± {row[f'{name}_std']:.3f}" for name in ("error", "duration"))
+    return (*head, error, duration, success, f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", beside)
 
 
 def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
-    """One row a throw.
-
-    Args:
-        throws: policy's name, plant's name and :class:`visthrow.task.measurement.Throws`.
-    """
+    """One row a throw, of policies' names, plants' names and :class:`visthrow.task.measurement.Throws`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([
@@ -84,7 +69,5 @@ def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
     for policy, plant, of in throws:
         for i in range(len(of.success)):
             numbers = (*of.landing_w[i], of.error[i], of.duration[i], of.clearance[i], of.smoothness[i])
-            writer.writerow(
-                [policy, plant, of.target, i, int(of.success[i]), *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)]
-            )
+            writer.writerow([policy, plant, of.target, i, int(of.success[i]), *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)])
     return text.getvalue()

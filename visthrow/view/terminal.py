@@ -8,15 +8,11 @@ RISES = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0)
 
 
 def curve(rows: Sequence[tuple[str, Sequence[tuple[float, float]]]], width: int, height: int, unit: str) -> list[str]:
-    """Values over time on a logarithmic axis, a mark a series; later series over earlier ones.
+    """Values over time on a logarithmic axis, a mark a series; later series over earlier ones. Returns ``height + 2`` lines.
 
     Args:
         rows: mark and (time [s], value) of each series; values that are not finite or not above 0 are left out.
-        width, height: of the plot without its labels, in characters.
-        unit: of the values, for the axis.
-
-    Returns:
-        ``height + 2`` lines.
+        width, height: of the plot without its labels, in characters. unit: of the values, for the axis.
     """
     points = [(mark, t, v) for mark, series in rows for t, v in series if math.isfinite(v) and v > 0.0]
     values = [v for _, _, v in points] or [1.0]
@@ -35,15 +31,9 @@ def curve(rows: Sequence[tuple[str, Sequence[tuple[float, float]]]], width: int,
 
 
 def scatter(points: Sequence[tuple[float, float]], reach: float, width: int, height: int) -> list[str]:
-    """Points about the middle, seen from above: how many lie in each cell, 9 for more, + where the middle is free.
+    """Points (to the right, up) of the middle [m], from above: how many lie in each cell, 9 for more, + where the middle is free.
 
-    Args:
-        points: (to the right, up) of the middle [m]; those beyond the reach stand at the edge.
-        reach: half of the square that is shown [m].
-        width, height: in characters.
-
-    Returns:
-        ``height + 2`` lines.
+    The reach is half of the square that is shown [m]; points beyond it stand at the edge. Returns ``height + 2`` lines.
     """
     counts = [[0] * width for _ in range(height)]
     for right, up in points:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from visthrow.baseline import pendulum as pm
-from visthrow.baseline.fly import Delays, look_ahead
+from visthrow.baseline.fly import look_ahead
 from visthrow.baseline.pendulum import DIR, POS, QUAT, RATE, VEL, Pendulum
 
 MODEL = Pendulum(0.21, 0.06, 0.36)
@@ -121,11 +121,11 @@ def test_looking_ahead_follows_the_commands_on_their_way():
     """Three different commands under way, each held for its own 20 ms: predicted as they will act."""
     state = pm.hover(MODEL, np.zeros((1, 3)))[0]
     sent = np.array([[[3.0, 1.0, 0.0, 0.0]], [[2.0, -2.0, 1.0, 0.0]], [[4.0, 0.0, 3.0, 0.5]]])
-    seen = look_ahead(MODEL, state, sent, 0.02, Delays(measurement=0.01, command=0.035))
+    seen = look_ahead(MODEL, state, sent, 0.02, 0.045)
     expected = pm.step(MODEL, state, sent[2], 0.005)  # 45 ms before: the third last command, for 5 ms more
     expected = pm.step(MODEL, pm.step(MODEL, expected, sent[1], 0.02), sent[0], 0.02)
     assert np.allclose(seen, expected, atol=1e-9)
-    assert look_ahead(MODEL, state, sent, 0.02, Delays()) is state
+    assert look_ahead(MODEL, state, sent, 0.02, 0.0) is state
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.06, 0.36), (0.2, -1.0, 0.36), (0.2, 0.06, float("nan"))])

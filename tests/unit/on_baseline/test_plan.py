@@ -6,8 +6,7 @@ import pytest
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline import spline as sp
 from visthrow.baseline.pendulum import Pendulum
-from visthrow.baseline.plan import plan_throw
-from visthrow.baseline.release import default_release, landing_point, read_release, release_for
+from visthrow.baseline.plan import default_release, landing_point, plan_throw, read_release, release_for
 from visthrow.baseline.spline import PlanError, PlanParams
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import FlightRecorder

@@ -3,10 +3,10 @@
 import numpy as np
 
 from visthrow.baseline import front, thrower
-from visthrow.evidence.report import baseline_units
 from visthrow.evidence.report.ablations import FURTHER, PAPER_FOUR
 from visthrow.evidence.report.gap import SWEEPS, TRAINED
 from visthrow.evidence.report.result_set import SHIPPED, ResultSet
+from visthrow.task.measurement import TARGETS
 from visthrow.throws import results
 from visthrow.throws.results import Result
 
@@ -59,14 +59,14 @@ def _ablations(rng):
 
 
 def _baselines(rng):
-    for target in baseline_units.TARGETS:
+    for target in TARGETS:
         yield baseline(rng, thrower.OWN, "none", target, 0.002, 1.6)
         for compensation, lost in (("none", 10), ("delay", 0), ("both", 0)):
             yield baseline(rng, "hybrid", compensation, target, 0.05, 1.6, lost)
     for i, speed in enumerate(front.SPEEDS):
         for j, (w_t, rho) in enumerate(front.WEIGHTS):
             how = {"speed": speed, "w_t": w_t, "rho": rho}
-            for bounds, faster in zip(baseline_units.BOUNDS, (0.0, 0.4)):
+            for bounds, faster in zip(thrower.BOUNDS, (0.0, 0.4)):
                 fast = 1.3 + 0.1 * i + 0.2 * j - faster
                 yield baseline(rng, thrower.OWN, "none", 2.0, 0.03 / fast**3, fast, bounds=bounds, **how)
                 yield baseline(rng, "hybrid", "both", 2.0, 0.2 / fast**3, fast, lost=5 if faster else 0, bounds=bounds, **how)
@@ -114,6 +114,6 @@ def everything(seed: int = 0) -> ResultSet:
     rng = np.random.default_rng(seed)
     names = SHIPPED
     shipped = [policy(rng, name, name.partition("_")[0], plant, target, 0.02 if name == "state" else 0.024) for name in names
-               for plant in PLANTS for target in baseline_units.TARGETS]  # fmt: skip
+               for plant in PLANTS for target in TARGETS]  # fmt: skip
     made = [*shipped, *_ablations(rng), *_baselines(rng), *_gap(rng), *_beyond(rng)]
     return ResultSet(tuple({r.key: r for r in made}.values()), runs(), {"ablations": "Because **this** was so.\n\nAnd `that`."})

@@ -13,7 +13,7 @@ from tests.unit.on_evidence import made_up_results as made_up
 from visthrow import cli
 from visthrow.baseline import spline, thrower
 from visthrow.cli import report as command
-from visthrow.evidence.report import ablations, baseline_units, beyond, gap, result_set, throws, trade
+from visthrow.evidence.report import ablations, beyond, gap, result_set, throws, trade
 from visthrow.evidence.sweep.units import load_list
 from visthrow.throws import results
 from visthrow.throws.results import Result
@@ -212,13 +212,13 @@ def test_what_the_report_stands_on_is_stated_once():
     keys = [results.key_of(unit) for unit in baseline_record.full()]
     assert len(set(keys)) == len(keys)
     assert {unit["target"] for unit in baseline_record.full()} == {1.5, 2.0, 2.5}
-    assert len(baseline_units.quick()) == 5
+    assert len(command.quick_units()) == 5
 
 
 def test_the_quick_list_can_do_without_the_reference_plant():
     plants = {}
     for changes in ((), command.NO_REFERENCE):
-        units = load_list(baseline_units.QUICK_LIST, changes).throws.values()
+        units = load_list(command.QUICK_LIST, changes).throws.values()
         plants[changes] = {unit.params.plant for row in units for unit in row}
     assert plants == {(): {"hybrid", "reference-realistic"}, command.NO_REFERENCE: {"hybrid"}}
 
@@ -245,10 +245,10 @@ DRIVER = """
 import sys
 from visthrow import cli
 from visthrow.baseline import spline, thrower
-from visthrow.evidence.report import baseline_units
+from visthrow.cli import report
 spline.LONGEST = (1.4,)
-baseline_units.QUICK_LIST = sys.argv[1]
-baseline_units.quick = lambda: [thrower.unit("pendulum", "none", target, 1) for target in baseline_units.TARGETS]
+report.QUICK_LIST = sys.argv[1]
+report.quick_units = lambda: [thrower.unit("pendulum", "none", target, 1) for target in (1.5, 2.0, 2.5)]
 sys.exit(cli.main(["report", "--quick", "--jobs", "1", "--out", sys.argv[2]]))
 """
 

@@ -12,11 +12,10 @@ import pytest
 from visthrow import cli, config
 from visthrow.common.errors import BusyError, ConfigError
 from visthrow.common.storage import write_json
-from visthrow.evidence.sweep import pool, units
-from visthrow.evidence.sweep.lists import RunGroup, SweepList
-from visthrow.evidence.sweep.lock import Lock, held
+from visthrow.evidence.sweep import RunGroup, SweepList, pool, units
 from visthrow.evidence.sweep.record import collect, status
 from visthrow.evidence.sweep.units import expand, load_list
+from visthrow.evidence.sweep.work import held, locked
 from visthrow.throws import results
 
 LIST = """
@@ -245,20 +244,20 @@ def test_the_time_limit_stops_what_runs(path, tmp_path, monkeypatch):
 
 def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
     path = tmp_path / "locks" / "a.lock"
-    code = "import time; from pathlib import Path; from visthrow.evidence.sweep.lock import Lock\n"
-    code += f"with Lock(Path({str(path)!r})): print(1, flush=True); time.sleep(60)"
+    code = "import time; from pathlib import Path; from visthrow.evidence.sweep.work import locked\n"
+    code += f"with locked(Path({str(path)!r})): print(1, flush=True); time.sleep(60)"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"1\n"
         assert held(path)
-        with pytest.raises(BusyError, match=str(other.pid)), Lock(path):
+        with pytest.raises(BusyError, match=str(other.pid)), locked(path):
             pass
         other.send_signal(signal.SIGKILL)
         other.wait()
         end = time.monotonic() + 10.0
         while held(path) and time.monotonic() < end:
             time.sleep(0.05)
-        with Lock(path):
+        with locked(path):
             assert held(path)
         assert not held(path)
     finally:

@@ -253,7 +253,7 @@ def test_processes_throw_what_one_process_throws(dropper, tmp_path):
 
 def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("visthrow.onboard.shipped.SHIPPED", tmp_path)
-    for name in demo.POLICIES:
+    for name in compare.DEFAULT_POLICIES:
         dropping_policy(name).save(tmp_path / f"{name}.npz")
     monkeypatch.setattr(demo, "THROWS", 3)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)

@@ -25,28 +25,27 @@ PARTS = {
 }
 
 
-class Stretch:
-    """Device operations to be timed: replayed from a CUDA graph, as training does, or on the CPU run as they are."""
+def seconds(function: Callable[[], Any], device: str, repeats: int, before: Callable[[], Any] = lambda: None) -> float:
+    """Median wall time of device operations [s]: replayed from a CUDA graph, as training does, or on the CPU run as they are.
 
-    def __init__(self, function: Callable[[], Any], device: str):
-        import torch
+    ``before`` is run before each of the repeats and not timed.
+    """
+    import torch
 
-        self._run = function
-        self._settle = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
-        function()
-        if device.startswith("cuda"):
-            from sim.torch_bridge import captured
+    settle, times = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None), []
+    function()
+    if device.startswith("cuda"):
+        from sim.torch_bridge import captured
 
-            self._run = captured(function).replay
-
-    def seconds(self, before: Callable[[], Any] = lambda: None) -> float:
-        """Wall time of one run [s]; ``before`` is not timed."""
+        function = captured(function).replay
+    for _ in range(repeats):
         before()
-        self._settle()
+        settle()
         start = time.perf_counter()
-        self._run()
-        self._settle()
-        return time.perf_counter() - start
+        function()
+        settle()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
 
 
 def whole(trainer: Any, iterations: int) -> dict[str, list[float]]:
@@ -73,53 +72,37 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
         actions = alg.act(observations).clone()
         actions[:, -1] = -1.0  # nothing is released: the rope is simulated throughout
 
+    @torch.inference_mode()
+    def reset() -> None:
+        env.reset()
+
     def simulate() -> None:
         with on_torch_stream(device):
             for _ in range(steps):
                 env.sim.step()
 
+    @torch.inference_mode()
     def steps_of_env() -> None:
-        with torch.inference_mode():
-            for _ in range(steps):
-                env.step(actions)
+        for _ in range(steps):
+            env.step(actions)
 
+    @torch.inference_mode()
     def infer() -> None:
-        with torch.inference_mode():
-            for _ in range(steps):
-                alg.act(observations)
+        for _ in range(steps):
+            alg.act(observations)
 
     found = {}
     for name, function in (("simulation", simulate), ("step", steps_of_env), ("inference", infer)):
-        with torch.inference_mode():
-            env.reset()
-        stretch = Stretch(function, device)
-        found[name] = statistics.median(
-            stretch.seconds(_fresh(env) if name == "simulation" else lambda: None) for _ in range(repeats)
-        )
+        reset()
+        found[name] = seconds(function, device, repeats, reset if name == "simulation" else lambda: None)
     return found
-
-
-def _fresh(env: Any) -> Callable[[], None]:
-    def start() -> None:
-        import torch
-
-        with torch.inference_mode():
-            env.reset()
-
-    return start
 
 
 def split(total: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
     """Seconds of each of :data:`PARTS` from the whole iteration and the parts measured alone; none below zero."""
     environment = max(parts["step"] - parts["simulation"], 0.0)
     storage = max(total["rollout"] - parts["step"] - parts["inference"], 0.0)
-    return {
-        "simulation": parts["simulation"],
-        "environment": environment,
-        "inference": parts["inference"],
-        "storage": storage,
-        "learning": total["learning"],
-    }
+    return dict(zip(PARTS, (parts["simulation"], environment, parts["inference"], storage, total["learning"])))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -141,8 +124,7 @@ def run(args: argparse.Namespace) -> int:
     if min(numbers) <= 0:
         raise VisthrowError(
             f"--iterations {args.iterations}, --repeats {args.repeats}, --minutes {args.minutes}, --until {args.until}, "
-            f"--evaluate-every {args.evaluate_every}: "
-            "expected positive numbers"
+            f"--evaluate-every {args.evaluate_every}: expected positive numbers"
         )
     from visthrow.task import Experiment
     from visthrow.training import device
@@ -185,14 +167,8 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
         f"The paper's 2e8 environment steps at this speed: {2e8 / samples * wall:.0f} s.",
     )
     figures = {
-        "config": name,
-        "device": device,
-        "samples": samples,
-        "seconds": parts,
-        "iteration_s": wall,
-        "rollout_s": total["rollout"],
-        "steps_per_s": samples / wall,
-        "runs": runs,
-    }
+        "config": name, "device": device, "samples": samples, "seconds": parts, "iteration_s": wall, "rollout_s": total["rollout"],
+        "steps_per_s": samples / wall, "runs": runs,
+    }  # fmt: skip
     table = Table(title, ("part", "time", "share", "env-steps/s"), tuple(rows))
     return Report("train", f"A training iteration on {device_name(device)}", (table,), notes, figures)

@@ -34,21 +34,13 @@ class Table:
 
 @dataclass(frozen=True)
 class Report:
-    """One measurement.
+    """One measurement."""
 
-    Attributes:
-        bench: which of ``visthrow bench`` made it.
-        title: one line.
-        tables: what is printed.
-        notes: sentences below the tables: how it was measured, what a number does not say.
-        figures: the numbers behind the tables, SI units, for programs.
-    """
-
-    bench: str
+    bench: str  # which of ``visthrow bench`` made it
     title: str
     tables: tuple[Table, ...]
-    notes: tuple[str, ...]
-    figures: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...]  # sentences below the tables: how it was measured, what a number does not say
+    figures: dict[str, Any] = field(default_factory=dict)  # the numbers behind the tables, SI units, for programs
 
     def record(self) -> dict[str, Any]:
         """The report with its provenance, as JSON holds it."""
@@ -78,11 +70,7 @@ def finish(report: Report, args: argparse.Namespace) -> int:
 
 
 def record_path(name: str) -> Path:
-    """File of a record.
-
-    Raises:
-        StorageError: a name that is no plain word.
-    """
+    """File of a record; StorageError for a name that is no plain word."""
     if not _NAME.fullmatch(name):
         raise StorageError(f"record name '{name}'; expected lower-case letters, digits, '-' and '_'")
     return FOLDER / f"{name}.json"
@@ -106,11 +94,7 @@ def origin(record: dict[str, Any]) -> str:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a record.
-
-    Raises:
-        StorageError: no JSON, or keys missing.
-    """
+    """Read a record; StorageError where it is no JSON, or keys are missing."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

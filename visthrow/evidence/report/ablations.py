@@ -3,10 +3,10 @@
 import math
 
 from visthrow.common import statistics as st
-from visthrow.evidence.report.result_set import ANY, ResultSet, durations, errors, landed, misses
+from visthrow.evidence.report.result_set import ANY, ResultSet, errors, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
-from visthrow.view import figures
+from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER_ABLATIONS
 
@@ -40,14 +40,12 @@ SHORT_LAYOUT = {"state": "state policies", "vision": "vision policies"}
 
 def section(thrown: ResultSet) -> Section:
     """Ratio to the full model with its interval, where the throws land, and what that says of each component."""
-    parts: list = [
-        Text("Each policy was trained with one component of the simulator removed and otherwise the same recipe, then flown "
-             "without retraining on the full reference plants at 2.0 m: other code and noise, the same equations, so that policies land "
-             "nearer there than in training. They stand in for a vehicle and are none. The ratio is its mean landing error over that of "
-             "the full model trained alike; intervals draw trainings first and throws within them where there are several "
-             "trainings (seeds). The paper's ratios come from five throws a variant of a real vehicle.")
-    ]  # fmt: skip
-    marks, missing, said = [], [], []
+    lead = Text("Each policy was trained with one component of the simulator removed and otherwise the same recipe, then flown "
+                "without retraining on the full reference plants at 2.0 m: other code and noise, the same equations, so that policies land "
+                "nearer there than in training. They stand in for a vehicle and are none. The ratio is its mean landing error over that of "
+                "the full model trained alike; intervals draw trainings first and throws within them where there are several "
+                "trainings (seeds). The paper's ratios come from five throws a variant of a real vehicle.")  # fmt: skip
+    grids, picture, marks, missing, said = [], None, [], [], []
     for layout in ("state", "vision"):
         for plant in PLANTS:
             rows = _rows(thrown, layout, plant, marks, missing, said)
@@ -55,19 +53,15 @@ def section(thrown: ResultSet) -> Section:
                 head = ("configuration", "trainings", "throws", "landed", "landing error [m]", "ratio to full", "the paper's ratio",
                         "scatter [m]", "duration [s]", "bias along [m]", "bias left [m]", "lands", "the paper: lands")  # fmt: skip
                 title = f"{SHORT_LAYOUT[layout].capitalize()} at {TARGET:.1f} m on the {SHORT[plant]}"
-                parts.append(Grid(title, head, tuple(rows), NOTE))
+                grids.append(Grid(title, head, tuple(rows), NOTE))
     if marks:
         series = [f"{SHORT_LAYOUT[layout]},\n{SHORT[plant]}" for layout in SHORT_LAYOUT for plant in PLANTS]
-        picture = figures.marks(marks, "mean landing error over the full model's", series, zero=1.0, log=True)
+        drawn = figures.marks(marks, "mean landing error over the full model's", series, zero=1.0, log=True)
         text = "Error ratio to the full model with 95 % intervals; at 1 the component does not matter."
-        parts.insert(1, Picture("ablations", picture, text))
-    scatter = _scatter(thrown)
-    if scatter:
-        parts.append(scatter)
-    parts += [Text(text, "finding") for text in said]
-    if missing:
-        parts.append(Text("Not thrown yet: " + "; ".join(dict.fromkeys(missing)) + ".", "missing"))
-    return Section("ablations", "What each component of the simulator is worth", tuple(parts))
+        picture = Picture("ablations", drawn, text)
+    findings = (Text(text, "finding") for text in said)
+    title = "What each component of the simulator is worth"
+    return parts.section("ablations", title, lead, picture, *grids, _scatter(thrown), *findings, missing=missing)
 
 
 def _rows(thrown: ResultSet, layout: str, plant: str, marks: list, missing: list, said: list) -> list[tuple[str, ...]]:
@@ -103,13 +97,13 @@ def paper_ratio(variant: str) -> st.Interval | None:
 
 
 def _row(variant: str, found: list[Result], full: list[Result]) -> tuple[str, ...]:
-    paper, bias = paper_ratio(variant), st.bias(misses(found))
+    paper, bias = paper_ratio(variant), st.bias([r.miss for r in found])
     ratio = "1" if variant == "full" else st.ratio(errors(found), errors(full)).text(2)
     along, lateral = (of.text(sign=True) for of in (bias.along, bias.lateral))
     return (
-        TITLES[variant], str(len(found)), str(sum(len(r.good) for r in found)), f"{100 * landed(found):.1f} %",
+        TITLES[variant], str(len(found)), str(sum(len(r.good) for r in found)), landed(*found),
         st.mean(errors(found)).text(), ratio, "-" if paper is None or variant == "full" else paper.text(1),
-        f"{bias.scatter:.3f}", f"{st.mean(durations(found)).value:.3f}", along, lateral, bias.direction,
+        f"{bias.scatter:.3f}", f"{st.mean([r.of('duration') for r in found]).value:.3f}", along, lateral, bias.direction,
         PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else "-",
     )  # fmt: skip
 
@@ -126,7 +120,7 @@ def _said(variant: str, ratio: st.Interval, found: list[Result]) -> str:
     agree = "apart from ours" if apart else "the intervals overlap"
     beside = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
     words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
-    bias = st.bias(misses(found))
+    bias = st.bias([r.miss for r in found])
     signs = f" Bias here: {bias.direction}, {100 * bias.share:.0f} % of the mean square miss"
     signs += f"; the paper's throws: {words}." if words else "."
     seeds = "" if len(found) > 1 else " One training: the interval covers throws, not trainings."

@@ -1,6 +1,7 @@
-"""Sections on what goes beyond the paper, and on the training runs."""
+"""Sections on what goes beyond the paper, on the training runs, and on where the figures come from."""
 
 import json
+from collections import defaultdict
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from visthrow.common import statistics as st
 from visthrow.evidence.report.result_set import SHIPPED, ResultSet, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
-from visthrow.view import figures
+from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 TARGET = 2.0
@@ -25,14 +26,11 @@ TITLES = {
 
 def section(thrown: ResultSet) -> Section:
     """Moving targets, varied payloads, drag, far targets."""
-    parts: list = [
-        Text("Each is a switch of the task's config, off by default. Policies trained with it stand beside those trained without.")
-    ]
-    missing: list[str] = []
-    parts += _moving(thrown, missing)
-    rows = []
+    lead = Text("Each is a switch of the task's config, off by default. Policies trained with it stand beside those trained without.")
+    rows, missing, table = [], [], None
+    moving = _moving(thrown, missing)
     for variant in VARIANTS[1:]:
-        found = [r for r in thrown.matching(kind="policy", variant=variant)]
+        found = thrown.matching(kind="policy", variant=variant)
         if not found:
             missing.append(TITLES[variant])
         rows += _rows(found)
@@ -40,11 +38,9 @@ def section(thrown: ResultSet) -> Section:
     if rows:
         head = ("policy", "training", "plant", "flown with", "target [m]", "throws", "landed", "landing error [m]")
         note = "'its own': the conditions of its own training; else what was changed."
-        parts.append(Grid("Payload, drag and distance", head, tuple(rows), note, heads=4))
-    parts += [Text(text, "finding") for text in _bars(thrown)]
-    if missing:
-        parts.append(Text("Not thrown yet: " + "; ".join(missing) + ".", "missing"))
-    return Section("beyond", "Beyond the paper", tuple(parts))
+        table = Grid("Payload, drag and distance", head, tuple(rows), note, heads=4)
+    findings = (Text(text, "finding") for text in _bars(thrown))
+    return parts.section("beyond", "Beyond the paper", lead, *moving, table, *findings, missing=missing)
 
 
 def _beyond(result: Result) -> bool:
@@ -61,7 +57,7 @@ def _rows(found: list[Result]) -> list[tuple[str, ...]]:
         error = st.mean(r.of("error")).text() if r.good.any() else "-"
         trained, changes = TITLES.get(unit["variant"], unit["variant"]), _changes(unit["departures"])
         rows.append((unit["policy"], trained, SHORT[unit["plant"]], changes, f"{unit['target']:.1f}",
-                     str(len(r.good)), f"{100 * landed([r]):.1f} %", error))  # fmt: skip
+                     str(len(r.good)), landed(r), error))  # fmt: skip
     return rows
 
 
@@ -101,18 +97,18 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
                 label = f"{policy}, {TITLES['full']}" if policy in SHIPPED else policy
                 lines.append(figures.Line(label, [x for x, _ in points], [st.mean(r.of("error")) for _, r in points], len(lines)))
             rows += [
-                (policy, SHORT[plant], f"{speed:g}", str(len(r.good)), f"{100 * landed([r]):.1f} %", st.mean(r.of("error")).text())
+                (policy, SHORT[plant], f"{speed:g}", str(len(r.good)), landed(r), st.mean(r.of("error")).text())
                 for speed, r in points
             ]
-    parts: list = []
+    made: list = []
     if lines:
         panel = figures.Panel("targets that move, from 2.0 m ahead in any direction", "speed of the target [m/s]", tuple(lines))
         text = "Landing error against where the target is at impact, in the training simulator; bands are 95 % intervals."
-        parts.append(Picture("moving", figures.curves([panel], "landing error [m]"), text))
+        made.append(Picture("moving", figures.curves([panel], "landing error [m]"), text))
     if rows:
         head = ("policy", "plant", "speed [m/s]", "throws", "landed", "landing error [m]")
-        parts.append(Grid("Moving targets", head, tuple(rows)))
-    return parts
+        made.append(Grid("Moving targets", head, tuple(rows)))
+    return made
 
 
 def _bars(thrown: ResultSet) -> list[str]:
@@ -135,14 +131,13 @@ def _judged(what: str, r: Result, bar: float) -> str:
 
 def training_section(thrown: ResultSet) -> Section:
     """Every training run with its time."""
-    parts: list = []
     if not thrown.runs:
-        parts.append(Text("No training is recorded: `visthrow sweep run paper`, then `visthrow sweep collect paper`.", "missing"))
-        return Section("training", "Training runs", tuple(parts))
+        none = Text("No training is recorded: `visthrow sweep run paper`, then `visthrow sweep collect paper`.", "missing")
+        return parts.section("training", "Training runs", none)
     total = sum(run.get("wall_s") or run.get("seconds") or 0.0 for run in thrown.runs)
-    parts.append(Text(f"{len(thrown.runs)} trainings, {total / 60:.0f} minutes in all, each on the device that its row names."))
+    lead = Text(f"{len(thrown.runs)} trainings, {total / 60:.0f} minutes in all, each on the device that its row names.")
     groups: dict[str, list[np.ndarray]] = {}
-    rows = []
+    rows, picture = [], None
     for run in thrown.runs:
         curve = np.array([point for point in run.get("curve", []) if None not in point], dtype=float).reshape(-1, 3)
         if len(curve) > 1:
@@ -150,11 +145,10 @@ def training_section(thrown: ResultSet) -> Section:
         rows.append(_run_row(run))
     if groups:
         text = "Landing error of the training's own throws, random starts and goals, over environment steps; a colour a seed."
-        parts.append(Picture("learning", figures.learning(list(groups.items())), text))
+        picture = Picture("learning", figures.learning(list(groups.items())), text)
     head = ("run", "seed", "million steps", "pieces", "time [s]", "final error [m]", "final duration [s]", "device", "commit")
     note = "Time: all pieces of the run. Final: throws from hover at 2.0 m in its own simulator, at the end of the training."
-    parts.append(Grid("Training runs", head, tuple(rows), note))
-    return Section("training", "Training runs", tuple(parts))
+    return parts.section("training", "Training runs", lead, picture, Grid("Training runs", head, tuple(rows), note))
 
 
 def _run_row(run: dict) -> tuple[str, ...]:
@@ -171,3 +165,25 @@ def _run_row(run: dict) -> tuple[str, ...]:
         number(seconds, "{:.0f}"), number(final.get("error_mean")), number(final.get("duration_mean")),
         device if isinstance(device, str) else ", ".join(map(str, device)), str(run.get("commit", "-"))[:9],
     )  # fmt: skip
+
+
+def origin_section(thrown: ResultSet) -> Section:
+    """A row for each command and commit that made throws, and seeds."""
+    groups: dict[tuple[str, ...], list] = defaultdict(list)
+    for r in thrown.results:
+        made = r.provenance
+        groups[(made.get("command", "-").split(" (")[0], str(made.get("commit", "-"))[:12], SHORT[r.unit["plant"]])].append(r)
+    rows = []
+    for (command, commit, plant), found in sorted(groups.items()):
+        times = sorted(str(r.provenance.get("time", "-"))[:10] for r in found)
+        seeds = ", ".join(sorted({str(r.unit["seed"]) for r in found}))
+        seconds = sum(r.provenance.get("seconds", 0.0) for r in found)
+        throws = sum(len(r.good) for r in found)
+        rows.append((command, commit, plant, str(len(found)), str(throws), seeds, times[0] if times[0] == times[-1] else
+                     f"{times[0]} to {times[-1]}", f"{seconds:.0f}"))  # fmt: skip
+    lead = Text("Seeds of throws fix starts, vehicles, winds and noise: policies and baseline meet the same ones. Intervals are "
+                "percentile bootstrap intervals of 95 %; 'runs and throws' are drawn in two levels where there are several "
+                "trainings. Throws that did not land have no error and count against 'landed'.")  # fmt: skip
+    head = ("command", "commit", "plant", "sets", "throws", "seeds", "made on", "seconds of work")
+    table = Grid("Throws behind this page", head, tuple(rows), heads=3) if rows else Text("No throws are recorded.", "missing")
+    return parts.section("origin", "Where the figures come from", lead, table)

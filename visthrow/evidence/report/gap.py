@@ -9,7 +9,7 @@ from visthrow.common import statistics as st
 from visthrow.evidence.report.result_set import ANY, SHIPPED, ResultSet, errors, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.throws.results import Result
-from visthrow.view import figures
+from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 PLANT, TARGET = "hybrid", 2.0
@@ -61,20 +61,15 @@ def section(thrown: ResultSet) -> Section:
         if not lines:
             missing.append(sweep.title)
         panels.append(figures.Panel(sweep.title, sweep.xlabel, tuple(lines), "not thrown yet"))
-    parts: list = [
-        Text("The shipped policies are flown in the training simulator at 2.0 m with one value changed and everything else as "
-             "it is flown. Nothing is retrained. `vision` saw late, lost and wrong keypoints in its training. Rings "
-             "mark the policies' own value, bands are 95 % intervals over throws.")
-    ]  # fmt: skip
+    made = [Text("The shipped policies are flown in the training simulator at 2.0 m with one value changed and everything else as "
+                 "it is flown. Nothing is retrained. `vision` saw late, lost and wrong keypoints in its training. Rings "
+                 "mark the policies' own value, bands are 95 % intervals over throws.")]  # fmt: skip
     if rows:
         text = "Mean landing error of the throws that landed, against one imperfection at a time."
-        parts.append(Picture("gap", figures.curves(panels, "landing error [m]", log=True), text))
         head = ("imperfection", "value", "policy", "throws", "landed", "landing error [m]", "added to its own [m]")
-        parts.append(Grid("The curves in figures", head, tuple(rows), heads=1))
-    parts += _trained(thrown, missing)
-    if missing:
-        parts.append(Text("Not thrown yet: " + "; ".join(missing) + ".", "missing"))
-    return Section("gap", "What vision costs, and why", tuple(parts))
+        curves = Picture("gap", figures.curves(panels, "landing error [m]", log=True), text)
+        made += [curves, Grid("The curves in figures", head, tuple(rows))]
+    return parts.section("gap", "What vision costs, and why", *made, *_trained(thrown, missing), missing=missing)
 
 
 def curve(thrown: ResultSet, sweep: Sweep, policy: str) -> list[tuple[float, Result]]:
@@ -97,7 +92,7 @@ def _rows(sweep: Sweep, policy: str, points: list[tuple[float, Result]]) -> list
     rows = []
     for value, r in points:
         added = "its own" if r is own else "-" if own is None else st.difference(errors([r]), errors([own])).text(sign=True)
-        rows.append((f"{sweep.title}, {sweep.xlabel}", f"{value:.3g}", policy, str(len(r.good)), f"{100 * landed([r]):.1f} %",
+        rows.append((f"{sweep.title}, {sweep.xlabel}", f"{value:.3g}", policy, str(len(r.good)), landed(r),
                      st.mean(r.of("error")).text(), added))  # fmt: skip
     return rows
 
@@ -116,7 +111,7 @@ def _trained(thrown: ResultSet, missing: list[str]) -> list:
             error = st.mean(errors(found))
             marks.append(figures.Mark(title, error, series))
             ratio = "-" if variant == "full" or not full else st.ratio(errors(found), errors(full)).text(2)
-            rows.append((title, SHORT[plant], str(len(found)), f"{100 * landed(found):.1f} %", error.text(), ratio))
+            rows.append((title, SHORT[plant], str(len(found)), landed(*found), error.text(), ratio))
     if not rows:
         return []
     order = list(TRAINED.values())

@@ -38,23 +38,14 @@ class ResultSet:
         self, plant: str, target: float, *, layout: str | None = None, variant: str | None = None, policy: str | None = None,
         departures: Any = ANY,
     ) -> list[Result]:  # fmt: skip
-        """Throws of learnt policies, one result a policy: of several alike the one with most throws.
+        """Throws of learnt policies at a target [m], one result a policy: of several alike the one with most throws.
 
-        Args:
-            plant: of :data:`visthrow.throws.plants.PLANTS`.
-            target: [m].
-            layout: "state" or "vision"; None for either.
-            variant: of the training; None for any.
-            policy: by its name alone; None for all.
-            departures: that the throws were flown with; a dictionary, or :data:`ANY`.
+        What is None does not matter, nor do departures, with which the throws were flown, that are :data:`ANY`.
         """
-        wanted = {"kind": "policy", "plant": plant, "target": target}
-        wanted |= {} if variant is None else {"variant": variant}
-        wanted |= {} if layout is None else {"layout": layout}
-        wanted |= {} if policy is None else {"policy": policy}
-        wanted |= {} if departures is ANY else {"departures": departures}
+        wanted = {"layout": layout, "variant": variant, "policy": policy, "departures": None if departures is ANY else departures}
+        wanted = {name: value for name, value in wanted.items() if value is not None}
         best: dict[str, Result] = {}
-        for result in self.matching(**wanted):
+        for result in self.matching(kind="policy", plant=plant, target=target, **wanted):
             name = result.unit["policy"]
             if name not in best or result.unit["throws"] > best[name].unit["throws"]:
                 best[name] = result
@@ -74,32 +65,17 @@ class ResultSet:
         """Results whose unit has these entries."""
         return [r for r in self.results if all(r.unit.get(name) == value for name, value in wanted.items())]
 
-    def baseline(self, plant: str, compensation: str | None = None, **wanted: Any) -> list[Result]:
-        """Throws of the baseline."""
-        wanted |= {} if compensation is None else {"compensation": compensation}
-        return self.matching(kind="baseline", plant=plant, **wanted)
-
     def by_departure(self, policy: str, key: str, plant: str = "hybrid", target: float = 2.0) -> list[tuple[Any, Result]]:
         """A shipped policy's throws with one value of the config changed: the value and the throws, ascending."""
         found = [r for r in self.matching(kind="policy", policy=policy, plant=plant, target=target)
                  if list(r.unit["departures"]) == [key]]  # fmt: skip
-        return sorted(((r.unit["departures"][key], r) for r in found), key=lambda pair: _first(pair[0]))
-
-
-def _first(value: Any) -> float:
-    return float(value[0] if isinstance(value, list) else value)
+        return sorted(((r.unit["departures"][key], r) for r in found), key=lambda pair: float(np.ravel(pair[0])[0]))
 
 
 def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), note: str = "") -> ResultSet:
-    """Read committed records, and folders of single results; what an older protocol flew is left out.
+    """Read committed records, folders with ``throws``, ``training`` and ``findings``, and folders of single results, ``<key>.json``.
 
-    Args:
-        records: folders with ``throws``, ``training`` and ``findings``; a later one counts over an earlier one.
-        folders: of ``<key>.json``.
-        note: on the number of throws.
-
-    Raises:
-        StorageError: a record that cannot be read.
+    A later one counts over an earlier one; what an older protocol flew is left out. StorageError for what cannot be read.
     """
     records = [Path(place) for place in records]
     found = load_all([*(place / "throws" for place in records), *folders]).values()
@@ -107,14 +83,15 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), not
     findings: dict[str, str] = {}
     for place in records:
         for path in sorted((place / "training").glob("*.json")):
-            runs.update({run.get("name", f"{run['run']}-{run['train_seed']}"): run for run in _runs(path)})
+            runs.update({run.get("name", f"{run['run']}-{run['train_seed']}"): run for run in runs_of(path)})
         for path in sorted((place / "findings").glob("*.md")):
             findings[path.stem] = path.read_text(encoding="utf-8").strip()
     today = [result for result in found if result.unit.get("protocol") == PROTOCOL]
     return ResultSet(tuple(join(today)), tuple(runs.values()), findings, note)
 
 
-def _runs(path: Path) -> list[dict[str, Any]]:
+def runs_of(path: Path) -> list[dict[str, Any]]:
+    """Training runs of a record; StorageError where it is none."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))["runs"]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -126,17 +103,6 @@ def errors(results: Iterable[Result]) -> list[np.ndarray]:
     return [result.of("error") for result in results if result.good.any()]
 
 
-def durations(results: Iterable[Result]) -> list[np.ndarray]:
-    """Times from start to landing of each run [s]."""
-    return [result.of("duration") for result in results if result.good.any()]
-
-
-def misses(results: Iterable[Result]) -> list[np.ndarray]:
-    """Misses of each run, along the throw and to the left [m]."""
-    return [result.miss for result in results if result.good.any()]
-
-
-def landed(results: Iterable[Result]) -> float:
+def landed(*results: Result, digits: int = 1) -> str:
     """Share of throws that landed."""
-    results = list(results)
-    return float(np.mean(np.concatenate([result.good for result in results]))) if results else 0.0
+    return f"{100 * np.mean(np.concatenate([result.good for result in results])):.{digits}f} %"

@@ -2,13 +2,14 @@
 
 import math
 
+from visthrow.baseline.front import FRONT_TARGET
 from visthrow.common import statistics as st
-from visthrow.evidence.report.baseline_units import FRONT_TARGET, TARGETS
-from visthrow.evidence.report.result_set import SHIPPED, ResultSet, errors, landed, misses
+from visthrow.evidence.report.result_set import SHIPPED, ResultSet, landed
+from visthrow.task.measurement import TARGETS
 from visthrow.throws.plants import PLANTS
 from visthrow.throws.results import Result
 from visthrow.view import figures
-from visthrow.view.parts import Grid, Picture, Section, Text
+from visthrow.view.parts import Grid, Picture, Section, Text, section
 from visthrow.view.tables import PAPER, PAPER_NOTE
 
 SHORT = {
@@ -30,22 +31,14 @@ def throws_section(thrown: ResultSet) -> Section:
                         missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
                     continue
                 rows.append(_row(name, target, plant, found))
-    parts: list = [
-        Text(
-            "Throws of the shipped policies from hover. In training goals lie within 2 m, so 2.5 m is out of distribution. The "
-            "training simulator has all noise of the training; the reference plants were never seen in it."
-        )
-    ]
-    if rows:
-        head = ("policy", "target [m]", "plant", "throws", "landed", "landing error [m], mean and 95 % interval", "deviation [m]",
-                "duration [s]", "bias along / left [m]", "the paper's vehicle: error [m], duration [s]")  # fmt: skip
-        parts.append(Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3))
-    picture = _scatter(thrown)
-    if picture:
-        parts.append(picture)
-    if missing:
-        parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
-    return Section("throws", "What the policies do", tuple(parts))
+    lead = Text(
+        "Throws of the shipped policies from hover. In training goals lie within 2 m, so 2.5 m is out of distribution. The "
+        "training simulator has all noise of the training; the reference plants were never seen in it."
+    )
+    head = ("policy", "target [m]", "plant", "throws", "landed", "landing error [m], mean and 95 % interval", "deviation [m]",
+            "duration [s]", "bias along / left [m]", "the paper's vehicle: error [m], duration [s]")  # fmt: skip
+    table = Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3) if rows else None
+    return section("throws", "What the policies do", lead, table, _scatter(thrown), missing=missing, head="Not thrown")
 
 
 def wanted_there(plant: str, target: float) -> bool:
@@ -54,14 +47,14 @@ def wanted_there(plant: str, target: float) -> bool:
 
 
 def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]:
-    head = (name, f"{target:.1f}", SHORT[plant], str(len(found.good)), f"{100 * landed([found]):.1f} %")
+    head = (name, f"{target:.1f}", SHORT[plant], str(len(found.good)), landed(found))
     paper = PAPER.get((name, target))
     beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
     if not found.good.any():
         return (*head, "-", "-", "-", "-", beside)
-    bias = st.bias(misses([found]))
+    bias = st.bias(found.miss)
     return (
-        *head, st.mean(errors([found])).text(), f"{found.of('error').std():.3f}", f"{found.of('duration').mean():.3f}",
+        *head, st.mean(found.of("error")).text(), f"{found.of('error').std():.3f}", f"{found.of('duration').mean():.3f}",
         f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}", beside,
     )  # fmt: skip
 
@@ -96,22 +89,16 @@ def vision_section(thrown: ResultSet) -> Section:
             beside = "-" if paper is None else f"{paper[0]:+.3f}, {paper[1]:+.3f}"
             rows.append((SHORT[plant], f"{target:.1f}", runs, gap.text(sign=True), _said(gap), faster.text(sign=True), beside))
             marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else _paper_gap(target)))
-    parts: list = [
-        Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
-             "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
-             "met the same vehicles, starts and winds.")
-    ]  # fmt: skip
+    parts = [Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
+                  "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
+                  "met the same vehicles, starts and winds.")]  # fmt: skip
     if rows:
         head = ("plant", "target [m]", "policies", "error: vision - state [m]", "in words", "duration: vision - state [s]",
                 "the paper's: error [m], duration [s]")  # fmt: skip
-        parts.append(Grid("Vision against state", head, tuple(rows), heads=1))
-        names = [SHORT[plant] for plant in PLANTS]
-        picture = figures.marks(marks, "landing error, vision minus state [m]", names, zero=0.0)
+        picture = figures.marks(marks, "landing error, vision minus state [m]", [SHORT[plant] for plant in PLANTS], zero=0.0)
         text = "Difference of mean landing errors with 95 % intervals; left of the line vision lands nearer."
-        parts.append(Picture("vision", picture, text))
-    if missing:
-        parts.append(Text("Not thrown by both: " + "; ".join(missing) + ".", "missing"))
-    return Section("vision", "Vision against state", tuple(parts))
+        parts += [Grid("Vision against state", head, tuple(rows)), Picture("vision", picture, text)]
+    return section("vision", "Vision against state", *parts, missing=missing, head="Not thrown by both")
 
 
 def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:

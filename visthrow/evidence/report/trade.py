@@ -5,12 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from visthrow.baseline import front, thrower
+from visthrow.baseline.front import FRONT_TARGET, FRONT_THROWS
+from visthrow.baseline.thrower import BOUNDS
 from visthrow.common import statistics as st
-from visthrow.evidence.report.baseline_units import BOUNDS, FRONT_TARGET, FRONT_THROWS, TARGETS
 from visthrow.evidence.report.result_set import SHIPPED, ResultSet, landed
 from visthrow.evidence.report.throws import SHORT
+from visthrow.task.measurement import TARGETS
 from visthrow.throws.results import Result
-from visthrow.view import figures
+from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER
 
@@ -39,24 +41,27 @@ def baseline_section(thrown: ResultSet) -> Section:
     for target in TARGETS:
         for plant in (thrower.OWN, "hybrid", "reference-realistic"):
             for compensation in ("none",) if plant == thrower.OWN else thrower.MADE_UP:
-                found = [r for r in thrown.baseline(plant, compensation, target=target) if _default(r)]
-                if found:
-                    rows.append(max(found, key=lambda r: r.unit["throws"]))
+                best = _best(thrown, plant, target, compensation)
+                if best:
+                    rows.append(best)
                 elif plant != "reference-realistic" or compensation != "none":
                     missing.append(f"{SHORT[plant]}, {thrower.MADE_UP[compensation]}, {target:g} m")
-    parts: list = [
-        Text("Trajectory optimisation and model-predictive control (TO+MPC), as the paper's: release height and speed from the "
-             "learnt policy, a septic spline, a nonlinear MPC on a rigid pendulum. In its own model it is an idealised bound, "
-             "without delay, noise, release lag or aerodynamics. On the plants it flies the same throws as the policies, with "
-             "none, most or all of the known delays made up for.")
-    ]  # fmt: skip
-    if rows:
-        parts.append(by_target(rows))
-        parts.append(Text(_bar(thrown), "finding"))
-    parts += _steps()
-    if missing:
-        parts.append(Text("Not thrown: " + "; ".join(missing) + ".", "missing"))
-    return Section("baseline", "The model-based baseline", tuple(parts))
+    lead = Text("Trajectory optimisation and model-predictive control (TO+MPC), as the paper's: release height and speed from the "
+                "learnt policy, a septic spline, a nonlinear MPC on a rigid pendulum. In its own model it is an idealised bound, "
+                "without delay, noise, release lag or aerodynamics. On the plants it flies the same throws as the policies, with "
+                "none, most or all of the known delays made up for.")  # fmt: skip
+    tables = [by_target(rows), Text(_bar(thrown), "finding")] if rows else []
+    return parts.section("baseline", "The model-based baseline", lead, *tables, *_steps(), missing=missing, head="Not thrown")
+
+
+def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Result | None:
+    """Throws at the speed and with the weights of the throws by target, the most there are."""
+    found = [r for r in _of_baseline(thrown, plant, target, compensation=compensation) if _default(r)]
+    return max(found, key=lambda r: r.unit["throws"], default=None)
+
+
+def _of_baseline(thrown: ResultSet, plant: str, target: float = FRONT_TARGET, **wanted: str) -> list[Result]:
+    return thrown.matching(kind="baseline", plant=plant, target=target, **wanted)
 
 
 def by_target(found: Sequence[Result]) -> Grid:
@@ -73,7 +78,7 @@ def _row(found: Result) -> tuple[str, ...]:
     own = unit["plant"] == thrower.OWN
     paper = PAPER.get(("TO+MPC", unit["target"])) if own else None
     head = (f"{unit['target']:.1f}", SHORT[unit["plant"]], "-" if own else thrower.MADE_UP[unit["compensation"]],
-            str(len(found.good)), f"{100 * landed([found]):.0f} %")  # fmt: skip
+            str(len(found.good)), landed(found, digits=0))  # fmt: skip
     beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
     if not found.good.any():
         return (*head, "-", "-", "-", "-", "-", beside)
@@ -101,31 +106,23 @@ def _bar(thrown: ResultSet) -> str:
     """Own-model errors and durations against the paper's: within 40 % of them, or better."""
     words = []
     for target in TARGETS:
-        found = [r for r in thrown.baseline(thrower.OWN, target=target) if _default(r) and r.good.any()]
-        if found:
-            best = max(found, key=lambda r: r.unit["throws"])
+        best = _best(thrown, thrower.OWN, target, "none")
+        if best and best.good.any():
             error, duration, paper = best.of("error").mean(), best.of("duration").mean(), PAPER[("TO+MPC", target)]
             words.append(f"{target:g} m: error {error / paper[0]:.2f} and duration {duration / paper[2]:.2f} times the paper's")
     return "In its own model: " + "; ".join(words) + "."
 
 
 def front_section(thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED) -> Section:
-    """The sweep on each plant with the policies on it, and who beats whom.
-
-    Args:
-        thrown: the results.
-        shown: as :data:`PANELS`.
-        names: of the policies.
-    """
-    panels, parts, said, sums, missing = [], [], [], [], []
+    """The sweep on each plant, as in :data:`PANELS`, with the policies of these names on it, and who beats whom."""
+    panels, said, sums, missing, picture, table = [], [], [], [], None, None
     for heading, plant, kinds, policies_on in shown:
         title = SHORT[plant]
         policies = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
         policies = [(name, result) for name, result in policies if result is not None and result.good.any()]
         drawn = []
         for compensation, bounds in kinds:
-            found = [r for r in thrown.baseline(plant, compensation, target=FRONT_TARGET, bounds=bounds)
-                     if r.unit["throws"] <= FRONT_THROWS or not _default(r)]  # fmt: skip
+            found = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
             label = _label(plant, compensation, bounds)
             if not found:
                 if (plant, bounds) != ("reference-realistic", BOUNDS[1]):
@@ -140,28 +137,30 @@ def front_section(thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Seq
         crosses = _paper_points() if plant == thrower.OWN else ()
         fronts = tuple((kinds.index(kind), _drawn(*kind), points_of(found)) for kind, found in drawn)
         panels.append(figures.Trade(heading, fronts, tuple(stars), crosses))
-    parts.append(Text(
+    lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting counts where all its throws "
         "landed. Plans bound the payload's path alone, as the paper's do, or the vehicle's thrust and its turning as well. Lines "
         "join the settings that no other one of their kind beats; stars are the learnt policies with 95 % intervals."
-    ))  # fmt: skip
+    )
     if any(len(points) for panel in panels for _, _, points in panel.fronts):
         text = (
             "Agility against accuracy, nearer to the lower left corner is better. On the plants the baseline's known delays are "
             "made up for, except where the legend says otherwise. Crosses and grey stars are the paper's."
         )
-        parts.append(Picture("front", figures.trades(panels), text))
+        picture = Picture("front", figures.trades(panels), text)
     if sums:
         head = ("plant", "what", "settings", "all landed", "fastest [s]", "most accurate [m]", "hypervolume [s m]",
                 "correlation of landing error with e_v")  # fmt: skip
         corner = "Hypervolume: area that is beaten up to {:g} s and {:g} m; more is better. ".format(*front.CORNER)
         note = corner + "Correlations are over throws of all settings; the paper states that the error follows e_v."
-        parts.append(Grid("Fronts in figures", head, tuple(sums), note, heads=2))
-    parts += [Text(text, "finding") for text in said]
-    parts += _breakdown(thrown)
-    if missing:
-        parts.append(Text("Not swept: " + "; ".join(missing) + ".", "missing"))
-    return Section("front", "Agility against accuracy", tuple(parts))
+        table = Grid("Fronts in figures", head, tuple(sums), note, heads=2)
+    made = (lead, picture, table, *(Text(text, "finding") for text in said), _breakdown(thrown))
+    return parts.section("front", "Agility against accuracy", *made, missing=missing, head="Not swept")
+
+
+def _swept(found: Sequence[Result]) -> list[Result]:
+    """Throws of the sweep: those by target are more."""
+    return [r for r in found if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
 
 
 def _label(plant: str, compensation: str, bounds: str) -> str:
@@ -245,11 +244,11 @@ def _count(points: Sequence) -> str:
     return f"{len(points)} setting" + ("" if len(points) == 1 else "s")
 
 
-def _breakdown(thrown: ResultSet) -> list[Grid]:
+def _breakdown(thrown: ResultSet) -> Grid | None:
     """The paper's table of settings, and ours of the own model."""
-    found = [r for r in thrown.baseline(thrower.OWN, target=FRONT_TARGET) if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
+    found = _swept(_of_baseline(thrown, thrower.OWN))
     if not found:
-        return []
+        return None
     rows = [
         (f"{v:g}", f"{w_t / 1e3:g}k", f"{rho:g}", "the paper's", f"{e:.3f}", f"{d:.3f}", f"{100 * p:.1f}", f"{100 * u:.1f}")
         for v, w_t, rho, e, d, p, u in front.PAPER_FRONT
@@ -261,6 +260,6 @@ def _breakdown(thrown: ResultSet) -> list[Grid]:
             parts = (100 * r.of(name).mean() for name in ("position_error", "velocity_error"))
             rows.append((*head, st.mean(r.of("error")).text(), f"{r.of('duration').mean():.3f}", *(f"{x:.1f}" for x in parts)))
         else:
-            rows.append((*head, f"landed {100 * landed([r]):.0f} %", "-", "-", "-"))
+            rows.append((*head, f"landed {landed(r, digits=0)}", "-", "-", "-"))
     head = ("v [m/s]", "w_t", "rho", "plan", "landing error [m]", "duration [s]", "e_p [cm]", "e_v [cm/s]")
-    return [Grid("Breakdown of the front in the own model; the paper's are of ten throws each", head, tuple(rows), heads=0)]
+    return Grid("Breakdown of the front in the own model; the paper's are of ten throws each", head, tuple(rows), heads=0)

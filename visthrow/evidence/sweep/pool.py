@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from visthrow.evidence.sweep.units import Source, ThrowUnit, Work
 from visthrow.evidence.sweep.work import EXIT_BUSY, EXIT_STOPPED
@@ -36,29 +36,6 @@ class Task:
     def log(self, out: Path) -> Path:
         """What its process prints."""
         return out / "logs" / f"{self.name.replace('/', '_')}.txt"
-
-
-class Running(Protocol):
-    """A task at work."""
-
-    def poll(self) -> int | None:
-        """Exit status, None while it runs."""
-
-    def stop(self) -> None:
-        """Ask it to write what it has and end."""
-
-    def kill(self) -> None:
-        """End it now."""
-
-
-class Starter(Protocol):
-    """Starts tasks: as processes of this machine, or as jobs."""
-
-    devices: list[str]  # one task at once on each
-    jobs: int  # tasks at once on CPU cores
-
-    def start(self, task: Task, device: str, minutes: float | None) -> Running:
-        """Start a task."""
 
 
 class Process(subprocess.Popen):
@@ -111,13 +88,7 @@ class Outcome:
 
 
 def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
-    """What is left to do and can be done now, the most important first.
-
-    Args:
-        work: the list.
-        out: folder of all results.
-        done: ids known to be done; those found so are added.
-    """
+    """What is left to do and can be done now, the most important first; ids that are found to be done are added to ``done``."""
 
     def left(unit: Source | ThrowUnit) -> bool:
         if unit.id not in done and unit.done(out):
@@ -136,15 +107,17 @@ def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
 
 
 class Pool:
-    """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop."""
+    """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop.
 
-    def __init__(self, work: Work, out: Path, starter: Starter, say: Callable[[str], None]) -> None:
+    Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU cores, and ``start(task, device, minutes)``.
+    What that returns has ``poll()`` for the exit status, None while it runs, ``stop()`` to write what it has and end, and ``kill()``.
+    """
+
+    def __init__(self, work: Work, out: Path, starter: Any, say: Callable[[str], None]) -> None:
         self.work, self.out, self.starter, self.say = work, out, starter, say
-        self.outcome = Outcome()
-        self._running: dict[str, tuple[Task, str, Running]] = {}
+        self.outcome, self._done, self._todo = Outcome(), set(), []
+        self._running: dict[str, tuple[Task, str, Any]] = {}
         self._wait: dict[str, float] = {}  # task -> time before which it is not tried again
-        self._done: set[str] = set()
-        self._todo: list[Task] = []
 
     def run(self, minutes: float | None = None) -> Outcome:
         """Work; returns when nothing is left, or ``minutes`` have passed, or after Ctrl-C."""
@@ -220,8 +193,4 @@ class Pool:
 
 def last_line(log: Path) -> str:
     """Return the last line of what a task printed."""
-    try:
-        lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-    except OSError:
-        return ""
-    return lines[-1].strip() if lines else ""
+    return log.read_text(errors="replace").strip().rpartition("\n")[2].strip() if log.exists() else ""

@@ -5,10 +5,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.errors import StorageError
-from visthrow.evidence.sweep.lock import held
+from visthrow.evidence.report.result_set import runs_of
 from visthrow.evidence.sweep.units import PROGRESS, SUMMARY, Source, Work, throws_folder, variant_of
-from visthrow.evidence.sweep.work import PIECES, lock_of
+from visthrow.evidence.sweep.work import PIECES, held, lock_of
 from visthrow.throws import results
 
 CURVE_POINTS = 60
@@ -53,12 +52,12 @@ def collect(work: Work, out: Path, records: Path) -> list[Path]:
         StorageError: a record that cannot be read or written.
     """
     training, throws = records / "training" / f"{work.name}.json", records / "throws" / f"{work.name}.json"
-    runs = {run["name"]: run for run in _read(training)} | {
+    runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {
         source.name: _run(source, out) for source in work.sources if source.config and source.done(out)
     }
     order = {source.name: i for i, source in enumerate(work.sources)}
     listed = sorted((run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]])
-    results.write_compact(training, {"runs": listed})
+    results.write_line(training, {"runs": listed})
     kept = {_question(result): result for result in results.load_all([throws]).values()}
     for units in work.throws.values():
         for unit in units:
@@ -71,15 +70,6 @@ def collect(work: Work, out: Path, records: Path) -> list[Path]:
 
 def _question(result: results.Result) -> str:
     return results.key_of({key: value for key, value in result.unit.items() if key != "weights"})
-
-
-def _read(path: Path) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))["runs"]
-    except (OSError, ValueError, KeyError) as error:
-        raise StorageError(f"{path}; expected a record of trainings; got {type(error).__name__}: {error}") from error
 
 
 def _progress(source: Source, out: Path) -> list[dict[str, str]]:

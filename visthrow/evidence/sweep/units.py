@@ -14,7 +14,7 @@ from typing import Any
 from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.evidence.sweep.lists import SweepList, ThrowParams
+from visthrow.evidence.sweep import SweepList, ThrowParams
 from visthrow.onboard.policy import find_policy
 from visthrow.task import Experiment
 from visthrow.throws import results
@@ -28,19 +28,13 @@ POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
 
 @dataclass(frozen=True)
 class Source:
-    """A policy: to be trained, or there already.
+    """A policy: to be trained, or there already."""
 
-    Attributes:
-        name: what it is called: ``<config>-<seed>`` where it is trained, ``<config>-<group>-<seed>`` with changes of its group.
-        config: of ``configs/train``; empty for a policy that is there already.
-        key: of the training; empty likewise.
-    """
-
-    name: str
-    config: str = ""
+    name: str  # <config>-<seed> where it is trained, <config>-<group>-<seed> with changes of its group
+    config: str = ""  # of configs/train; empty for a policy that is there already
     changes: tuple[str, ...] = ()
     seed: int = 0
-    key: str = ""
+    key: str = ""  # of the training; empty likewise
 
     @property
     def id(self) -> str:
@@ -88,8 +82,7 @@ class ThrowUnit:
     @property
     def id(self) -> str:
         """Name on the command line."""
-        words = [self.source.id, self.set, f"{self.target:g}", *([] if self.batch is None else [str(self.batch)])]
-        return ":".join(words)
+        return ":".join([self.source.id, self.set, f"{self.target:g}", *([] if self.batch is None else [str(self.batch)])])
 
     def unit(self, out: Path) -> dict[str, Any]:
         """What :mod:`visthrow.throws.results` knows it by; the policy must be there."""
@@ -138,11 +131,7 @@ class Work:
     checkpoint_every: int  # iterations
 
     def source(self, name: str) -> Source:
-        """The training of that id.
-
-        Raises:
-            ConfigError: there is none; the list has changed.
-        """
+        """The training of that id; ConfigError where the list has changed."""
         known = {source.id: source for source in self.sources}
         if name not in known:
             raise ConfigError(f"no run '{name}' in the list; {suggest(name, known)}")
@@ -162,21 +151,13 @@ def variant_of(run: str) -> str:
 
 
 def load_list(name: str, overrides: tuple[str, ...] = ()) -> Work:
-    """Load a list by a name of ``configs/sweep`` or a file, and expand it to units.
-
-    Raises:
-        ConfigError: no such list, or something wrong in it.
-    """
+    """Load a list by a name of ``configs/sweep`` or a file, and cut it into units; ConfigError where something is wrong in it."""
     path = config.find("sweep", name)
     return expand(path.stem, config.load(SweepList, path, overrides))
 
 
 def expand(name: str, params: SweepList) -> Work:
-    """Cut a list into units.
-
-    Raises:
-        ConfigError: a config, change or policy that does not exist.
-    """
+    """Cut a list into units; ConfigError for a config, change or policy that does not exist."""
     sources: dict[str, Source] = {}
     throws: dict[str, list[ThrowUnit]] = {}
     commit = provenance.commit() if params.commit == "same" else ""

@@ -1,9 +1,14 @@
 """Doing of units in this process: a piece of a training run, throws. What is done, or is being done elsewhere, is left alone."""
 
+import fcntl
+import json
+import os
+import platform
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,7 +18,6 @@ import torch
 from visthrow.common import provenance
 from visthrow.common.errors import BusyError
 from visthrow.common.storage import write_json
-from visthrow.evidence.sweep.lock import Lock
 from visthrow.evidence.sweep.units import Source, ThrowUnit, Work, throws_folder
 from visthrow.throws import results
 from visthrow.throws.loading import Loaded, load_policy
@@ -29,15 +33,38 @@ def lock_of(out: Path, name: str) -> Path:
     return out / "locks" / f"{name.replace('/', '_')}.lock"
 
 
-def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
-    """Do units one after the other.
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock on a file, which says who has it; BusyError where another process does.
 
-    Args:
-        work: the list.
-        out: folder of all results.
-        ids: of trainings and throws.
-        device: as :func:`visthrow.training.device.resolve` takes it.
-        minutes: after which a training stops with a checkpoint.
+    The kernel lets go of it with the process. The file stays: removing it would let two processes lock two files of one name.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise BusyError(f"{path}: another process works on it: {file.read() or 'it does not say which'}") from None
+        file.truncate(0)
+        json.dump({"process": os.getpid(), "machine": platform.node(), "since": time.time()}, file)
+        file.flush()
+        yield
+
+
+def held(path: Path) -> bool:
+    """Whether a living process has the lock on a file."""
+    try:
+        with path.open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
+    """Do trainings and throws of these ids one after the other; after so many minutes a training stops with a checkpoint.
 
     Returns:
         0; 130 where a training was stopped before its end; 75 where another process had the unit.
@@ -48,7 +75,7 @@ def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float 
         left = None if minutes is None else max(minutes - (time.monotonic() - begin) / 60, 0.01)
         unit = throws.get(name) or work.source(name)
         try:
-            with Lock(lock_of(out, name)):
+            with locked(lock_of(out, name)):
                 if unit.done(out):
                     continue
                 if isinstance(unit, Source):
@@ -108,11 +135,7 @@ def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
 
 
 def load(unit: ThrowUnit, out: Path) -> Loaded:
-    """The policy with the experiment that it is to fly in, departing from its contract as far as the list allows.
-
-    Raises:
-        MismatchError: the list does not allow what differs.
-    """
+    """The policy with the experiment that it is to fly in; MismatchError where the list does not allow what differs."""
     source, changes = unit.source, unit.params.changes
     flown_in = unit.flown_in(unit.experiments(out)[0]["task"]["observation"]["layout"])
     if flown_in is None and source.config:  # the list's config: that of the file may have fields of another version

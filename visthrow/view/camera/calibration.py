@@ -22,11 +22,7 @@ SIGNIFICANT = 1e-3
 
 
 def board_of(words: list[str] | None) -> BoardParams:
-    """Board of the words after ``--board``.
-
-    Raises:
-        ConfigError: they name none.
-    """
+    """Board of the words after ``--board``; ConfigError where they name none."""
     expected = f"--board {BOARD}, for instance: --board chessboard 7 5 0.04"
     if not words or len(words) < 4 or len(words) > 6 or words[0] not in ("chessboard", "circles", "charuco"):
         raise ConfigError(f"--board {' '.join(words or ['(missing)'])}; expected {expected}")
@@ -37,11 +33,7 @@ def board_of(words: list[str] | None) -> BoardParams:
 
 
 def pictures_of(names: list[str]) -> tuple[list[Path], list[np.ndarray]]:
-    """Read pictures, and those of folders, as BGR, uint8, shape (H, W, 3).
-
-    Raises:
-        ConfigError: a file is no picture, or there is none.
-    """
+    """Read pictures, and those of folders, as BGR, uint8, shape (H, W, 3); ConfigError where a file is none, or there is none."""
     import cv2
 
     paths: list[Path] = []
@@ -103,12 +95,7 @@ def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tupl
     (F test of eight free numbers), or below the bias that training draws for each episode (``noise.bias_std``).
 
     Args:
-        camera: The configuration.
-        given: Its reprojection errors.
-        best: Those of the lens calibrated on the same pictures.
-
-    Returns:
-        Whether it fits, and a sentence.
+        camera: the configuration. given: its reprojection errors. best: those of the lens calibrated on the same pictures.
     """
     from scipy.stats import f
 
