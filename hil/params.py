@@ -7,23 +7,25 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from camera.params import CameraParams
-from hil.backends.ardupilot import ArduPilotParams
-from hil.backends.betaflight import BetaflightParams
-from hil.backends.crazyflie import CrazyflieParams
-from hil.backends.px4 import Px4Params
 from hil.control.aim import AimParams
 from hil.control.calibrating import CalibrationParams
 from hil.control.realtime import RealtimeParams
 from hil.control.safety import CheckParams, FenceParams, GuardParams
 from hil.control.states import StateParams
+from hil.links.backends.ardupilot import ArduPilotParams
+from hil.links.backends.betaflight import BetaflightParams
+from hil.links.backends.crazyflie import CrazyflieParams
+from hil.links.backends.px4 import Px4Params
 from hil.links.roster import MavlinkId, check_allowed
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
 from hil.poses.pose import BODIES, PAYLOAD, VEHICLE
+from hil.poses.sources.images import ImageParams
+from hil.poses.sources.mavlink import BodyIds
+from hil.poses.sources.mocap import MocapParams, RigidBody
+from hil.poses.sources.player import CHANNELS, LogBody
 from hil.poses.track import MOST_PREDICTION
-from hil.sources import CHANNELS, BodyIds, LogBody, MocapParams, RigidBody
-from hil.sources.images import ImageParams
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
@@ -55,7 +57,7 @@ class SourceParams:
     kind: Literal["mavlink", "tlog", "csv", "bin", "ulg", "mocap"]
     file: str | None  # of a recording: tlog, csv, bin or ulg
     senders: tuple[BodyIds, ...]  # of mavlink and tlog
-    columns: tuple[ChannelMap, ...] = ()  # of csv: of hil.sources.player.CHANNELS; none where the file names its channels
+    columns: tuple[ChannelMap, ...] = ()  # of csv: of hil.poses.sources.player.CHANNELS; none where the file names its channels
     time: TimeColumn | None = None  # of csv: its clock
     logs: tuple[LogBody, ...] = ()  # of bin and ulg
     bodies: tuple[RigidBody, ...] = ()  # of mocap

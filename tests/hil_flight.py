@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from hil.backends import DryRun, Status
 from hil.control.runner import Decision, OperatorInput, Runner
+from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.pose import Pose
 from visthrow import config

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from hil.control.recording.record import Recorder
 from hil.control.runner import Decision, Runner
-from hil.recording.record import Recorder
 from tests.hil_flight import Spy, fly, params, simple_policy
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.policy import Policy, find_policy

@@ -1,14 +1,127 @@
-"""The release of a throw on the runner's side: latched once, separated a known lag later, followed until it is down."""
+"""The release of a throw on the runner's side: latched once, separated a known lag later, followed by its own poses until it is down."""
 
 import math
+from dataclasses import dataclass
 
-from hil.control.landing import Flight, Landing
+import numpy as np
+
 from hil.errors import RunError
 from hil.poses.pose import Vector
+from visthrow.onboard.hover import GRAVITY
 
 LAG_TOLERANCE = 5e-3  # what the mechanism may take longer than the trained lag [s]
 STUCK_AFTER = 0.6  # a payload that still hangs this long after it should have separated was not released, whatever was answered [s]
 ROUNDING = 1e-9  # tolerance of differences of times [s]
+
+FREE_AFTER, FREE_LEAST, FREE_LONG = 0.02, 5, 0.12
+"""The free fall that a separation is looked for before: poses from this long after the expected one [s], so many at least,
+and over so long [s], in which the air takes a few millimetres."""
+
+BENT, BENT_MOST = 5e-3, 0.1
+"""Distance from the free fall carried backwards, from which on poses say when the rope held [m]; noise stays below. Poses up
+to so long before the expected separation are looked at [s]."""
+
+NEAR = 8  # poses before the ground that the landing is carried forward from: free fall needs no model of drag over 0.1 s
+
+UNSEEN, MOST_BLIND = 0.1, 0.15
+"""A ball whose poses ended this long ago [s], and no longer than that before the ground [s], has landed where its fall leads: the
+impact itself looks like a jump to a gate that has missed the poses before it."""
+
+
+@dataclass(frozen=True)
+class Landing:
+    """One throw as the payload's poses tell it; times on the runner's clock."""
+
+    goal_w: Vector  # [m]
+    start: float  # of the throw [s]
+    latch: float  # of the release [s]
+    time: float  # of the landing [s]
+    landing_w: Vector  # payload's centre [m]
+    error: float  # horizontal distance from the goal [m]
+    duration: float  # from the throw's start to the landing [s]
+    lag: float = 0.0  # trained, from latch to separation [s]
+    separation: float | None = None  # by the poses [s]; None where they do not tell
+    separation_w: Vector | None = None  # payload's centre at that time [m]
+
+
+class Flight:
+    """Collects a payload's poses from the latch on until it is down."""
+
+    def __init__(self, goal_w: Vector, start: float, latch: float, height: float, lag: float = 0.0) -> None:
+        """Begin at the latch [s] of a throw; the payload's centre lands at a height [m], and separates a lag after the latch [s]."""
+        self.goal_w, self.start, self.latch, self.height, self.lag = goal_w, start, latch, height, lag
+        self._times: list[float] = []
+        self._points: list[Vector] = []
+
+    def add(self, time: float, pos: Vector) -> Landing | None:
+        """Take a pose of the payload, measured at a time [s], in our frames [m]; the landing, once it has come down."""
+        self._times.append(time)
+        self._points.append(pos)
+        # The ball may be measured for the last time some centimetres above the ground, or bounce in between.
+        if len(self._times) < NEAR or pos[2] > self.height + 0.05 or pos[2] > self._points[-2][2]:
+            return None
+        return self._landing()
+
+    def overdue(self, now: float) -> Landing | None:
+        """Return the landing of a ball that by a time [s] was lost from sight shortly before the ground."""
+        seen = self._times
+        free = len(seen) >= NEAR and seen[-NEAR] > self.latch + self.lag
+        if not free or now - seen[-1] < UNSEEN:
+            return None
+        landing = self._landing()
+        return landing if landing.time - seen[-1] < MOST_BLIND and landing.time < now - UNSEEN else None
+
+    def _landing(self) -> Landing:
+        times, points = np.array(self._times), np.array(self._points)
+        last = times[-1]
+        near = slice(max(0, len(times) - NEAR), len(times))
+        x, vx = _parabola(times[near] - last, points[near])
+        drop = x[2] - self.height
+        fall = (vx[2] + np.sqrt(max(vx[2] ** 2 + 2.0 * GRAVITY * drop, 0.0))) / GRAVITY
+        point = x + fall * vx
+        point[2] = self.height
+        when = float(last + fall)
+        landed = tuple(point.tolist())
+        error = float(np.hypot(landed[0] - self.goal_w[0], landed[1] - self.goal_w[1]))
+        found = separation(times, points, self.latch + self.lag)
+        return Landing(self.goal_w, self.start, self.latch, when, landed, error, when - self.start, self.lag, *(found or (None, None)))
+
+
+def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[float, Vector] | None:
+    """Return when and where the rope let go: where the poses leave the free fall after it, carried backwards.
+
+    While the rope holds, its pull bends the path away from the free fall by ``a (t_s - t)^2 / 2``; the root of the distance is
+    a line in time that ends at the separation.
+
+    Args:
+        times: of the poses [s], shape (N,). points: [m], shape (N, 3).
+        expected: about when [s].
+
+    Returns:
+        Time [s] and the payload's centre [m]; None where too few poses were seen on either side.
+    """
+    free = (times > expected + FREE_AFTER) & (times < expected + FREE_AFTER + FREE_LONG)
+    if np.count_nonzero(free) < FREE_LEAST:
+        return None
+    x, v = _parabola(times[free] - expected, points[free])
+    when = times - expected
+    off = np.linalg.norm(points + [0.0, 0.0, 0.5 * GRAVITY] * when[:, None] ** 2 - x - when[:, None] * v, axis=1)
+    bent = (when > -BENT_MOST) & (when < FREE_AFTER) & (off > BENT)
+    if np.count_nonzero(bent) < 3:
+        return None
+    slope, offset = np.polyfit(when[bent], np.sqrt(off[bent]), 1)
+    if not slope < 0.0 or not -BENT_MOST < -offset / slope < BENT_MOST:
+        return None
+    at = -offset / slope
+    point = x + at * v - [0.0, 0.0, 0.5 * GRAVITY * at * at]
+    return float(expected + at), tuple(point.tolist())
+
+
+def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position and velocity at time 0 of the free fall that fits poses best, shape (3,) each."""
+    lifted = points + [0.0, 0.0, 0.5 * GRAVITY] * times[:, None] ** 2
+    fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]
+    return fit[0], fit[1]
 
 
 class Latch:

@@ -8,17 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from hil.backends.base import Backend, DryRun
 from hil.control.calibrating import Calibrating, Solver
-from hil.control.decision import Decision, OperatorInput
 from hil.control.realtime import collected
+from hil.control.recording.latency import Stages
+from hil.control.recording.record import Recorder
 from hil.control.runner import Runner
-from hil.control.states import State
+from hil.control.states import Decision, OperatorInput, State
+from hil.links.backends.base import Backend, DryRun
 from hil.links.clock import Clock, Ticker
-from hil.recording.latency import Stages
-from hil.recording.record import Recorder
-from hil.sources import Source
-from hil.sources.images import Eyes
+from hil.poses.sources.base import Source
+from hil.poses.sources.images import Eyes
 
 AHEAD, AHEAD_SPREAD = 1e-3, 5e-3
 """Before a tick the poses that have come are taken in [s], so that the tick finds the last one or two alone; earlier by a share of
@@ -31,8 +30,7 @@ SAY_AGAIN = 3.0  # between two words on why it does not go on that differ in the
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
-COLLECT_ALL = 50
-"""Ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's."""
+COLLECT_ALL = 50  # ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's
 
 
 class Operator(Protocol):
@@ -141,7 +139,7 @@ class Loop:
         recording = self.recorder is None or self.recorder.failed is None
         asked = time.perf_counter()
         if self.eyes is not None:
-            self.eyes.tell(runner.hint(now))
+            self.eyes.hint = runner.hint(now)
             runner.look(self.eyes.poll(now))
         if self.solver is not None and (result := self.solver.poll()) is not None:
             runner.calibrated(result)

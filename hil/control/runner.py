@@ -14,21 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
-from hil.backends.base import HOLD as HELD
 from hil.control.aim import Aim
 from hil.control.calibrating import Calibrating
-from hil.control.decision import Decision, OperatorInput
 from hil.control.hovering import Hovering
 from hil.control.latch import Latch
 from hil.control.safety import Guard, failed_checks, fence_broken, outside
-from hil.control.states import FLYING, Inputs, Machine, State
+from hil.control.states import FLYING, Decision, Inputs, Machine, OperatorInput, State
+from hil.links.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
+from hil.links.backends.base import HOLD as HELD
 from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
 from hil.poses.gate import HOLD, Tether
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
+from hil.poses.sources.images import Hint
 from hil.poses.track import BodyState, Track
-from hil.sources.images import Hint
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import Pilot, PilotOutput
@@ -44,9 +43,7 @@ HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 """Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
 
 GROUND = 0.12  # height of the vehicle that counts as landed [m]
-
-LEVEL_TIME = 0.5
-"""An aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]."""
+LEVEL_TIME = 0.5  # an aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]
 
 
 WARM_CALLS = 3  # calls of the policy before it is to fly: code, data and the traced operations are at hand after two

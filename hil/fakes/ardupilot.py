@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.ardupilot import BRAKE, GUIDED, GUIDED_NOGPS, LAND_MODE, LOITER, SERVO_GRIPPER, THRUST_AS_THRUST
-from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import SERVO, FakeMavlink
+from hil.links.backends.ardupilot import BRAKE, GUIDED, GUIDED_NOGPS, LAND_MODE, LOITER, SERVO_GRIPPER, THRUST_AS_THRUST
+from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY

@@ -1,6 +1,7 @@
 """What all fakes share: plant, motion capture on the wire, a queue of things that take their time, a hold of their own."""
 
 import heapq
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -9,9 +10,8 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from hil.backends.thrust import ThrustParams
 from hil.fakes.mocap import SLACK, Mocap, MocapFault, MocapParams
-from hil.fakes.witness import Witness
+from hil.links.backends.thrust import ThrustParams
 from hil.links.device import Port, chunks
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -25,7 +25,8 @@ VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, 25)  # MAVLink system and component that po
 MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were trained with [rad/s]
 
 MOST_EVENTS = 200
-
+ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
+MOST_KEPT = 100  # breaches
 ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm` asks for [s]
 DESCENT, TOUCH = 0.4, 0.12  # set-point of a landing below the vehicle [m]; height that counts as down [m]
 
@@ -104,6 +105,56 @@ class SetPoints:
         return None if self._acting is None else mean + (begin + period - since) / period * self._acting
 
 
+@dataclass
+class Witness:
+    """Notes what must never arrive at a vehicle, from the vehicle's side.
+
+    Attributes:
+        limits: largest thrust [N] and body rates [rad/s] that may be asked for.
+        fence: corners of the box that the payload may be released in [m], world frame.
+        breaches: what happened, with its time; empty after a good run.
+        commands, releases: how many came.
+        worst: largest sizes that came, of thrust [N] and rates [rad/s].
+    """
+
+    limits: tuple[float, float, float, float]
+    fence: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-3.0, -3.0, -0.05), (3.0, 3.0, 3.0))
+    breaches: list[str] = field(default_factory=list)
+    commands: int = 0
+    releases: int = 0
+    worst: list[float] = field(default_factory=lambda: [0.0] * 4)
+    _answered: bool = False
+
+    def command(self, time: float, command: tuple[float, ...]) -> None:
+        """Note a set-point: thrust [N], body rates [rad/s]."""
+        self.commands += 1
+        if not all(map(math.isfinite, command)):
+            self._note(time, f"command {command} is not finite")
+            return
+        self.worst = [max(w, abs(c)) for w, c in zip(self.worst, command)]
+        if command[0] < 0.0 or any(abs(c) > ROOM * most for c, most in zip(command, self.limits)):
+            self._note(time, f"command {command} beyond {self.limits}")
+
+    def release(self, time: float, armed: bool, payload_w: np.ndarray) -> None:
+        """Note a command to open the mechanism."""
+        self.releases += 1
+        low, high = self.fence
+        if self._answered:
+            self._note(time, "released again after the answer")
+        if not armed:
+            self._note(time, "released while disarmed")
+        if not all(a <= x <= b for a, x, b in zip(low, payload_w, high)):
+            self._note(time, f"released with the payload at {np.round(payload_w, 2).tolist()}, outside of its fence")
+
+    def answered(self) -> None:
+        """Note that the release was acknowledged: none may follow."""
+        self._answered = True
+
+    def _note(self, time: float, text: str) -> None:
+        if len(self.breaches) < MOST_KEPT:
+            self.breaches.append(f"{time:.3f} s: {text}")
+
+
 class Fake(ABC):
     """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
 
@@ -151,7 +202,7 @@ class Fake(ABC):
         self.question_lag = 0.5 * plant.period
         self.events: list[tuple[float, str]] = []
         self._going_on: dict[str, float] = {}
-        self.taken = False
+        self.taken = self._open = False
 
     def happened(self, text: str) -> None:
         """Note something that the autopilot did by itself, or was told; what goes on from one period to the next is one event."""
@@ -213,6 +264,16 @@ class Fake(ABC):
     def note_release(self) -> None:
         """Note that a release command has come."""
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
+
+    def output(self, is_open: bool, when: float) -> bool:
+        """Take the mechanism's output, or its channel, as seen at a time [s]; whether it has opened now, which releases."""
+        opens = is_open and not self._open
+        self._open = is_open
+        if opens:
+            self.heard = when
+            self.note_release()
+            self.open_mechanism()
+        return opens
 
     def weight(self) -> float:
         """Return the weight of what flies now [N]."""
@@ -346,3 +407,15 @@ class PortFake(Fake):
         super().close()
         if self.port is not None:
             self.port.close()
+
+
+class Bridge(Fake):
+    """A real autopilot in software flies; it speaks for itself, and the runner's link passes this process by."""
+
+    unknown = ("followed", "ignored", "commands", "worst", "breaches", "last_command")  # of a report
+
+    def take(self) -> None:
+        """Do nothing: the pilot is the autopilot's."""
+
+    def report(self) -> dict[str, Any]:
+        return {name: value for name, value in super().report().items() if name not in self.unknown}

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.betaflight import BOX_ARM, BOX_OVERRIDE, FORWARDING, HIGH, LOW, SETTINGS, STICKS
-from hil.backends.rates import RATES_TYPES, RatesParams, Sticks
 from hil.fakes.base import PortFake
 from hil.links import msp
+from hil.links.backends.betaflight import BOX_ARM, BOX_OVERRIDE, FORWARDING, HIGH, LOW, SETTINGS, STICKS
+from hil.links.backends.rates import RATES_TYPES, RatesParams, Sticks
 
 IDLE_AFTER, DISARM_AFTER = 0.36, 1.6  # silence after which the motors idle, and after which it disarms, with all channels by MSP [s]
 OVERRIDE_GONE = 0.3  # silence after which the receiver's channels count again, under MSP OVERRIDE [s]
@@ -48,7 +48,7 @@ class FakeBetaflight(PortFake):
         self.override = False
         self._first: float | None = None
         self._heard = -np.inf
-        self._asked_open = self._low_first = self._disarmed = False
+        self._low_first = self._disarmed = False
 
     def _set_rates(self) -> None:
         p, axes = self.parameters, ("roll", "pitch", "yaw")
@@ -127,12 +127,8 @@ class FakeBetaflight(PortFake):
         """Release on the change to open, while the channels are ours."""
         at = STICKS + RELEASE_AUX - 1
         opened = self.override and at < len(self.channels) and self.channels[at] > 1700
-        if opened and not self._asked_open:
-            self.note_release()
-            if self.options.answer not in ("silent", "denied"):
-                self.witness.answered()
-            self.open_mechanism()
-        self._asked_open = opened
+        if self.output(opened, self.heard) and self.options.answer not in ("silent", "denied"):
+            self.witness.answered()
 
     def _status(self) -> bytes:
         failsafe = self.plant.time - self._heard > IDLE_AFTER

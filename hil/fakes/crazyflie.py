@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.crazyflie import FULL, MODES
 from hil.fakes.base import PortFake
 from hil.links import crtp
+from hil.links.backends.crazyflie import FULL, MODES
 
 LEVELS_AFTER, STOPS_AFTER = 0.5, 2.0  # silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN
 LEAST = 1000  # Thrust below this is none (MIN_THRUST)

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.autopilot import ARMED, CUSTOM
 from hil.fakes.base import VEHICLE_ID, Fake
+from hil.links.backends.autopilot import ARMED, CUSTOM
 from hil.links.mavlink_link import IGNORE_ATTITUDE
 from hil.links.pymav import mav
 

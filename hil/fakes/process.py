@@ -13,24 +13,23 @@ from typing import Any
 
 from hil.control.realtime import collected
 from hil.errors import LinkError, RunError
-from hil.fakes import KINDS, VEHICLE_ID, Fake, Options, WirePlant
+from hil.fakes.ardupilot import FakeArduPilot
+from hil.fakes.base import Fake, Options, WirePlant
+from hil.fakes.betaflight import FakeBetaflight
+from hil.fakes.crazyflie import FakeCrazyflie
 from hil.fakes.mocap import MocapParams
+from hil.fakes.px4 import FakePx4
 from hil.links.clock import Clock
-from hil.links.device import LARGEST_DATAGRAM, Port
+from hil.links.device import LARGEST_DATAGRAM, UdpPort
 from hil.links.mavlink_link import Link
-from visthrow import config
 from visthrow.common.errors import suggest
 
-AFTER_LANDING = 10.0
-"""The process ends this long after the payload has landed [s]: the vehicle has landed by then."""
+KINDS = {"ardupilot": FakeArduPilot, "px4": FakePx4, "betaflight": FakeBetaflight, "crazyflie": FakeCrazyflie}
+AFTER_LANDING = 10.0  # the process ends this long after the payload has landed [s]: the vehicle has landed by then
 
 
 def load_plant(target: str, policy: str, seed: int) -> WirePlant:
-    """Call ``module:function`` with policy and seed.
-
-    Raises:
-        RunError: no such module or function, or one that makes no plant of these two.
-    """
+    """Call ``module:function`` with policy and seed; raises `RunError` where there is none, or one that makes no plant of these two."""
     module, _, name = target.partition(":")
     try:
         make = getattr(importlib.import_module(module), name)
@@ -48,21 +47,13 @@ class ListeningPort:
     whole, sender, peer = False, None, None
 
     def __init__(self, number: int) -> None:
-        """Listen on a port of the loopback address.
-
-        Raises:
-            LinkError: it is taken, or there is none of that number.
-        """
+        """Listen on a port of the loopback address; raises `LinkError` where it is taken, or there is none of that number."""
         if not 1 <= number <= 65535:
             raise LinkError(f"tcp port {number}; expected 1 to 65535")
-        self._server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            self._server.bind(("127.0.0.1", number))
+            self._server = socket.create_server(("127.0.0.1", number), backlog=1)
         except OSError as error:
-            self._server.close()
             raise LinkError(f"cannot listen on tcp port {number}: {error.strerror}") from error
-        self._server.listen(1)
         self._server.setblocking(False)
         self._peer: socket.socket | None = None
 
@@ -95,62 +86,31 @@ class ListeningPort:
         return (self._peer or self._server).fileno()
 
     def close(self) -> None:
-        self._server.close()
-        if self._peer is not None:
-            self._peer.close()
+        for one in (self._server, self._peer):
+            if one is not None:
+                one.close()
 
 
-class AnsweringPort:
+class AnsweringPort(UdpPort):
     """A UDP port that answers whoever spoke last: what a vehicle in software offers."""
 
-    whole, sender, peer = True, None, None
-
-    def __init__(self, port: Port) -> None:
-        """Take a port that listens."""
-        self._port = port
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._port, name)
-
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        return self._port.write(data, to or self._port.sender)
+        return super().write(data, to or self.sender)
 
 
 def make_fake(
     kind: str, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0,
     options: Options | None = None, port: Any = None,
 ) -> Fake:  # fmt: skip
-    """A fake of a kind.
-
-    Args:
-        kind: of `hil.fakes.KINDS`.
-        plant, link, mocap, seed, options: see `hil.fakes.Fake`.
-        port: of MSP for Betaflight, of CRTP for the Crazyflie.
-
-    Raises:
-        RunError: an unknown kind.
-    """
+    """Return a fake of a kind, with its port of MSP for Betaflight, of CRTP for the Crazyflie; raises `RunError` for an unknown kind."""
     if kind not in KINDS:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, KINDS)}")
     more = {"port": port} if kind in ("betaflight", "crazyflie") else {}
     return KINDS[kind](plant, link, mocap, seed, options, **more)
 
 
-def read_options(overrides: list[str]) -> Options:
-    """Options of a fake from ``key=value`` texts.
-
-    Raises:
-        ConfigError: an unknown key or a wrong value; the message says what exists.
-    """
-    return config.loads(Options, "", overrides, "options of the fake")
-
-
 class Paced:
-    """A fake in real time, a period at a call.
-
-    Attributes:
-        late: periods that took longer than real time has.
-    """
+    """A fake in real time, a period at a call; ``late`` counts periods that took longer than real time has."""
 
     def __init__(self, fake: Fake, clock: Clock) -> None:
         """Start now; where the machine is late the vehicle's clock is as late as the vehicle."""
@@ -172,8 +132,7 @@ class Paced:
             clock.wait_for([fake.port], due)
             fake.hear()
         fake.deliver(time)  # poses leave before a period is worked out
-        fake.fly()
-        fake.emit()
+        fake.step()
 
 
 @contextlib.contextmanager
@@ -199,9 +158,7 @@ def interruptible() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def serve(
-    fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
-) -> dict[str, Any]:  # fmt: skip
+def serve(fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING) -> dict[str, Any]:
     """Fly in real time until ``after`` seconds after the payload's landing, for ``most`` seconds, or until Ctrl-C.
 
     Returns:
@@ -218,9 +175,3 @@ def serve(
     if out is not None:
         out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
-
-
-__all__ = [
-    "KINDS", "VEHICLE_ID", "AnsweringPort", "ListeningPort", "MocapParams", "Options", "Paced", "WirePlant", "load_plant",
-    "make_fake", "read_options", "serve",
-]  # fmt: skip

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.autopilot import bytes_to_integer, integer_to_bytes
-from hil.backends.px4 import AUTO_LAND, AUTO_LOITER, LAND_OR_HOLD, MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL
-from hil.backends.thrust import ThrustParams
 from hil.fakes.mavlink import FakeMavlink
+from hil.links.backends.autopilot import bytes_to_integer, integer_to_bytes
+from hil.links.backends.px4 import AUTO_LAND, AUTO_LOITER, LAND_OR_HOLD, MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL
+from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 
 STREAM_FIRST, STREAM_GAP = 1.0, 0.5  # set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]

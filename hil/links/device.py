@@ -8,9 +8,9 @@ import ipaddress
 import os
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from hil.errors import LinkError
 
@@ -18,9 +18,7 @@ _NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):(
 _SERIAL = re.compile(r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})")
 LARGEST_DATAGRAM = 65536
 MOST_CHUNKS = 256  # datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
-
-MOST_SHUT_OUT = 4096
-"""Datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of those that are ours."""
+MOST_SHUT_OUT = 4096  # datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of those that are ours
 
 
 @dataclass(frozen=True)
@@ -88,19 +86,19 @@ def chunks(port: Port) -> Iterator[bytes]:
         yield data
 
 
-class _SocketPort:
-    """What both kinds of socket share."""
+class _Opened:
+    """What is open behind a port."""
 
-    _socket: socket.socket
+    _open: Any
 
     def fileno(self) -> int:
-        return self._socket.fileno()
+        return self._open.fileno()
 
     def close(self) -> None:
-        self._socket.close()
+        self._open.close()
 
 
-class UdpPort(_SocketPort):
+class UdpPort(_Opened):
     """A UDP socket; one that listens hears everybody, and says who sent what."""
 
     whole = True
@@ -108,20 +106,20 @@ class UdpPort(_SocketPort):
     def __init__(self, device: Device) -> None:
         """Open it; raises `LinkError` where the address is taken or not this machine's."""
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        self._open = socket.socket(family, socket.SOCK_DGRAM)
+        self._open.setblocking(False)
         self.peer = (device.host, device.port) if device.kind == "udpout" else None
         self.sender: tuple[str, int] | None = None
         try:
             if device.kind == "udp":
-                self._socket.bind((device.host, device.port))
+                self._open.bind((device.host, device.port))
         except OSError as error:
-            self._socket.close()
+            self._open.close()
             raise LinkError(f"cannot open {device.kind}:{device.host}:{device.port}: {error.strerror}") from error
 
     def read(self) -> bytes | None:
         try:
-            data, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+            data, sender = self._open.recvfrom(LARGEST_DATAGRAM)
         except OSError:  # there is none, or the peer's port is closed: ICMP, reported here
             return None
         self.sender = sender[:2]
@@ -130,42 +128,47 @@ class UdpPort(_SocketPort):
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         to = self.peer or to
         try:
-            return to is not None and self._socket.sendto(data, to) == len(data)
+            return to is not None and self._open.sendto(data, to) == len(data)
         except OSError:
             return False
 
 
-class TcpPort(_SocketPort):
-    """A TCP connection, opened within two seconds or not at all."""
+class _Stream(_Opened):
+    """A stream of bytes to and from one peer."""
 
     whole, sender, peer = False, None, None
-
-    def __init__(self, device: Device) -> None:
-        """Connect; raises `LinkError` where nobody answers."""
-        try:
-            self._socket = socket.create_connection((device.host, device.port), timeout=2.0)
-        except OSError as error:
-            raise LinkError(f"cannot connect to tcp:{device.host}:{device.port}: {error.strerror or error}") from error
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setblocking(False)
+    _get: Callable[[], bytes]
+    _put: Callable[[bytes], int | None]
 
     def read(self) -> bytes | None:
         try:
-            return self._socket.recv(LARGEST_DATAGRAM) or None
+            return self._get() or None
         except OSError:
             return None
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         try:
-            return self._socket.send(data) == len(data)
+            return self._put(data) == len(data)
         except OSError:
             return False
 
 
-class SerialPort:
-    """A serial port."""
+class TcpPort(_Stream):
+    """A TCP connection, opened within two seconds or not at all."""
 
-    whole, sender, peer = False, None, None
+    def __init__(self, device: Device) -> None:
+        """Connect; raises `LinkError` where nobody answers."""
+        try:
+            self._open = socket.create_connection((device.host, device.port), timeout=2.0)
+        except OSError as error:
+            raise LinkError(f"cannot connect to tcp:{device.host}:{device.port}: {error.strerror or error}") from error
+        self._open.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._open.setblocking(False)
+        self._get, self._put = lambda: self._open.recv(LARGEST_DATAGRAM), self._open.send
+
+
+class SerialPort(_Stream):
+    """A serial port."""
 
     def __init__(self, device: Device) -> None:
         """Open it; raises `LinkError` where pyserial is missing, or the port cannot be opened."""
@@ -174,28 +177,11 @@ class SerialPort:
         except ModuleNotFoundError:
             raise LinkError("a serial port needs pyserial; install it with: pip install 'visthrow[serial]'") from None
         try:
-            self._port = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
+            self._open = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
             number = getattr(error, "errno", None)  # pyserial's text names port and reason twice
             raise LinkError(f"cannot open {device.host}: {os.strerror(number) if number else error}") from error
-
-    def read(self) -> bytes | None:
-        try:
-            return self._port.read(self._port.in_waiting or 1) or None
-        except OSError:
-            return None
-
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        try:
-            return self._port.write(data) == len(data)
-        except OSError:
-            return False
-
-    def fileno(self) -> int:
-        return self._port.fileno()
-
-    def close(self) -> None:
-        self._port.close()
+        self._get, self._put = lambda: self._open.read(self._open.in_waiting or 1), self._open.write
 
 
 def open_port(device: Device) -> Port:

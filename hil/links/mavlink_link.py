@@ -1,19 +1,20 @@
-"""The MAVLink link: datagrams in, messages to whoever listens, messages out, both ways into a .tlog.
+"""The MAVLink link: datagrams in, messages to whoever listens, messages out, both ways into a .tlog; TIMESYNC on it, both ways.
 
 Nothing here waits, and no bytes that arrive make it raise. :func:`poses_from_message` and :func:`attitude_target` are
 the boundary between MAVLink's units and orders and ours.
 """
 
 import math
+import random
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
-from hil.links.clock import Clock
+from hil.links.clock import Clock, TimeSync
 from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
-from hil.links.pymav import Parser, mav
-from hil.links.roster import Address, Roster, Seen
-from hil.links.signing import Signed
+from hil.links.pymav import Parser, Signed, mav
+from hil.links.roster import Address, Roster, Seen, shown
 from hil.links.writer import TlogWriter
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import quat_of_euler, rotate_one
@@ -32,7 +33,7 @@ class Link:
         received, sent, dropped: messages that were taken in, went, and could not be sent.
         parser: counts what was no message. roster: who may speak.
         sender: address of the message that listeners are called with.
-        on_pump: called with the time [s] whenever arrivals were taken in. sync: `hil.links.sync.LinkSync`, where there is one.
+        on_pump: called with the time [s] whenever arrivals were taken in. sync: `hil.links.mavlink_link.LinkSync`, where there is one.
     """
 
     def __init__(
@@ -177,3 +178,67 @@ def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_
     """Return SET_ATTITUDE_TARGET at a time [s]: collective thrust, 0 to 1, body rates forward, right, down [rad/s]."""
     stamp = int(time_s * 1e3) & 0xFFFFFFFF
     return mav.MAVLink_set_attitude_target_message(stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust)
+
+
+ASK_EVERY = (0.05, 0.15)
+"""Between two questions [s], drawn anew for each: a peer that works in periods of its own answers a question that comes at the same
+point of its period always with the same delay, which no shortest round trip would betray."""
+
+EARLY, LATE = 0.005, 0.2
+"""A pose that seems to arrive earlier than it was measured by more than this, or later by more, bears another clock [s]."""
+
+
+class LinkSync:
+    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one system may have two clocks.
+
+    ``foreign`` counts poses whose stamps are not of their sender's TIMESYNC clock.
+    """
+
+    def __init__(self, link: Link) -> None:
+        """Listen to a link, and ask from its pump."""
+        self._link = link
+        self._asked, self._pause, self._random = -1e9, 0.0, random.Random(0)
+        self.peers: dict[tuple[int, Address], TimeSync] = {}
+        self._pending: list[int] = []
+        self.foreign = 0
+        link.listen(self._hear)
+        link.on_pump.append(self.service)
+        link.sync = self
+
+    def service(self, now: float) -> None:
+        """Ask where it is time; nobody is asked before anybody was heard."""
+        if self._link.received and now - self._asked >= self._pause:
+            self._asked, self._pause = now, self._random.uniform(*ASK_EVERY)
+            stamp = TimeSync.stamp(now)
+            self._pending = [*self._pending[-50:], stamp]
+            self._link.send(mav.MAVLink_timesync_message(0, stamp))
+
+    def _hear(self, message: Any, arrival: float) -> None:
+        if message.get_type() != "TIMESYNC":
+            return
+        if message.tc1 == 0:
+            self._link.send(mav.MAVLink_timesync_message(TimeSync.stamp(arrival), message.ts1), self._link.sender)
+        elif message.ts1 in self._pending:
+            peer = self.peers.setdefault((message.get_srcSystem(), self._link.sender), TimeSync())
+            peer.take(message.tc1, message.ts1, arrival)
+
+    def dated(self, pose: Pose, system: int) -> Pose:
+        """Return a pose of the message just handed on, dated on our clock where its sender's is known and the stamp is of it."""
+        peer = self.peers.get((system, self._link.sender))
+        if peer is None or peer.offset is None:
+            return pose
+        measured = pose.stamp - peer.offset
+        if not -EARLY <= pose.arrival - measured <= LATE:
+            self.foreign += 1
+            return pose
+        return replace(pose, measured=min(measured, pose.arrival))
+
+    def summary(self) -> dict[str, Any]:
+        """Return offsets and round trips [s] by system and address."""
+        return {
+            "peers": {
+                f"{system} at {shown(address)}": {"offset": peer.offset, "round_trip": peer.round_trip, "steps": peer.steps}
+                for (system, address), peer in self.peers.items()
+            },
+            "foreign_stamps": self.foreign,
+        }

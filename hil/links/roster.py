@@ -22,10 +22,7 @@ SILENT = 1.5  # after which another address may take a party's place on the grou
 MOST_KEPT = 256  # kinds of messages of all senders that are told apart; the rest is counted together
 MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
 NOT_YET = "before its first"  # why a message of a party is not taken that has not been heard as the one that it is to be
-
-SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})
-"""Messages that a party may send beside its own: its clock, and whether it is simulated."""
-
+SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})  # messages that a party may send beside its own: its clock, and whether it is simulated
 SIMULATED = "SIMULATED"  # name of the NAMED_VALUE_INT by which a fake says that nothing real flies
 
 

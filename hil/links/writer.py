@@ -10,6 +10,7 @@ from typing import Any
 from hil.links.device import Port
 from visthrow.common.errors import StorageError
 
+TLOG, POSES_TLOG, MSP_LOG = "link.tlog", "poses.tlog", "link.msp"  # in a run's folder: of the link, of poses on a port of their own, of MSP
 MOST_WAITING = 100_000  # chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
 
 WRITE_EVERY = 0.1

@@ -34,16 +34,10 @@ class FrameParams:
     marker_offset_b: tuple[float, float, float]  # of the tracked point from the centre of mass [m], our body frame
 
     def __post_init__(self) -> None:
-        rotation_of(self.axes)
-        rotation_of(self.body_axes)
-
-
-def rotation_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes: ``v_ours = matrix @ v_source``, shape (3, 3); raises `FrameError` for what is no turn."""
-    try:
-        return turn_of(axes)
-    except ValueError as error:
-        raise FrameError(str(error)) from error
+        try:
+            turn_of(self.axes), turn_of(self.body_axes)
+        except ValueError as error:
+            raise FrameError(str(error)) from error
 
 
 class Frames:
@@ -57,8 +51,8 @@ class Frames:
         self.params = params
         half = math.radians(params.yaw_offset_deg) / 2.0
         yaw = (0.0, 0.0, math.sin(half), math.cos(half))
-        self._world = multiply(yaw, _quaternion(rotation_of(params.axes)))  # from the source's world to ours
-        self._body = _quaternion(rotation_of(params.body_axes))  # from the source's body to ours
+        self._world = multiply(yaw, _quaternion(turn_of(params.axes)))  # from the source's world to ours
+        self._body = _quaternion(turn_of(params.body_axes))  # from the source's body to ours
         self._offset = tuple(float(x) for x in params.marker_offset_b)
 
     def world_from_source(self, vector: Vector) -> Vector:

@@ -14,11 +14,11 @@ import numpy as np
 
 from hil.errors import RunError
 from hil.links.clock import Clock
-from hil.poses.frames import FrameParams, Frames, rotation_of
+from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import VEHICLE, Pose
-from hil.sources.base import Source
+from hil.poses.sources.base import Source
 from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
-from visthrow.logs.axes import OURS, TURNS
+from visthrow.logs.axes import OURS, TURNS, turn_of
 
 SPEED, RATE = 0.06, 0.25  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
 SPAN = 0.2  # over which speed and rate are taken [s]
@@ -134,17 +134,17 @@ def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
     pairs = [(move, step) for move, step in zip(MOVES, steps) if move.axis is not None]
     ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
     turns = [(move.axis, step) for move, step in pairs if move.turn]
-    world = max(TURNS, key=lambda axes: _agreement([(i, rotation_of(axes) @ way) for i, way in ways]))
+    world = max(TURNS, key=lambda axes: _agreement([(i, turn_of(axes) @ way) for i, way in ways]))
 
     known = {order: Frames(replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)) for order in ("xyzw", "wxyz")}
     vectors = {order: [(i, step.turns(ours)) for i, step in turns] for order, ours in known.items()}
 
     def fits(order: str, body: str) -> float:
-        both = [(i, v) for i, (in_world, in_body) in vectors[order] for v in (in_world, rotation_of(body) @ in_body)]
+        both = [(i, v) for i, (in_world, in_body) in vectors[order] for v in (in_world, turn_of(body) @ in_body)]
         return round(_agreement(both), 9)
 
     order, body = max(product(vectors, TURNS), key=lambda case: fits(*case))
-    fitting = replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=_yaw(ways, rotation_of(world)))
+    fitting = replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=_yaw(ways, turn_of(world)))
     lines = [*(_line(move, step, frames) for move, step in pairs), _start(steps[0].before, frames)]
     mirrored = bool(np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5)
     return Finding(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))

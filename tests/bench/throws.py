@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tests.bench.figures import bootstrap_upper, finite, json_lines
-from tests.bench.processes import COMMAND, Pair, own_cores, side_by_side
+from tests.bench.processes import Pair, own_cores, side_by_side
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
 from visthrow.evidence.bench.records import Report, Table
@@ -78,7 +78,7 @@ def _progress(count: int, most: int, wire: dict[str, Any], direct: dict[str, Any
 def _direct(seeds: list[int], args: argparse.Namespace) -> Any:
     if not seeds:
         return
-    command = [*COMMAND, "direct", "--set", f"policy={args.policy}", "--seeds", *map(str, seeds)]
+    command = [sys.executable, "-m", "tests.bench.direct", "--set", f"policy={args.policy}", "--seeds", *map(str, seeds)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         for row in process.stdout:
             yield {"way": "direct", **json.loads(row)}
@@ -149,7 +149,7 @@ def _report(pairs: list[tuple[dict, dict]], args: argparse.Namespace) -> Report:
         f"pairs share start, motion capture's noise and losses by their seeds {args.seed} to {args.seed + args.throws - 1}: 100 "
         "Hz, 1 mm, 0.2 deg, 10 ms, 2 % lost; the landing is the plant's true one",
         "without the wire: the same plant, motion capture, estimator and policy in one loop, without link, autopilot, state "
-        "machine and real time (visthrow hil direct)",
+        "machine and real time (tests/bench/direct.py)",
         "in real time" if args.speed == 1.0 else f"both clocks at {args.speed:g} of real time: the machine was too slow for more",
         f"{figures['missed']} ticks missed, {figures['missed_ours']} of them ours; {late} periods of the fake were late; "
         f"{len(figures['breaches'])} breaches noted by the vehicle; {figures['held_back']} questions for a release held back",

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from hil.backends import Status
+from hil.control.recording.playback import replay
+from hil.control.recording.record import Recorder, lines, read_poses
 from hil.control.runner import OperatorInput, Runner
+from hil.links.backends.base import Status
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from hil.recording.playback import replay
-from hil.recording.record import Recorder, lines, read_poses
 from tests.contract.test_pilot import quiet
 from tests.hil_flight import TICK, Spy, params
 from tests.hil_runs import record_run, saved_policy

@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from hil.backends import ArduPilot
-from hil.backends.ardupilot import GUIDED, LAND_MODE
 from hil.errors import RunError
-from hil.fakes import FakeArduPilot
-from hil.fakes.process import VEHICLE_ID, MocapParams, Options, load_plant
+from hil.fakes.ardupilot import FakeArduPilot
+from hil.fakes.base import VEHICLE_ID, Options
+from hil.fakes.mocap import MocapParams
+from hil.fakes.process import load_plant
+from hil.links.backends.ardupilot import GUIDED, LAND_MODE, ArduPilot
 from hil.links.mavlink_link import Link, attitude_target
 from hil.params import HilParams
 from tests.hil_flight import simple_policy

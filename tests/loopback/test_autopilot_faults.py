@@ -12,8 +12,8 @@ import time
 import numpy as np
 import pytest
 
-from hil.control.decision import OperatorInput
-from hil.recording.record import Recorder
+from hil.control.recording.record import Recorder
+from hil.control.states import OperatorInput
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hil.backends.base import FOLLOW, HOLD, LAND, WAIT
-from hil.backends.check import AutopilotCheck
-from hil.control.decision import OperatorInput
+from hil.check import AutopilotCheck
 from hil.control.loop import AutoOperator, fly
+from hil.control.states import OperatorInput
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
 from hil.links import msp
+from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers, throw

@@ -6,21 +6,22 @@ import sys
 import numpy as np
 import pytest
 
-from hil.backends import Crazyflie, make_backend, mechanism_lag
-from hil.backends.base import ACCEPTED, FAILED, FOLLOW
 from hil.control.loop import AutoOperator, Loop
 from hil.control.runner import Runner
 from hil.errors import LinkError
-from hil.fakes import FakeCrazyflie, Options
-from hil.fakes.base import VEHICLE_ID
+from hil.fakes.base import VEHICLE_ID, Options
+from hil.fakes.crazyflie import FakeCrazyflie
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import AnsweringPort
 from hil.fakes.sitl.throw import FlightClock
 from hil.links import crtp
+from hil.links.backends import make_backend, mechanism_lag
+from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
+from hil.links.backends.crazyflie import Crazyflie
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
-from hil.sources.opening import open_source
+from hil.poses.sources.opening import open_source
 from tests.bench.processes import free_port
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
@@ -34,7 +35,7 @@ class Desk:
         self.number, poses = free_port(), free_port()
         over = [f'crazyflie.device="udpout:127.0.0.1:{self.number}"', f'link.device="udp:127.0.0.1:{poses}"']
         self.params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
-        port = AnsweringPort(UdpPort(Device("udp", "127.0.0.1", self.number)))
+        port = AnsweringPort(Device("udp", "127.0.0.1", self.number))
         link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
         self.fake = FakeCrazyflie(make("vision", 0), link, MocapParams(), 0, Options(**options), port=port)
         self.backend = make_backend(self.params)

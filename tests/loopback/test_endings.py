@@ -6,8 +6,8 @@ import signal
 
 import pytest
 
-from hil.cli.terminal import ENDING, Terminal
 from hil.control.loop import fly
+from hil.terminal import ENDING, Terminal
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers

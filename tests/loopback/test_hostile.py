@@ -10,10 +10,9 @@ import time
 import numpy as np
 import pytest
 
-from hil.backends.base import FAILED
 from hil.control.loop import AutoOperator
-from hil.links.pymav import mav
-from hil.links.signing import Signed
+from hil.links.backends.base import FAILED
+from hil.links.pymav import Signed, mav
 from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import simple_policy

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from hil.control.decision import OperatorInput
+from hil.control.states import OperatorInput
 from hil.errors import RunError
 from hil.fakes.mocap import FAULTS, MocapFault
 from hil.poses.pose import VEHICLE, Pose

@@ -6,15 +6,15 @@ import socket
 
 import pytest
 
-from hil.backends import make_backend
+from hil.links.backends import make_backend
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.roster import SILENT
 from hil.params import HilParams
-from hil.sources.mavlink import MavlinkSource
-from hil.sources.opening import open_source
+from hil.poses.sources.mavlink import MavlinkSource
+from hil.poses.sources.opening import open_source
 from tests.bench.processes import free_port
 from tests.hil_runs import record_run, saved_policy
 from visthrow import config

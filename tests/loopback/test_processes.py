@@ -16,7 +16,7 @@ import time
 import numpy as np
 import pytest
 
-from hil.recording.playback import replay
+from hil.control.recording.playback import replay
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
 from visthrow.onboard.actions import hover_action

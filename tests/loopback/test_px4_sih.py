@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from hil.cli.simulated import make_ball
 from hil.fakes.base import VEHICLE_ID, Options
 from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl import Px4Sih
+from hil.fakes.sitl.sih import Px4Sih
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.params import HilParams
+from hil.simulated import make_ball
 from tests.bench.processes import free_port
 from visthrow import config
 

@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from hil.backends import make_backend, mechanism_lag
 from hil.control.loop import AutoOperator, fly
+from hil.control.recording.playback import replay
+from hil.control.recording.record import Recorder
 from hil.control.runner import Runner
+from hil.links.backends import make_backend, mechanism_lag
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
-from hil.recording.playback import replay
-from hil.recording.record import Recorder
-from hil.sources import MavlinkSource, read_tlog
+from hil.poses.sources.mavlink import MavlinkSource
+from hil.poses.sources.player import read_tlog
 from tests.loopback.wire import throw
 from visthrow import config
 from visthrow.onboard.pilot import Pilot

@@ -2,16 +2,17 @@
 
 from collections import deque
 
-from hil.backends import Betaflight, make_backend, mechanism_lag
 from hil.control.loop import AutoOperator, Loop
 from hil.control.runner import Runner
-from hil.fakes import Fake
-from hil.fakes.process import VEHICLE_ID, MocapParams, Options, make_fake
-from hil.links.mavlink_link import Link
+from hil.fakes.base import VEHICLE_ID, Fake, Options
+from hil.fakes.mocap import MocapParams
+from hil.fakes.process import make_fake
+from hil.links.backends import make_backend, mechanism_lag
+from hil.links.backends.betaflight import Betaflight
+from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
-from hil.links.sync import LinkSync
-from hil.sources import MavlinkSource
-from hil.sources.opening import parties
+from hil.poses.sources.mavlink import MavlinkSource
+from hil.poses.sources.opening import parties
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl import Firmware, needed, throw
 from hil.fakes.sitl.betaflight import SAMPLE
-from hil.fakes.sitl.throw import SETTINGS
+from hil.fakes.sitl.firmware import Firmware, needed
+from hil.fakes.sitl.throw import SETTINGS, throw
 from hil.params import HilParams
 from tests.sitl.landings import BASE, DELAY
 from tests.sitl.test_betaflight import program

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.fakes.direct import Direct
 from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl import throw
+from hil.fakes.sitl.throw import throw
 from hil.params import HilParams
+from tests.bench.direct import Direct
 from tests.sitl.test_betaflight import program
 from visthrow import config
 from visthrow.common import provenance

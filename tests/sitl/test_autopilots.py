@@ -13,16 +13,15 @@ import time
 
 import pytest
 
-from hil.backends import make_backend
-from hil.backends.autopilot import ARMED
-from hil.backends.base import FOLLOW, HOLD
+from hil.links.backends import make_backend
+from hil.links.backends.autopilot import ARMED
+from hil.links.backends.base import FOLLOW, HOLD
 from hil.links.device import check_device, open_port
-from hil.links.mavlink_link import Link
+from hil.links.mavlink_link import Link, LinkSync
 from hil.links.pymav import mav
 from hil.links.roster import Roster
-from hil.links.sync import LinkSync
 from hil.params import HilParams
-from hil.sources.opening import parties
+from hil.poses.sources.opening import parties
 from visthrow import config
 
 pytestmark = pytest.mark.sitl

@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.backends import Betaflight
-from hil.backends.base import FOLLOW
-from hil.fakes.base import Options
+from hil.fakes.base import VEHICLE_ID, Options
 from hil.fakes.mocap import MocapParams
-from hil.fakes.process import VEHICLE_ID
-from hil.fakes.sitl import BetaflightSitl, Firmware, needed, opened, throw
+from hil.fakes.sitl.betaflight import BetaflightSitl
+from hil.fakes.sitl.firmware import Firmware, needed
+from hil.fakes.sitl.throw import opened, throw
+from hil.links.backends.base import FOLLOW
+from hil.links.backends.betaflight import Betaflight
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams

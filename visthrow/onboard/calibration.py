@@ -34,14 +34,9 @@ CONSTANTS = {
 }  # fmt: skip
 """Unknowns that stay the same; see `Spreads`."""
 
-LEAST_STEPS, LEAST_SEEN = 75, 0.5
-"""Steps of a calibration, and share of them in which the ball is seen."""
-
-ROUNDS, SETTLED = 12, 1e-3
-"""Of Gauss-Newton at most, and the step of a constant in its spreads below which it has settled."""
-
-OUTLIER = 3.0
-"""Standard deviations beyond which a sighting counts less (Huber)."""
+LEAST_STEPS, LEAST_SEEN = 75, 0.5  # steps of a calibration, and share of them in which the ball is seen
+ROUNDS, SETTLED = 12, 1e-3  # of Gauss-Newton at most, and the step of a constant in its spreads below which it has settled
+OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
 
 
 @dataclass(frozen=True)
@@ -123,8 +118,7 @@ class Calibration:
         )
 
 
-UNKNOWN_YAW = math.radians(2.0)
-"""Standard deviation of the camera's yaw above which it is said to be unknown [rad]."""
+UNKNOWN_YAW = math.radians(2.0)  # standard deviation of the camera's yaw above which it is said to be unknown [rad]
 
 
 class CalibrationError(VisthrowError):
@@ -133,8 +127,7 @@ class CalibrationError(VisthrowError):
 
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
 
-STILL, SWAY = 1.5, 1.5
-"""Of a hover before the sway, and of the sway [s]."""
+STILL, SWAY = 1.5, 1.5  # of a hover before the sway, and of the sway [s]
 
 SWAY_RATE, SWAY_FREQUENCY = 1.0, 4.0 / 3.0
 """Amplitude of roll and pitch rate, 7 deg of tilt about either axis [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""

@@ -15,20 +15,11 @@ from torch import Tensor
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
 from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
 
-SUMS = 7
-"""Width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y."""
-
-POSITION_SIGMA = 0.017
-"""Deviation of one measured goal position of the state layout [m]: three measurements of 0.01 m each are added up."""
-
-ANGLE_SIGMA = 0.02
-"""Deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of 110 degrees."""
-
-SPEED_SIGMA = 0.4
-"""Prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have."""
-
-GRAZING = 0.1
-"""Sine of the least angle below the horizon at which a ray is followed to the ground."""
+SUMS = 7  # width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y
+POSITION_SIGMA = 0.017  # deviation of one measured goal position of the state layout [m]: three measurements of 0.01 m each are added up
+ANGLE_SIGMA = 0.02  # deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of 110 degrees
+SPEED_SIGMA = 0.4  # prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have
+GRAZING = 0.1  # sine of the least angle below the horizon at which a ray is followed to the ground
 
 
 def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:

@@ -18,31 +18,23 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.ardupilot import ArduPilotParams
 from hil.errors import LinkError
-from hil.fakes.base import Fake, Options
+from hil.fakes.base import Bridge, Options
 from hil.fakes.mocap import MocapParams
 from hil.fakes.sitl.betaflight import MotorPlant
+from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.device import LARGEST_DATAGRAM
 from hil.links.mavlink_link import Link
 
-SERVOS = 9002
-"""UDP port on which ArduPilot finds the simulation."""
-
-HEAD = struct.Struct("<HHI")
-"""Magic, frames a second that it would like, number of the frame; outputs [us] follow."""
-
-MAGIC = {18458: 16, 29569: 32}
-"""Outputs of a packet by its magic."""
+SERVOS = 9002  # UDP port on which ArduPilot finds the simulation
+HEAD = struct.Struct("<HHI")  # magic, frames a second that it would like, number of the frame; outputs [us] follow
+MAGIC = {18458: 16, 29569: 32}  # outputs of a packet by its magic
 
 OURS = (2, 0, 1, 3)
 """Where front left, front right, rear left, rear right stand among the outputs of a quadrotor X (FRAME_CLASS 1, FRAME_TYPE 1)."""
 
-LOW, HIGH, NEAR = 1000.0, 2000.0, 50.0
-"""MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]."""
-
-PATIENCE = 0.05
-"""For a frame, after which the wall's clock goes on without one [s]: ArduPilot sleeps, or is not there yet."""
+LOW, HIGH, NEAR = 1000.0, 2000.0, 50.0  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
+PATIENCE = 0.05  # for a frame, after which the wall's clock goes on without one [s]: ArduPilot sleeps, or is not there yet
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -69,27 +61,21 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
     return b"\n" + json.dumps(told).encode() + b"\n"
 
 
-class ArduPilotSitl(Fake):
+class ArduPilotSitl(Bridge):
     """See the head of this module.
 
     Attributes:
         frames: that were flown. repeated: that came again. restarts: of ArduPilot.
     """
 
+    unknown = (*Bridge.unknown, "armed")
+
     def __init__(
         self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: ArduPilotParams
     ) -> None:  # fmt: skip
-        """Listen for ArduPilot.
-
-        Args:
-            plant, link, mocap, seed, options: see `Fake`.
-            params: of the runner's back-end: which output opens the mechanism, and where.
-
-        Raises:
-            LinkError: the port is taken.
-        """
+        """Listen for ArduPilot; ``params`` of the back-end say which output opens the mechanism. Raises `LinkError`: the port is taken."""
         super().__init__(plant, link, mocap, seed, options)
-        self.params, self._number, self._open = params, -1, False
+        self.params, self._number = params, -1
         self.motors, self.frames, self.repeated, self.restarts = np.zeros(4), 0, 0, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -101,7 +87,7 @@ class ArduPilotSitl(Fake):
         self.port = self._socket
 
     def fly(self) -> None:
-        """See `Fake`: a period by the next frame's outputs, and the state after it in answer; without a frame, a period as it was."""
+        """Fly a period by the next frame's outputs, and the state after it in answer; without a frame, a period as it was."""
         frame, to = self._frame()
         if frame is None:
             super().fly()
@@ -118,7 +104,6 @@ class ArduPilotSitl(Fake):
         self._socket.sendto(state_line(self.plant.time, self.plant), to)
 
     def _frame(self) -> tuple[tuple[int, np.ndarray] | None, Any]:
-        """The next whole frame and where it came from."""
         while select.select([self._socket], [], [], PATIENCE)[0]:
             packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
             frame = outputs(packet)
@@ -128,31 +113,15 @@ class ArduPilotSitl(Fake):
 
     def _mechanism(self, servos: np.ndarray) -> None:
         at = self.params.servo_output - 1
-        opened = 0 <= at < len(servos) and abs(servos[at] - self.params.servo_open_us) <= NEAR
-        if opened and not self._open:
-            self.heard = self.plant.time
-            self.note_release()
-            self.open_mechanism()
-        self._open = opened
+        self.output(0 <= at < len(servos) and abs(servos[at] - self.params.servo_open_us) <= NEAR, self.plant.time)
 
     def flown(self) -> np.ndarray:
-        """See `Fake`: the motors' outputs."""
         return self.motors
 
-    def speak(self) -> None:
-        """See `Fake`: the autopilot speaks for itself."""
-
-    def take(self) -> None:
-        """See `Fake`: the pilot is the autopilot's."""
-
     def report(self) -> dict[str, Any]:
-        known = {name: value for name, value in super().report().items() if name not in UNKNOWN}
-        return {**known, "held": self.plant.held, "frames": self.frames, "repeated": self.repeated, "restarts": self.restarts}
+        counts = {"held": self.plant.held, "frames": self.frames, "repeated": self.repeated, "restarts": self.restarts}
+        return super().report() | counts
 
     def close(self) -> None:
         super().close()
         self._socket.close()
-
-
-UNKNOWN = ("followed", "ignored", "commands", "worst", "breaches", "last_command", "armed")
-"""Of a fake's report: the runner's link passes this process by."""

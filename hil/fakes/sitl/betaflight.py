@@ -10,24 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.betaflight import BOX_ARM, HIGH, NEAR, STICKS, BetaflightParams
-from hil.fakes.base import Fake, Options, WirePlant
+from hil.fakes.base import Bridge, Options, WirePlant
 from hil.fakes.mocap import SLACK, MocapParams
 from hil.fakes.sitl.firmware import PORTS
 from hil.fakes.sitl.packets import Sensors
 from hil.links import msp
+from hil.links.backends.betaflight import BOX_ARM, HIGH, NEAR, STICKS, BetaflightParams
 from hil.links.device import Device, TcpPort, chunks
 from hil.links.mavlink_link import Link
 
-ASK = {msp.RC: 0.002, msp.STATUS: 0.1}
-"""What the firmware is asked for, and how often [s]."""
+ASK = {msp.RC: 0.002, msp.STATUS: 0.1}  # what the firmware is asked for, and how often [s]
 
 SAMPLE = 0.0005
 """Between two samples of the sensors [s]: 2000 a second for loops of 8 kHz. Of one sample in 2 ms, held so long, the firmware's D is a
 spike, and motors taken at the first loop after each sample miss 17 % of it and see the gyro 1.2 ms later."""
 
-SLOW = 0.01
-"""Share of late periods above which the machine is too slow for real time."""
+SLOW = 0.01  # share of late periods above which the machine is too slow for real time
 
 
 class MotorPlant(WirePlant):
@@ -39,7 +37,7 @@ class MotorPlant(WirePlant):
     force_b: np.ndarray
 
 
-class BetaflightSitl(Fake):
+class BetaflightSitl(Bridge):
     """See the head of this module.
 
     Attributes:
@@ -50,20 +48,12 @@ class BetaflightSitl(Fake):
         self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams,
         stands: int,
     ) -> None:  # fmt: skip
-        """Connect to a firmware that runs.
-
-        Args:
-            plant, link, mocap, seed, options: see `Fake`.
-            params: of the runner's back-end: which channel opens the mechanism.
-            stands: see `Sensors`.
-        """
+        """Connect to a firmware that runs; ``params`` of the back-end say which channel opens the mechanism, ``stands``: see `Sensors`."""
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.armed = params, False
         self.port, self.sensors = TcpPort(Device("tcp", "127.0.0.1", PORTS[1])), Sensors(stands)
         self._parser, self._asked = msp.Parser(), dict.fromkeys(ASK, -1e9)
         self._boxes: tuple[int, ...] = ()
-        self._open = False
-        self._blocks = 0
         self.motors = np.zeros(4)
         self.answered = 0
         self.cycles: list[int] = []
@@ -72,7 +62,7 @@ class BetaflightSitl(Fake):
         self._rate_b, self._sent = plant.rate_b, 0  # at the beginning of the last period; samples sent in this one
 
     def run_on(self, when: float) -> None:
-        """See `Fake`: samples by the rates at the period's beginning and their last change."""
+        """Send samples by the rates at the period's beginning and their last change."""
         plant, step = self.plant, self.plant.period / self._samples
         due = np.arange(self._sent, min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), self._samples))
         if len(due):
@@ -81,13 +71,11 @@ class BetaflightSitl(Fake):
             self._sent += len(due)
 
     def fly(self) -> None:
-        """See `Fake`: a period by what the firmware made of the samples within it."""
         self.run_on(self.plant.time + self.plant.period)
         self._rate_b, self._sent = self.plant.rate_b, 0
         super().fly()
 
     def hear(self) -> None:
-        """See `Fake`: what the firmware says of itself."""
         super().hear()
         for data in chunks(self.port):
             self.heard = self.wall()
@@ -101,11 +89,7 @@ class BetaflightSitl(Fake):
             self._hear_status(frame)
         elif frame.command == msp.RC:
             channels, at = frame.words(), STICKS + self.params.release_channel - 1
-            opened = at < len(channels) and abs(channels[at] - HIGH) <= NEAR
-            if opened and not self._open:
-                self.note_release()
-                self.open_mechanism()
-            self._open = opened
+            self.output(at < len(channels) and abs(channels[at] - HIGH) <= NEAR, self.heard)
 
     def _hear_status(self, frame: msp.Frame) -> None:
         flags, cycle = frame.number("<I", 6) or 0, frame.number("<H", 0)
@@ -117,14 +101,12 @@ class BetaflightSitl(Fake):
             self.cycles.append(cycle)
 
     def flown(self) -> np.ndarray:
-        """See `Fake`: the firmware's motor outputs."""
         came, self._outputs = np.concatenate(self._outputs), []
         if len(came):
             self.motors, self.answered = came.mean(axis=0, dtype=float), self.answered + 1
         return self.motors
 
     def speak(self) -> None:
-        """See `Fake`: questions that are due."""
         plant = self.plant
         for command, period in ASK.items():
             if plant.time - self._asked[command] >= period:
@@ -133,14 +115,9 @@ class BetaflightSitl(Fake):
         if not self._boxes and self._asked[msp.STATUS] == plant.time:
             self.port.write(msp.pack(msp.Frame(msp.BOXIDS)))
 
-    def take(self) -> None:
-        """See `Fake`: there is no pilot; all channels are the runner's."""
-
     def report(self) -> dict[str, Any]:
         loop = float(np.median(self.cycles)) if self.cycles else None
-        unknown = ("followed", "ignored", "commands", "worst", "breaches", "last_command")  # the runner's link passes us by
-        known = {name: value for name, value in super().report().items() if name not in unknown}
-        return {**known, "held": self.plant.held, "motor_packets": self.answered, "loop_us": loop}
+        return super().report() | {"held": self.plant.held, "motor_packets": self.answered, "loop_us": loop}
 
     def close(self) -> None:
         super().close()

@@ -17,18 +17,13 @@ import sys
 import time
 from pathlib import Path
 
-from hil.backends.betaflight import STICKS, BetaflightParams
 from hil.errors import RunError
 from hil.fakes.sitl.packets import StillSensors, stood
+from hil.links.backends.betaflight import STICKS, BetaflightParams
 
-PORTS = (5761, 5762)
-"""TCP ports of the first two serial ports: the first is the runner's, the second the bridge's."""
-
-START, ANSWER, END = 20.0, 20.0, 10.0
-"""Time for a start, for an answer of the command line and for the process's end [s]."""
-
-FREED = 90.0
-"""After which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s."""
+PORTS = (5761, 5762)  # TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
+START, ANSWER, END = 20.0, 20.0, 10.0  # time for a start, for an answer of the command line and for the process's end [s]
+FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
 
 GAINS = {
     "p_roll": 5, "i_roll": 2, "d_roll": 5, "d_max_roll": 5,
@@ -54,8 +49,7 @@ the same at any command, and a policy can be trained in it."""
 
 LOCKSTEP = Path(__file__).with_name("lockstep.c")
 
-PR_SET_PDEATHSIG = 1
-"""Of prctl."""
+PR_SET_PDEATHSIG = 1  # of prctl
 
 _LIBC = ctypes.CDLL(None)
 
@@ -108,11 +102,7 @@ class Firmware:
     """
 
     def __init__(self, program: str | Path, folder: str | Path) -> None:
-        """Name program and folder; nothing runs yet.
-
-        Raises:
-            RunError: there is no such program.
-        """
+        """Name program and folder; nothing runs yet. Raises `RunError`: there is no such program."""
         self.program, self.folder = Path(program).resolve(), Path(folder)
         if not self.program.is_file():
             raise RunError(f"no firmware at {program}; expected Betaflight's program for a PC, as `make TARGET=SITL` builds it")
@@ -235,11 +225,7 @@ class CommandLine:
     """The firmware's command line on its first serial port."""
 
     def __init__(self) -> None:
-        """Connect and enter it.
-
-        Raises:
-            RunError: nobody answers.
-        """
+        """Connect and enter it. Raises `RunError`: nobody answers."""
         self._socket = socket.create_connection(("127.0.0.1", PORTS[0]), timeout=ANSWER)
         self._socket.sendall(b"#")
         self._heard()
@@ -265,11 +251,7 @@ class CommandLine:
         return data.decode("ascii", "replace")
 
     def ask(self, text: str) -> str:
-        """Give a command; what it says.
-
-        Raises:
-            RunError: it is refused.
-        """
+        """Give a command; what it says. Raises `RunError`: it is refused."""
         self._socket.sendall(text.encode() + b"\n")
         answer = self._heard()
         if "###ERROR" in answer:
@@ -287,11 +269,7 @@ class CommandLine:
         return ""
 
     def save(self) -> None:
-        """Keep the settings: they are in its file when it says that it restarts.
-
-        Raises:
-            RunError: it does not.
-        """
+        """Keep the settings: they are in its file when it says that it restarts. Raises `RunError`: it does not."""
         self._socket.sendall(b"save\n")
         self._heard(b"Rebooting")
 

@@ -21,29 +21,17 @@ import numpy as np
 
 from hil.errors import RunError
 
-GRAVITY = 9.80665
-"""Of the firmware's accelerometer [m/s^2]."""
-
-SENSORS = 9003
-"""UDP port that samples go to."""
-
-FDM = struct.Struct("<18d")
-"""Stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure."""
-
-TIME, MOTORS, LARGEST_ANSWER = 8, 4, 4096
-"""Bytes of the firmware's time before its answers; motors in one; bytes of all."""
-
-OURS = (2, 0, 1, 3)
-"""Where front left, front right, rear left, rear right stand in an answer."""
-
-SEA_LEVEL = 101325.0
-"""[Pa]"""
+GRAVITY = 9.80665  # of the firmware's accelerometer [m/s^2]
+SENSORS = 9003  # UDP port that samples go to
+FDM = struct.Struct("<18d")  # stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure
+TIME, MOTORS, LARGEST_ANSWER = 8, 4, 4096  # bytes of the firmware's time before its answers; motors in one; bytes of all
+OURS = (2, 0, 1, 3)  # where front left, front right, rear left, rear right stand in an answer
+SEA_LEVEL = 101325.0  # [Pa]
 
 STILL, CALIBRATION = 0.002, 3.0
 """Between two packets at rest, and the time that the firmware's gyro takes to be calibrated and its receiver to begin [s]."""
 
-PATIENCE = 10.0
-"""For the firmware to come to a stamp [s], on the wall's clock: a tenth of a millisecond is usual."""
+PATIENCE = 10.0  # for the firmware to come to a stamp [s], on the wall's clock: a tenth of a millisecond is usual
 
 
 def sample(stamp: float, rate_b: Sequence[float], force_b: Sequence[float], quat_wb: Sequence[float]) -> bytes:
@@ -103,11 +91,7 @@ class Sensors:
         self._run(sample(self._stamp, *self._last))
 
     def start(self) -> None:
-        """Let the firmware calibrate its sensors, the vehicle standing still.
-
-        Raises:
-            RunError: see `send`.
-        """
+        """Let the firmware calibrate its sensors, the vehicle standing still. Raises `RunError`: see `send`."""
         for _ in range(round(CALIBRATION / STILL)):
             self.rest(STILL)
 

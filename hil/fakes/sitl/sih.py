@@ -12,38 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends.px4 import Px4Params
-from hil.fakes.base import Fake, Options
+from hil.fakes.base import Bridge, Options
 from hil.fakes.mocap import MocapParams
+from hil.links.backends.px4 import Px4Params
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
-STEP = 0.001
-"""Time step of the ball [s]."""
+STEP = 0.001  # time step of the ball [s]
 
 STREAMS = {mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01, mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.01,
            mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.01}  # fmt: skip
 """Messages that PX4 is asked for, and their periods [s]."""
 
-ASK_AGAIN = 1.0
-"""Between two requests for a stream [s]: an answer may be lost, and PX4 may start again."""
-
-NEAR = 50.0
-"""An output this near to its target has arrived [us]."""
-
-FLIP = np.array([1.0, -1.0, -1.0])
-"""North, east, down and forward, right, down to ours."""
+ASK_AGAIN = 1.0  # between two requests for a stream [s]: an answer may be lost, and PX4 may start again
+NEAR = 50.0  # an output this near to its target has arrived [us]
+FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down and forward, right, down to ours
 
 
 @dataclass
 class HangingBall:
-    """A ball on a rope below a vehicle that moves as it is told; what `hil.fakes.base.WirePlant` offers.
-
-    Raises:
-        ValueError: a rope without length.
-    """
+    """A ball on a rope below a vehicle that moves as it is told, a `WirePlant`; raises `ValueError` for a rope without length."""
 
     mount_b: np.ndarray  # where the rope hangs [m], shape (3,)
     length: float  # from the mount to the ball's centre [m]
@@ -110,11 +100,11 @@ class HangingBall:
         }  # fmt: skip
 
 
-class Px4Sih(Fake):
+class Px4Sih(Bridge):
     """See the head of this module.
 
     Attributes:
-        heard_of: positions that came. outputs: of the mechanism [us], the last one.
+        heard_of: positions that came. last_output: of the mechanism [us].
     """
 
     plant: HangingBall
@@ -122,21 +112,14 @@ class Px4Sih(Fake):
     def __init__(
         self, plant: HangingBall, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: Px4Params, autopilot: Link
     ) -> None:  # fmt: skip
-        """Listen to PX4.
-
-        Args:
-            plant, link, mocap, seed, options: see `Fake`.
-            params: of the runner's back-end: which output opens the mechanism, and where.
-            autopilot: link to PX4 of the bridge's own.
-        """
+        """Listen to PX4 by a link of the bridge's own; ``params`` of the back-end say which output opens the mechanism."""
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.autopilot, self.port = params, autopilot, autopilot.port
-        self._pos, self._vel, self._open, self._asked = np.zeros(3), np.zeros(3), False, dict.fromkeys(STREAMS, -np.inf)
-        self.heard_of, self.output = 0, None
+        self._pos, self._vel, self._asked = np.zeros(3), np.zeros(3), dict.fromkeys(STREAMS, -np.inf)
+        self.heard_of, self.last_output = 0, None
         autopilot.listen(self._hear)
 
     def hear(self) -> None:
-        """See `Fake`: PX4's messages."""
         super().hear()
         self.autopilot.pump(self.wall)
 
@@ -152,30 +135,23 @@ class Px4Sih(Fake):
             rate = FLIP * (message.rollspeed, message.pitchspeed, message.yawspeed)
             self.plant.follow(self._pos, self._vel, quat / np.linalg.norm(quat), rate)
         elif kind == "SERVO_OUTPUT_RAW":
-            self._mechanism(getattr(message, f"servo{self.params.servo_output}_raw", 0), arrival)
-
-    def _mechanism(self, output: float, arrival: float) -> None:
-        self.output = output
-        opened = bool(self.params.servo_output) and abs(output - self.params.servo_open_us) <= NEAR
-        if opened and not self._open:
-            self.heard = arrival
-            self.note_release()
-            self.open_mechanism()
-        self._open = opened
+            self.last_output = getattr(message, f"servo{self.params.servo_output}_raw", 0)
+            near = abs(self.last_output - self.params.servo_open_us) <= NEAR
+            self.output(bool(self.params.servo_output) and near, arrival)
 
     def flown(self) -> np.ndarray:
-        """See `Fake`: PX4 flies."""
+        """Return nothing: PX4 flies."""
         return np.zeros(4)
 
     def emit(self) -> None:
-        """See `Fake`; nothing before PX4 has said where the vehicle is."""
+        """Say nothing before PX4 has said where the vehicle is."""
         if self.heard_of:
             super().emit()
         else:
             self.speak()
 
     def speak(self) -> None:
-        """See `Fake`: ask for what is not coming."""
+        """Ask for what is not coming."""
         now = self.plant.time
         for number, period in STREAMS.items():
             if now - self._asked[number] >= ASK_AGAIN:
@@ -183,9 +159,6 @@ class Px4Sih(Fake):
                 self.autopilot.send(mav.MAVLink_command_long_message(
                     self.params.system, self.params.component, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 1e6 * period, 0, 0, 0, 0, 0
                 ))  # fmt: skip
-
-    def take(self) -> None:
-        """See `Fake`: the pilot is PX4's."""
 
     def close(self) -> None:
         super().close()

@@ -13,29 +13,26 @@ from typing import Any
 
 import numpy as np
 
-from hil.backends import make_backend, mechanism_lag
 from hil.control.loop import AutoOperator, Loop
+from hil.control.recording.flightlogs import read, throws
+from hil.control.recording.record import Recorder
+from hil.control.recording.report import throw_path
 from hil.control.runner import Runner
 from hil.control.states import State
 from hil.fakes.base import VEHICLE_ID, Fake, Options
 from hil.fakes.mocap import SLACK, MocapParams
 from hil.fakes.sitl.betaflight import BetaflightSitl, MotorPlant
 from hil.fakes.sitl.firmware import Firmware, needed
+from hil.links.backends import make_backend, mechanism_lag
 from hil.links.device import Device, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
-from hil.recording.flightlogs import read, throws
-from hil.recording.record import Recorder
-from hil.recording.report import throw_path
-from hil.sources import Source
-from hil.sources.opening import open_source
+from hil.poses.sources.base import Source
+from hil.poses.sources.opening import open_source
 from visthrow.onboard.policy import Policy
 
-SETTINGS = "settings"
-"""Folder of the firmware's settings beside those of the throws."""
-
-AFTER, MOST = 1.2, 25.0
-"""Flown on after a landing; flown at most [s]."""
+SETTINGS = "settings"  # folder of the firmware's settings beside those of the throws
+AFTER, MOST = 1.2, 25.0  # flown on after a landing; flown at most [s]
 
 
 class FlightClock:
@@ -67,11 +64,7 @@ class FlightClock:
 
 
 def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
-    """The firmware's settings for a run, written and read back where the folder has none yet.
-
-    Raises:
-        RunError: see `Firmware`.
-    """
+    """The firmware's settings for a run, written and read back where the folder has none yet. Raises `RunError`: see `Firmware`."""
     settings = folder / SETTINGS
     if not (settings / "eeprom.bin").exists():
         Firmware(program, settings).set_up(needed(params.betaflight))

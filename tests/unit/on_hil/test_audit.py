@@ -2,8 +2,8 @@
 
 import pytest
 
-from hil.backends.audit import GIVE_UP, GIVE_UP_OPTIONAL, NO_SUCH_PARAMETER, Audit, Rule, bits, equal, within
-from hil.backends.base import ACCEPTED, FAILED, IDLE, PENDING, Release
+from hil.links.backends.audit import GIVE_UP, GIVE_UP_OPTIONAL, NO_SUCH_PARAMETER, Audit, Rule, bits, equal, within
+from hil.links.backends.base import ACCEPTED, FAILED, IDLE, PENDING, Release
 
 RULES = (
     bits("GUID_OPTIONS", 8, "thrust"),

@@ -4,15 +4,17 @@ import json
 
 import pytest
 
-from hil.backends import Crazyflie, DryRun
-from hil.backends.check import AutopilotCheck, autopilot_record, hover_of_run
-from hil.backends.thrust import LEAST_SHARES
-from hil.control.decision import OperatorInput
+from hil.check import AutopilotCheck, hover_of_run
 from hil.control.loop import fly
+from hil.control.recording.record import CONFIG, TICKS, Recorder
 from hil.control.runner import Runner
+from hil.control.states import OperatorInput
 from hil.errors import RunError
+from hil.flight import autopilot_record
+from hil.links.backends.base import DryRun
+from hil.links.backends.crazyflie import Crazyflie
+from hil.links.backends.thrust import LEAST_SHARES
 from hil.params import HilParams
-from hil.recording.record import CONFIG, TICKS, Recorder
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers, pipe

@@ -6,8 +6,8 @@ import zipfile
 
 import pytest
 
+from hil.control.recording.record import pack
 from hil.errors import RunError
-from hil.recording.bundle import pack
 from tests.hil_runs import record_run, saved_policy
 from visthrow.cli import main
 

@@ -11,10 +11,10 @@ import torch
 
 from camera.keypoints import KeypointCamera, goal_corners_w, keypoints
 from camera.mount import rotation_from_vector
-from hil.backends import DryRun
 from hil.control.calibrating import Calibrating, CalibrationParams, solved
-from hil.control.decision import OperatorInput
 from hil.control.runner import Runner
+from hil.control.states import OperatorInput
+from hil.links.backends.base import DryRun
 from hil.params import HilParams
 from hil.poses.detection import Detection
 from hil.poses.pose import Pose

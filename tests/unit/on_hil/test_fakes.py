@@ -7,14 +7,21 @@ import numpy as np
 import pytest
 
 from hil.errors import LinkError, RunError
-from hil.fakes.process import ListeningPort, make_fake, read_options
-from hil.fakes.witness import Witness
+from hil.fakes.base import Options, Witness
+from hil.fakes.process import ListeningPort, make_fake
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe
+from visthrow import config
 from visthrow.common.errors import ConfigError
+
+
+def read_options(overrides):
+    """Options as `hil fake` reads them."""
+    return config.loads(Options, "", overrides, "options of the fake")
+
 
 LIMITS = (14.0, 10.0, 10.0, 4.0)
 INSIDE = np.array([0.0, 0.0, 1.0])

@@ -10,14 +10,16 @@ import threading
 import numpy as np
 import pytest
 
-from hil.backends.base import FOLLOW
-from hil.backends.betaflight import BOX_ARM, HIGH, LOW, Betaflight
 from hil.errors import RunError
-from hil.fakes.base import Options
+from hil.fakes.base import VEHICLE_ID, Options
 from hil.fakes.mocap import MocapParams
-from hil.fakes.process import VEHICLE_ID, ListeningPort
-from hil.fakes.sitl import BetaflightSitl, Firmware, betaflight, firmware, needed, packets
+from hil.fakes.process import ListeningPort
+from hil.fakes.sitl import betaflight, firmware, packets
+from hil.fakes.sitl.betaflight import BetaflightSitl
+from hil.fakes.sitl.firmware import Firmware, needed
 from hil.links import msp
+from hil.links.backends.base import FOLLOW
+from hil.links.backends.betaflight import BOX_ARM, HIGH, LOW, Betaflight
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams

@@ -1,5 +1,6 @@
 """Flight logs made of run folders: channels, times, release and landing; the view of them, live and recorded."""
 
+import argparse
 import json
 import math
 import shutil
@@ -12,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hil.control.landing import Flight, separation
+from hil.control.latch import Flight, separation
+from hil.control.recording import flightlogs, view
+from hil.control.recording.flightlogs import read, throws
+from hil.control.recording.record import load_run
+from hil.control.recording.report import finish
 from hil.errors import RunError
-from hil.recording import flightlogs, view
-from hil.recording.flightlogs import read, throws
-from hil.recording.record import load_run
-from hil.recording.report import finish
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy
 from visthrow.logs.export import columns
@@ -198,7 +199,7 @@ def test_the_recording_of_a_run_holds_all(run, tmp_path):
 def test_the_same_run_as_mcap(run, tmp_path, capsys):
     """`hil view --out run.mcap`, read back by the library's own reader."""
     reader = pytest.importorskip("mcap.reader")
-    assert view.run(run[0], False, str(tmp_path / "run.mcap"), 0, 0) == 0
+    assert view.run(argparse.Namespace(folder=run[0], live=False, out=str(tmp_path / "run.mcap"))) == 0
     assert "open it with Foxglove" in capsys.readouterr().out
     found = {}
     with (tmp_path / "run.mcap").open("rb") as file:

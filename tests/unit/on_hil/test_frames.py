@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
 from hil.params import HilParams
-from hil.poses.frames import FrameParams, Frames, rotation_of
+from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import Pose
 from visthrow import config
 from visthrow.common.errors import ConfigError
-from visthrow.logs.axes import TURNS
+from visthrow.logs.axes import TURNS, turn_of
 
 AXES = TURNS
 EXACT = 1e-14
@@ -43,7 +43,7 @@ def test_there_are_24_turns_and_24_mirrors_are_refused():
     }
     for axes in every - set(AXES):
         with pytest.raises(FrameError, match="mirror the world") as caught:
-            rotation_of(axes)
+            frames(axes)
         assert set(str(caught.value).split(": ")[-1].split()) < set(AXES), "what it proposes are turns"
 
 
@@ -77,8 +77,8 @@ def test_every_case_against_matrices(axes):
     rng = np.random.default_rng(1)
     body_axes, yaw = AXES[-1 - AXES.index(axes)], 33.0
     convert = frames(axes, body_axes, "wxyz", yaw)
-    world = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ rotation_of(axes)
-    body = rotation_of(body_axes)
+    world = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ turn_of(axes)
+    body = turn_of(body_axes)
     for _ in range(10):
         pose = random_pose(rng)
         rot = Rotation.from_quat([*pose.quat[1:], pose.quat[0]]).as_matrix()

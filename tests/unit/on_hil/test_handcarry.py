@@ -10,7 +10,7 @@ from hil.links.clock import ManualClock
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, summary_text
 from hil.poses.pose import Pose
-from hil.sources import Recorded
+from hil.poses.sources.base import Recorded
 from visthrow.cli import main
 from visthrow.common.rotations import multiply
 from visthrow.logs.axes import TURNS as AXES

@@ -2,9 +2,8 @@
 
 import pytest
 
-from hil.backends import make_backend
-from hil.backends.base import DryRun
-from hil.backends.held import Held
+from hil.links.backends import make_backend
+from hil.links.backends.base import DryRun, Held
 from hil.params import HilParams
 from visthrow import config
 from visthrow.common.errors import ConfigError

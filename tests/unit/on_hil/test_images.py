@@ -16,11 +16,11 @@ from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
+from hil.control.recording.record import lines
 from hil.errors import SourceError
 from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
-from hil.recording.record import lines
-from hil.sources.images import STAMPS, Hint, ImageParams, LiveImages, Looker, RecordedImages
+from hil.poses.sources.images import STAMPS, Eyes, Hint, ImageParams, LiveImages, RecordedImages
 from tests.drawn import render_scene
 from visthrow import config
 from visthrow.cli import main
@@ -108,7 +108,7 @@ def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
     for i in range(FRAMES):
         pos, vector, _ = pose(i)
         quat = quaternion(vector)
-        source.tell(Hint(tuple(pos.tolist()), quat, (0.2, 0.6)))
+        source.hint = Hint(tuple(pos.tolist()), quat, (0.2, 0.6))
         (detection,) = source.poll(PERIOD * i + 1e-9)
         assert detection.stamp == pytest.approx(PERIOD * i)
         again = Detection.of(json.loads(json.dumps(detection.values())))
@@ -130,7 +130,8 @@ def told(looker, picture, stamp, hint, blind=False):
         return Seen(None, None) if blind else detect(image, known)
 
     looker.detector.detect = listen
-    detection = looker.look(picture, stamp, hint)
+    looker.hint = hint
+    detection = looker.look(picture, stamp)
     looker.detector.detect = detect
     return detection, kept[0]
 
@@ -138,7 +139,7 @@ def told(looker, picture, stamp, hint, blind=False):
 def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     """Where the ball was is kept in the world: after a turn of 20 deg it is looked for elsewhere in the picture."""
     pos, vector, ball = pose(0)
-    looker = Looker(params(folder), training())
+    looker = Eyes(params(folder), training())
     assert told(looker, pictures[0], 0.0, None)[1].ball_ray_c is None
     hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
     detection, known = told(looker, pictures[0], 0.0, hint)
@@ -160,7 +161,7 @@ def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
 
 
 def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_while_that_is_known(folder, pictures):
-    looker = Looker(params(folder), training())
+    looker = Eyes(params(folder), training())
     pos, vector, _ = pose(0)
     hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
     for k in range(5):
@@ -295,7 +296,7 @@ def test_wrong_pictures(folder, tmp_path):
         RecordedImages(params(folder, fisheye=None), training()).poll(1.0)
     mount = dataclasses.replace(training().mount, position_b=(0.07, 0.0, -0.02))
     with pytest.raises(ConfigError, match="40 mm from that of training"):
-        Looker(params(folder, mount=mount), training())
+        Eyes(params(folder, mount=mount), training())
     with pytest.raises(ConfigError, match=r"images\.path is none"):
         ImageParams("folder")
     with pytest.raises(ConfigError, match=r"no table \[images\]"):

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hil.control.recording.latency import STAGES, Stage, Stages, draw, table
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from hil.recording.latency import STAGES, Stage, Stages, draw, table
 from visthrow.view import parts
 
 BIN = 0.011

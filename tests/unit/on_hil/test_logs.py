@@ -7,10 +7,10 @@ import struct
 import numpy as np
 import pytest
 
+from hil.control.recording.record import lines
 from hil.errors import SourceError
 from hil.params import HilParams
-from hil.recording.record import lines
-from hil.sources import LogBody, read_autopilot
+from hil.poses.sources.player import LogBody, read_autopilot
 from tests import logfiles as files
 from tests.unit.on_logs.test_fuzz import damaged, dataflash, patience, ulog
 from visthrow import config

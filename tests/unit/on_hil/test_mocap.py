@@ -10,8 +10,7 @@ import pytest
 
 from hil.errors import LinkError, SourceError
 from hil.params import HilParams
-from hil.sources import MocapParams, RigidBody, open_mocap
-from hil.sources.mocap import MotionCaptureSource, NatNetSource
+from hil.poses.sources.mocap import MocapParams, MotionCaptureSource, NatNetSource, RigidBody, open_mocap
 from visthrow import config
 from visthrow.common.errors import ConfigError
 

@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
-from hil.backends import Betaflight
 from hil.links import msp
+from hil.links.backends.betaflight import Betaflight
 from hil.params import HilParams
 from tests.fuzz import EACH, SEEDS
 from tests.loopback.wire import pipe

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hil.backends.rates import RatesParams, Sticks
+from hil.links.backends.rates import RatesParams, Sticks
 from visthrow.common.errors import ConfigError
 
 LINEAR = RatesParams("actual", (60, 60, 30), (60, 60, 30), (0, 0, 0))

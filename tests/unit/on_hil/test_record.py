@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from hil.backends import Status
+from hil.control.recording.record import Recorder, lines, load_run
 from hil.control.runner import OperatorInput, Runner
 from hil.errors import RunError
-from hil.recording.record import Recorder, lines, load_run
+from hil.links.backends.base import Status
 from tests.bench.processes import free_port
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main

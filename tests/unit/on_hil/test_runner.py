@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from hil.backends import Status
 from hil.control.runner import WARM_CALLS, OperatorInput, Runner
 from hil.control.states import Inputs, Machine
 from hil.errors import RunError
+from hil.links.backends.base import Status
 from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy

@@ -7,9 +7,9 @@ import tty
 
 import pytest
 
-from hil.backends import Betaflight
 from hil.errors import LinkError
 from hil.links import msp
+from hil.links.backends.betaflight import Betaflight
 from hil.links.device import Device, SerialPort
 from hil.links.writer import HEAD, LoggedPort
 from hil.params import HilParams

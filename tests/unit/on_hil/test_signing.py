@@ -7,8 +7,7 @@ import pytest
 
 from hil.errors import LinkError
 from hil.links.mavlink_link import Link
-from hil.links.pymav import mav
-from hil.links.signing import BEHIND, EPOCH, Signed, read_key, stamp_now
+from hil.links.pymav import BEHIND, EPOCH, Signed, mav, read_key, stamp_now
 from tests.loopback.wire import pipe
 
 KEY = bytes(range(32))

@@ -12,7 +12,9 @@ from hil.links.pymav import Parser, mav
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.poses.pose import Pose
-from hil.sources import BodyIds, MavlinkDecoder, Recorded, read_table, read_tlog
+from hil.poses.sources.base import Recorded
+from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder
+from hil.poses.sources.player import read_table, read_tlog
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog

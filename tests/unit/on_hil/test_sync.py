@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from hil.fakes import FakeArduPilot
-from hil.fakes.process import VEHICLE_ID, MocapParams, Options
+from hil.fakes.ardupilot import FakeArduPilot
+from hil.fakes.base import VEHICLE_ID, Options
+from hil.fakes.mocap import MocapParams
 from hil.links.clock import TimeSync
-from hil.links.mavlink_link import Link
+from hil.links.mavlink_link import LATE, Link, LinkSync
 from hil.links.pymav import mav
-from hil.links.sync import LATE, LinkSync
-from hil.sources import BodyIds, MavlinkSource
+from hil.poses.sources.mavlink import BodyIds, MavlinkSource
 from tests.level import LevelPlant
 from tests.loopback.wire import HERE, pipe
 

@@ -7,11 +7,11 @@ import time
 
 import pytest
 
-from hil.cli.flight import require_fake
-from hil.cli.terminal import ENDING, PAUSING, Console, Terminal
-from hil.control.decision import Decision, OperatorInput
+from hil.control.states import Decision, OperatorInput
 from hil.errors import RunError
+from hil.flight import require_fake
 from hil.params import HilParams
+from hil.terminal import ENDING, PAUSING, Console, Terminal
 from visthrow import config
 
 

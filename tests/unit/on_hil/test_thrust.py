@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from hil.backends import require_reach
-from hil.backends.thrust import LEAST_SHARES, HoverMeter, ThrustParams
 from hil.errors import RunError
+from hil.links.backends import require_reach
+from hil.links.backends.thrust import LEAST_SHARES, HoverMeter, ThrustParams
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from visthrow import config

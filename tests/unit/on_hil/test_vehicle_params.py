@@ -2,8 +2,10 @@
 
 import pytest
 
-from hil.backends import Betaflight, DryRun, make_backend, mechanism_lag
 from hil.errors import LinkError, RunError
+from hil.links.backends import make_backend, mechanism_lag
+from hil.links.backends.base import DryRun
+from hil.links.backends.betaflight import Betaflight
 from hil.params import HilParams
 from visthrow import config
 from visthrow.common.errors import ConfigError

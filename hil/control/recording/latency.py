@@ -1,0 +1,143 @@
+"""Where the time of a tick goes: percentiles and a histogram a stage, in memory that does not grow with the run."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.poses.pose import VEHICLE, Pose
+
+STAGES = {
+    "transport": "from measurement to arrival; beyond the fastest pose where the source's clock is not known",
+    "arrival": "from the newest pose's arrival to the tick",
+    "late": "how late the tick began",
+    "poll": "taking in what came since the last look",
+    "estimate": "gate, filter, state machine",
+    "observation": "projection and assembly of what the policy sees",
+    "policy": "the network, and its output as a command",
+    "send": "guard passed, until the bytes are with the system",
+    "total": "from the look for messages to the command's bytes out",
+    "ack": "from the release command to its answer",
+}
+"""Stage -> what it is, in the order of the report."""
+OF_CLOCK = ("transport", "arrival", "late", "ack")
+"""Stages between two readings of the run's clock, which ``--speed`` slows; the others are taken in real time."""
+
+LEAST, GROWTH, BINS = 1e-6, 1.01, 1640  # lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per cent
+CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
+
+
+class Stage:
+    """Times of one stage: counts in bins that grow by one per cent, and the largest one exactly."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(BINS, dtype=np.int64)
+        self.most = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one time [s]."""
+        place = int(math.log(seconds / LEAST) / math.log(GROWTH)) if seconds > LEAST else 0
+        self.counts[min(place, BINS - 1)] += 1
+        self.most = max(self.most, seconds)
+
+    def percentile(self, share: float) -> float:
+        """Return the time [s] below which a share of all lie, 0 to 1; to one per cent, and never above the largest."""
+        reached = np.searchsorted(np.cumsum(self.counts), share * self.counts.sum())
+        return min(LEAST * GROWTH ** (float(reached) + 0.5), self.most)
+
+    def summary(self) -> dict[str, float]:
+        """Return p50, p95, p99 and max [ms] and the count; empty where nothing was counted."""
+        count = int(self.counts.sum())
+        if not count:
+            return {}
+        shares = {"p50_ms": 0.5, "p95_ms": 0.95, "p99_ms": 0.99}
+        return {**{k: 1e3 * self.percentile(p) for k, p in shares.items()}, "max_ms": 1e3 * self.most, "count": count}
+
+
+class Stages:
+    """All stages of a run."""
+
+    def __init__(self) -> None:
+        self.stages = {name: Stage() for name in STAGES}
+        self._fastest: float | None = None
+
+    def add(self, times: dict[str, float]) -> None:
+        """Count the times of one tick [s], by stage."""
+        for name, seconds in times.items():
+            self.stages[name].add(seconds)
+
+    def poses(self, poses: list[Pose], now: float) -> dict[str, float]:
+        """Return times of the vehicle's poses that have come for a tick at ``now`` [s]; transport is counted a pose."""
+        newest = None
+        for pose in poses:
+            if pose.body != VEHICLE or not (math.isfinite(pose.stamp) and math.isfinite(pose.arrival)):
+                continue
+            newest = pose.arrival
+            if pose.measured is not None:
+                self.stages["transport"].add(pose.arrival - pose.measured)
+                continue
+            apart = pose.arrival - pose.stamp
+            if self._fastest is None or abs(apart - self._fastest) > CLOCK_STEP:
+                self._fastest = apart
+            self._fastest = min(self._fastest, apart)
+            self.stages["transport"].add(apart - self._fastest)
+        return {} if newest is None else {"arrival": now - newest}
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return summaries by stage."""
+        return {name: stage.summary() for name, stage in self.stages.items()}
+
+
+def slowed(speed: float) -> str:
+    """Return whose milliseconds they are, where the run's clock is not real time; else nothing."""
+    return "" if speed == 1.0 else f"; {', '.join(OF_CLOCK)}: by the run's clock, at {speed:g} of real time"
+
+
+def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]:
+    """Return lines of a report, a stage a line, of :meth:`Stages.summary` and the speed of the run's clock."""
+    lines = [f"{'stage':11}     p50     p95     p99     max [ms]{slowed(speed)}"]
+    for name, values in latency.items():
+        if values:
+            numbers = "".join(f" {values[k]:7.3f}" for k in ("p50_ms", "p95_ms", "p99_ms", "max_ms"))
+            lines.append(f"{name:11}{numbers}   {STAGES.get(name, '')}")
+    return lines
+
+
+def draw(path: str | Path, stages: Stages, title: str) -> None:
+    """Draw a histogram a stage, on one axis of time, as a PNG file; raises `StorageError` where it cannot be written."""
+    from visthrow.common import style
+    from visthrow.common.storage import atomic_write
+    from visthrow.view.parts import png_of
+
+    style.use()
+    import matplotlib.pyplot as plt
+
+    shown = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
+    rows = max(len(shown), 1)
+    figure, axes = plt.subplots(rows, 1, figsize=(8.6, 0.9 + 0.88 * rows), sharex=True, squeeze=False)
+    for axis, (name, stage) in zip(axes[:, 0], shown.items()):
+        _histogram(axis, name, stage)
+    axes[-1, 0].set_xscale("log")
+    axes[-1, 0].set_xlabel("time [ms]; thin lines: p50, p95, p99; triangle: the longest")
+    figure.suptitle(title, x=0.02, ha="left", fontsize=11.5)
+    figure.tight_layout(h_pad=0.25)
+    atomic_write(path, png_of(figure))
+
+
+def _histogram(axis: Any, name: str, stage: Stage) -> None:
+    from visthrow.common import style
+
+    group = 8  # bins of one per cent to a bar
+    counts = stage.counts.reshape(-1, group).sum(1)
+    edges = 1e3 * LEAST * GROWTH ** (group * np.arange(len(counts) + 1))
+    used = np.flatnonzero(counts)
+    part = slice(used[0], used[-1] + 1)
+    axis.stairs(counts[part], edges[used[0] : used[-1] + 2], fill=True, color=style.COLOURS[0], alpha=0.75)
+    for share in (0.5, 0.95, 0.99):
+        axis.axvline(1e3 * stage.percentile(share), color=style.INK, lw=0.8)
+    axis.plot(1e3 * max(stage.most, LEAST), 0.0, "v", color=style.COLOURS[1], ms=7, clip_on=False, zorder=4)
+    axis.set_ylabel(name, rotation=0, ha="right", va="center")
+    axis.set_title(STAGES[name], loc="left", fontsize=8.0, pad=2.0)
+    axis.set_yticks([])
+    axis.spines["left"].set_visible(False)

@@ -1,0 +1,199 @@
+"""One folder a run: config, policy, every raw pose, every tick, the link's .tlog; and what is made of it afterwards.
+
+``poses.jsonl`` and ``ticks.jsonl`` hold a JSON value a line and survive a kill but for a tenth of a second; floats are written so
+that they read back to the same bits. Lines are written by a thread of their own, so that a slow disk delays no tick.
+"""
+
+import hashlib
+import json
+import tempfile
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hil.control.states import Decision, OperatorInput
+from hil.errors import RunError
+from hil.links.backends.base import Status
+from hil.links.writer import Writer
+from hil.params import HilParams
+from hil.poses.pose import Pose
+from visthrow import config
+from visthrow.common import provenance
+from visthrow.common.errors import ConfigError, StorageError
+from visthrow.common.storage import atomic_write, write_json
+from visthrow.common.toml_text import dumps
+from visthrow.onboard.policy import Policy, find_policy
+
+POLICY, CONFIG, POSES, TICKS, SUMMARY, PROVENANCE = (
+    "policy.npz", "config.toml", "poses.jsonl", "ticks.jsonl", "summary.json", "provenance.json",
+)  # fmt: skip
+
+
+class Recorder:
+    """Writes a run's folder."""
+
+    def __init__(self, folder: str | Path, params: HilParams) -> None:
+        """Make the folder with config, policy and provenance; raises `StorageError` where it holds a run already, or cannot be written."""
+        self.folder = Path(folder)
+        if (self.folder / CONFIG).exists():
+            raise StorageError(f"{self.folder} holds a run already; name another folder with --out")
+        source = find_policy(params.policy)
+        data = source.read_bytes()
+        provenance.write_run_folder(
+            self.folder, config.dumps(params), policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest()
+        )
+        atomic_write(self.folder / POLICY, data)
+        self._writers = {name: Writer(self.folder / name) for name in (POSES, TICKS)}
+
+    @property
+    def failed(self) -> str | None:
+        """Why something could not be written, or None."""
+        return next((writer.why for writer in self._writers.values() if writer.why), None)
+
+    def tick(
+        self, index: int, poses: list[Pose], status: Status, words: OperatorInput, recording: bool, decision: Decision,
+        times: dict[str, float],
+    ) -> None:  # fmt: skip
+        """Record one tick; never raises and never waits. Once something was lost, nothing more is written."""
+        if self.failed is not None:
+            return
+        for p in poses:
+            self._put(POSES, (index, p.stamp, p.arrival, p.body, p.pos, p.quat, p.vel, p.rate, p.reset, p.measured))
+        self._put(TICKS, {
+            "n": index, "status": list(vars(status).values()), "words": list(vars(words).values()), "recording": recording,
+            **vars(decision), "times": times, "poses": len(poses),
+        })  # fmt: skip
+
+    def _put(self, name: str, values: Any) -> None:
+        self._writers[name].put(json.dumps(values).encode() + b"\n")
+
+    def close(self, summary: dict[str, Any]) -> None:
+        """Write what is left and the summary; raises `StorageError` where the disk is full, when the run itself is over."""
+        for writer in self._writers.values():
+            writer.close()
+        write_json(self.folder / SUMMARY, {**summary, "recording_failed": self.failed})
+
+
+def lines(path: Path) -> Iterator[Any]:
+    """Yield values of a file of lines; a last line that was cut short is left out.
+
+    Raises:
+        RunError: no such file, or a line before the last one is damaged.
+    """
+    try:
+        rows = path.read_text(encoding="utf-8").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{path}: cannot be read: {error}; expected the folder of a run") from error
+    for number, row in enumerate(rows, start=1):
+        if not row:
+            continue
+        try:
+            yield json.loads(row)
+        except ValueError as error:
+            if number < len(rows):
+                raise RunError(f"{path}: line {number} is damaged: {error}") from error
+
+
+def pose_of(row: list) -> tuple[int, Pose]:
+    """Return the number of the tick and the raw pose of a line of :data:`POSES`."""
+    index, stamp, arrival, body, *vectors, reset, measured = row
+    pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
+    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset, measured)
+
+
+def read_poses(folder: Path) -> dict[int, list[Pose]]:
+    """Return raw poses of a run by tick; raises `RunError` where the file is missing or damaged."""
+    found: dict[int, list[Pose]] = {}
+    try:
+        for row in lines(folder / POSES):
+            index, pose = pose_of(row)
+            found.setdefault(index, []).append(pose)
+    except (TypeError, ValueError) as error:
+        raise RunError(f"{folder / POSES}: not a list of poses: {error}") from error
+    return found
+
+
+def require_run(folder: Path) -> None:
+    """Raise `RunError` for what is no folder of a run, with what was expected in it."""
+    if not (folder / CONFIG).is_file() or not (folder / TICKS).is_file():
+        raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it")
+
+
+def _replayable(path: Path) -> str:
+    """Return config of a run without what only reads the recording's source: its poses are here, and its form has changed before."""
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}; expected the config of a run") from error
+    tree.pop("against", None)
+    tree["source"] = {key: value for key, value in tree.get("source", {}).items() if key not in ("columns", "time")}
+    return dumps(tree)
+
+
+def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
+    """Return config, policy, ticks and raw poses of a run; a config or policy that cannot be read raises as where it was given.
+
+    Raises:
+        RunError: no folder of a run, or a damaged one.
+    """
+    folder = Path(folder)
+    require_run(folder)
+    params, policy = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG)), Policy.load(folder / POLICY)
+    ticks, poses = list(lines(folder / TICKS)), read_poses(folder)
+    if not (folder / SUMMARY).is_file():  # killed: the two files may end at different ticks, with half of its poses
+        ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
+    return params, policy, ticks, poses
+
+
+PARTS = (CONFIG, POLICY, POSES, TICKS, SUMMARY, PROVENANCE)  # files of a bundle, beside the links' own records
+
+RECORDS = ("*.tlog", "*.msp")
+
+ENDING, MOST = ".zip", 2 << 30  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
+
+
+def pack(folder: str | Path) -> Path:
+    """Write the bundle of a run beside its folder and return its path; raises `RunError` where that cannot be."""
+    folder = Path(folder).resolve()
+    require_run(folder)
+    path = folder.with_name(folder.name + ENDING)
+    found = [folder / name for name in PARTS if (folder / name).is_file()]
+    found += sorted(file for pattern in RECORDS for file in folder.glob(pattern))
+    part = path.with_name(f".{path.name}.tmp")
+    try:
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as bundle:
+            for file in found:
+                bundle.write(file, file.name)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+    return path
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[Path]:
+    """The folder of a run: the one that is named, or that of a bundle while it is looked at.
+
+    Raises:
+        RunError: a file that is no bundle, or one that unpacks to more than a run.
+    """
+    path = Path(path)
+    if path.is_dir() or not path.exists():
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            with zipfile.ZipFile(path) as bundle:
+                entries = [entry for entry in bundle.infolist() if Path(entry.filename).name == entry.filename]
+                if sum(entry.file_size for entry in entries) > MOST:
+                    raise RunError(f"{path}: unpacks to more than {MOST >> 30} GiB; expected the bundle of a run")
+                for entry in entries:
+                    bundle.extract(entry, folder)
+        except (zipfile.BadZipFile, zlib.error, RuntimeError, OSError) as error:  # RuntimeError: locked by a password, an unknown method
+            raise RunError(f"{path}: {error}; expected a folder of a run, or the bundle of one") from error
+        yield Path(folder)

@@ -1,0 +1,91 @@
+"""What is made of a run's folder when the run is over: flight logs, pictures, the report of its times."""
+
+from pathlib import Path
+from typing import Any
+
+from hil.control.recording.flightlogs import read, throws, whole
+from hil.control.recording.latency import Stages, draw, slowed, table
+from visthrow.common.errors import VisthrowError
+from visthrow.logs.flightlog import FlightLog
+from visthrow.onboard.calibration import Calibration
+
+LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
+
+
+def summary_text(summary: dict[str, Any], folder: Path) -> str:
+    """Return a run in a few lines."""
+    lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
+    lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
+    if summary.get("calibration"):
+        lines.append(f"calibration: {Calibration.of(summary['calibration'])}")
+    if summary["stuck"]:
+        lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
+    if summary["left_fence"]:
+        lines.append(f"after the throw the vehicle left its fence: {summary['left_fence']}")
+    for landing in summary["landings"]:
+        lines.append(
+            f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
+            f"{landing['error']:.3f} m from the goal, {landing['duration']:.2f} s after the throw began"
+        )
+        if landing["separation"] is not None:
+            took = landing["separation"] - landing["latch"]
+            lines.append(f"it let go {1e3 * took:.0f} ms after the latch; trained with {1e3 * landing['lag']:.0f} ms")
+    for name, body in summary["bodies"].items():
+        refused = ", ".join(f"{n} {why}" for why, n in body["refused"].items()) or "none"
+        lines.append(f"{name}: {body['accepted']} poses taken; refused: {refused}")
+    for link in summary["links"]:
+        if link["refused"]:
+            lines.append(f"refused on the link: {link['refused']} messages, most often {link['refused_most'][0]['what']}")
+    ours = summary["missed_ours"]
+    lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}, {ours} of them by taking too long ourselves")
+    lines += table(summary["latency"], summary.get("speed", 1.0))
+    lines += [f"error: {text.strip().splitlines()[-1]}" for text in summary["errors"]]
+    return "\n".join([*lines, f"{folder}  the run; `visthrow hil replay {folder}` runs it again"])
+
+
+def throw_path(folder: Path, number: int, ending: str) -> Path:
+    """Return the file of a throw, counted from 1."""
+    return folder / f"throw-{number:02d}{ending}"
+
+
+def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
+    """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
+
+    Returns:
+        Lines that say what was written, and what could not be.
+    """
+    folder, said = Path(folder), []
+    try:
+        if stages is not None:
+            draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}{slowed(speed)}")
+            said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
+        played = read(folder)
+        if not played.throws:
+            whole(played).save(folder / WHOLE)
+            said.append(f"{folder / WHOLE}  flight log of the whole run")
+        for number, log in enumerate(throws(played), start=1):
+            path = throw_path(folder, number, ".npz")
+            log.save(path)
+            said.append(f"{path}  throw {number}: {outcome(log)}")
+            if "landing" in log:
+                picture(folder, number, log, played.playback.params.camera)
+    except VisthrowError as error:
+        said.append(f"not all could be written: {error}")
+    return said
+
+
+def outcome(log: FlightLog) -> str:
+    """Return how a throw ended, in words."""
+    result = log.meta["result"]
+    if not result["success"]:
+        return f"no landing counted: {result['failure']}"
+    return f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s"
+
+
+def picture(folder: Path, number: int, log: FlightLog, camera: Any) -> Path:
+    """Draw a throw's strip; returns its path."""
+    from visthrow.view import strip
+
+    path = throw_path(folder, number, ".png")
+    strip.draw(path, log, camera)
+    return path

@@ -1,0 +1,213 @@
+"""A run in the rerun viewer: live, or from its folder.
+
+The live view reads the folder that the run writes, in a process of its own: the flying process does nothing for it that it
+would not do without it. Where the viewer falls behind, ticks are left out.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from hil.control.recording.flightlogs import Samples, events, meta_of, read
+from hil.control.recording.playback import Playback, Tick
+from hil.control.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of
+from hil.errors import RunError
+from hil.params import HilParams
+from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from visthrow import config
+from visthrow.onboard.policy import Policy
+
+EVERY = 0.1  # between two looks at the folder [s]
+MOST_SHOWN = 100  # ticks sent at a time; of more, where the viewer fell behind, the last ones
+TRAIL = 300  # poses whose places stay drawn: three seconds at 100 Hz
+
+BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
+
+
+class Show:
+    """Sends ticks to a stream of rerun."""
+
+    def __init__(self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+        """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
+        from visthrow.view import rerun_view
+
+        self._stream, self._view = stream, rerun_view
+        self._meta = meta_of(playback, provenance, start)
+        self._samples = Samples(playback, self._meta)
+        self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
+        self._said: list | None = None
+        rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
+
+    def take(self, ticks: list[Tick]) -> None:
+        """Send some ticks, in order."""
+        for tick in ticks:
+            self._samples.add(tick)
+            for sample in tick.samples:
+                if sample.body in self._trails:
+                    self._trails[sample.body].append(sample.pose.pos)
+        log = self._samples.flush()
+        shown = events(ticks)
+        if shown and self._said is not None and shown[0][1:] == self._said[1:]:
+            shown = shown[1:]
+        self._said = shown[-1] if shown else self._said
+        log.meta["events"] = shown
+        self._view.send(self._stream, log)
+        now = ticks[-1].line["time"] - self._meta["times"]["policy_start"]
+        for body, points in self._trails.items():
+            if len(points) > 1:
+                self._view.trail(self._stream, BODY_CHANNELS[body], now, np.array(points))
+
+
+def sizes(pilot: Any) -> SimpleNamespace:
+    """Return what `visthrow.view.rerun_view` draws by, from the policy's contract."""
+    contract = pilot.policy.contract
+    rotors = SimpleNamespace(**contract["vehicle"]["rotors"])
+    rope = SimpleNamespace(payload_radius=contract["rope"]["payload_radius"])
+    return SimpleNamespace(camera=pilot.camera.params, vehicle=SimpleNamespace(rotors=rotors), rope=rope)
+
+
+class Tail:
+    """Whole lines that are added to a file."""
+
+    def __init__(self, path: Path) -> None:
+        """Begin at its start; it may not be there yet."""
+        self._path, self._file, self._rest = path, None, ""
+
+    def lines(self) -> Iterator[Any]:
+        """Yield values of the lines that were completed since the last call."""
+        if self._file is None:
+            if not self._path.is_file():
+                return
+            self._file = self._path.open(encoding="utf-8")
+        self._rest += self._file.read()
+        *whole, self._rest = self._rest.split("\n")
+        for row in whole:
+            yield json.loads(row)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+class Follower:
+    """Plays back a run while it is written."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read config, policy and provenance, which a run writes before it waits for poses; raises `RunError` for no folder of a run."""
+        if not all((folder / name).is_file() for name in (CONFIG, POLICY, PROVENANCE)):
+            raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY} and {PROVENANCE} in it")
+        self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
+        self.playback = Playback(self.params, Policy.load(folder / POLICY))
+        self.provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+        self._tails = {name: Tail(folder / name) for name in (TICKS, POSES)}
+        self._lines: deque[dict[str, Any]] = deque()
+        self._poses: dict[int, list[Pose]] = {}
+
+    def ticks(self) -> list[Tick]:
+        """Return ticks that were written since the last call, with all their poses."""
+        for row in self._tails[POSES].lines():
+            index, pose = pose_of(row)
+            self._poses.setdefault(index, []).append(pose)
+        self._lines.extend(self._tails[TICKS].lines())
+        found = []
+        while self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]:
+            line = self._lines.popleft()
+            found.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
+        return found
+
+    @property
+    def over(self) -> bool:
+        """Whether the run has ended."""
+        return (self.folder / SUMMARY).is_file()
+
+    def close(self) -> None:
+        """Close its files."""
+        for tail in self._tails.values():
+            tail.close()
+
+
+def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
+    """Send a run to a stream of rerun while it is written, until it is over; returns the number of ticks that were left out."""
+    follower, show, dropped = Follower(Path(folder)), None, 0
+    try:
+        while going():
+            over = follower.over
+            ticks = follower.ticks()
+            dropped += max(0, len(ticks) - MOST_SHOWN)
+            if ticks:
+                if show is None:
+                    show = Show(stream, follower.playback, follower.provenance, ticks[0].line["time"])
+                show.take(ticks[-MOST_SHOWN:])
+            elif over:
+                break
+            time.sleep(EVERY)
+    finally:
+        follower.close()
+    return dropped
+
+
+def write(folder: str | Path, path: str | Path) -> None:
+    """Write a whole run as a ``.rrd`` file; errors as of :func:`read`, and where the place cannot be written."""
+    from visthrow.view import rerun_view
+
+    played = read(folder)
+    layout = rerun_view.blueprint(np.array(played.playback.params.goal_w), {"state"})
+    with rerun_view.recording(path, layout) as stream:
+        show = Show(stream, played.playback, played.provenance, played.ticks[0].line["time"])
+        for first in range(0, len(played.ticks), MOST_SHOWN // 10):
+            show.take(played.ticks[first : first + MOST_SHOWN // 10])
+
+
+def write_mcap(folder: str | Path, path: str | Path) -> None:
+    """Write a whole run as an MCAP file; errors as of :func:`write`, and `LogError` where the package mcap is not installed."""
+    from visthrow.view import mcap_view
+
+    played = read(folder)
+    meta = meta_of(played.playback, played.provenance, played.ticks[0].line["time"])
+    samples = Samples(played.playback, meta)
+    for tick in played.ticks:
+        samples.add(tick)
+    log = samples.flush()
+    log.meta["events"] = events(played.ticks)
+    mcap_view.write(path, log, sizes(played.playback.runner.pilot))
+
+
+def start_viewer(folder: Path) -> subprocess.Popen:
+    """Start the live view of a run in a process of its own, at the lowest priority."""
+    command = [sys.executable, "-m", "visthrow.cli", "hil", "view", str(folder), "--live"]
+    lowest = (lambda: os.nice(19)) if hasattr(os, "nice") else None
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=lowest)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the live view, or write files: ``visthrow hil view``."""
+    from hil.control.recording.report import finish
+
+    folder = Path(args.folder)
+    if args.live:
+        from visthrow.view import rerun_view
+        from visthrow.view.live import web_viewer
+
+        layout = rerun_view.blueprint(np.array(Follower(folder).params.goal_w), {"state"})
+        with web_viewer(layout, args.web_port, args.data_port) as stream:
+            dropped = follow(folder, stream)
+            print(f"the run is over; {dropped} ticks were left out of the view. Ctrl-C closes the viewer", file=sys.stderr)
+            while True:
+                time.sleep(1.0)
+    path = Path(args.out) if args.out is not None else folder / "run.rrd"
+    foxglove = path.suffix == ".mcap"
+    (write_mcap if foxglove else write)(folder, path)
+    print(f"{path}  the run in 3D, image plane and signals; open it with{' Foxglove' if foxglove else f': rerun {path}'}")
+    print("\n".join(finish(folder)))
+    return 0

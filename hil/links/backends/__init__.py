@@ -1,0 +1,84 @@
+"""Back-ends: where commands go. ``dry-run`` (the default) sends nothing, ``ardupilot`` and ``px4`` speak MAVLink on the link
+that the poses may share, ``betaflight`` speaks MSP and ``crazyflie`` CRTP on a port of its own."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hil.errors import RunError
+from hil.links.backends.ardupilot import ArduPilot, ArduPilotParams
+from hil.links.backends.autopilot import MavlinkAutopilot
+from hil.links.backends.base import Backend, DryRun, Held, Status
+from hil.links.backends.betaflight import Betaflight, BetaflightParams
+from hil.links.backends.crazyflie import Crazyflie, CrazyflieParams
+from hil.links.backends.px4 import Px4, Px4Params
+from hil.links.backends.rates import Sticks
+from hil.links.crtp import open_crtp
+from hil.links.device import check_device, open_port
+from hil.links.writer import MSP_LOG, LoggedPort
+
+AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {"ardupilot": ArduPilot, "px4": Px4}  # back-ends that speak MAVLink
+THRUST_SHORT = 0.98  # shares of the thrust, and of the rates, that the policy was trained with: what a vehicle must reach at least
+
+
+def mechanism_lag(params: Any) -> float:
+    """Return the time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
+    return 0.0 if params.backend == "dry-run" else getattr(params, params.backend).mechanism_lag
+
+
+def make_backend(
+    params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None, folder: Path | None = None
+) -> Backend | Held:
+    """Return the back-end of a run.
+
+    Args:
+        params: `hil.params.HilParams`. link: MAVLink link of the run; None where poses are recorded ones.
+        write: whether wrong parameters of the autopilot are written. tell: is handed the audit's table.
+        folder: of the run, where MSP is written down as the link's messages are in its .tlog.
+
+    Raises:
+        LinkError: the port of the flight controller cannot be opened.
+        RunError: a MAVLink back-end without a link.
+    """
+    name, vehicle = params.backend, getattr(params, params.backend.replace("-", "_"), None)
+    backend: Backend
+    if name == "dry-run":
+        backend = DryRun()
+    elif name == "betaflight":
+        device = check_device(vehicle.device, remote=vehicle.remote)
+        if device.kind not in ("tcp", "serial"):
+            raise RunError(f"betaflight.device {vehicle.device}: MSP is a stream; expected tcp:... or serial:...")
+        port = open_port(device)
+        backend = Betaflight(port if folder is None else LoggedPort(port, folder / MSP_LOG), vehicle, write, tell)
+    elif name == "crazyflie":
+        backend = Crazyflie(open_crtp(vehicle.device, vehicle.remote), vehicle)
+    elif link is None:
+        raise RunError(f"backend {name} without a MAVLink link; expected source.kind mavlink")
+    else:
+        backend = AUTOPILOTS[name](link, vehicle, write, tell)
+    return Held(backend, params.delay.hold) if params.delay.hold and name != "dry-run" else backend
+
+
+def require_reach(params: Any, contract: dict[str, Any]) -> None:
+    """Raise `RunError` for a vehicle that by its calibration and rate profile cannot do what the policy was trained to command."""
+    if params.backend == "dry-run":
+        return
+    vehicle, action = getattr(params, params.backend), contract["action"]
+    most, wanted = vehicle.thrust.most, float(action["max_thrust"])
+    if most < THRUST_SHORT * wanted:
+        raise RunError(
+            f"{params.backend}.thrust gives {most:.2f} N at most, the policy was trained with {wanted:g} N; check weight, hover "
+            "and slope, or train a policy for this vehicle"
+        )
+    ends = Sticks(vehicle.rates).most if params.backend == "betaflight" else action["max_rate"]
+    if any(end < THRUST_SHORT * rate for end, rate in zip(ends, action["max_rate"])):
+        raise RunError(
+            f"betaflight.rates reach {', '.join(f'{r:.1f}' for r in ends)} rad/s on roll, pitch, yaw, the policy was trained "
+            f"with {', '.join(f'{r:g}' for r in action['max_rate'])}; raise rates"
+        )
+
+
+__all__ = [
+    "AUTOPILOTS", "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "Crazyflie", "CrazyflieParams",
+    "DryRun", "Px4", "Px4Params", "Status", "make_backend", "mechanism_lag", "require_reach",
+]  # fmt: skip

@@ -1,0 +1,83 @@
+"""ArduPilot: SET_ATTITUDE_TARGET in GUIDED or GUIDED_NOGPS, DO_GRIPPER or DO_SET_SERVO, LOITER or BRAKE to hold, LAND.
+
+Without bit 3 of GUID_OPTIONS thrust is read as a climb rate; with ATC_ANGLE_BOOST it grows with tilt; DO_SET_SERVO is
+accepted on an output that has a function and moves nothing; the last set-point is flown until GUID_TIMEOUT.
+
+Source: ArduCopter/Parameters.cpp (GUID_OPTIONS, GUID_TIMEOUT), AC_AttitudeControl.cpp (ANGLE_BOOST), AP_Gripper (GRIP_),
+SRV_Channel (SERVOn_FUNCTION 28 is Gripper), AP_NavEKF_Source.cpp (EK3_SRC1_POSXY 6 is ExternalNav).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hil.links.backends.audit import Rule, bits, equal, within
+from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
+from hil.links.backends.base import FOLLOW, HOLD, LAND
+from hil.links.pymav import mav
+from visthrow.common.errors import ConfigError
+
+GUIDED, LOITER, LAND_MODE, BRAKE, GUIDED_NOGPS = 4, 5, 9, 17, 20  # mode numbers of ArduCopter
+THRUST_AS_THRUST = 8  # bit 3 of GUID_OPTIONS
+SERVO_GRIPPER, SERVO_DISABLED = 28, 0  # values of SERVOn_FUNCTION
+
+
+@dataclass(frozen=True)
+class ArduPilotParams(AutopilotParams):
+    """The vehicle on the other side."""
+
+    follow_mode: int  # GUIDED (4) or GUIDED_NOGPS (20)
+    hold_mode: int  # LOITER (5) or BRAKE (17): who holds after the throw
+    release: Literal["gripper", "servo"]  # DO_GRIPPER, or DO_SET_SERVO on servo_output
+    gripper: int  # number of the gripper
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.follow_mode not in (GUIDED, GUIDED_NOGPS) or self.hold_mode not in (LOITER, BRAKE):
+            raise ConfigError(
+                f"follow_mode {self.follow_mode}, hold_mode {self.hold_mode}; expected GUIDED (4) or GUIDED_NOGPS (20), and "
+                "LOITER (5) or BRAKE (17)"
+            )
+        if self.release == "servo" and not self.servo_output:
+            raise ConfigError("release 'servo' with servo_output 0; expected the output that the mechanism hangs on")
+
+
+class ArduPilot(MavlinkAutopilot):
+    """An ArduCopter."""
+
+    name, autopilot = "ardupilot", mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+    params: ArduPilotParams
+
+    def _role(self, mode: int) -> str | None:
+        if mode in (GUIDED, GUIDED_NOGPS):
+            return FOLLOW
+        return {self.params.hold_mode: HOLD, LAND_MODE: LAND}.get(mode)
+
+    def _mode_numbers(self, mode: str) -> tuple[float, float]:
+        p = self.params
+        return {FOLLOW: p.follow_mode, HOLD: p.hold_mode, LAND: LAND_MODE}[mode], 0.0
+
+    def _expected_modes(self) -> str:
+        return "GUIDED (4) or GUIDED_NOGPS (20)" + (f", or {self.params.hold_mode} to take it" if self.params.take else "")
+
+    def _release_command(self) -> tuple[int, tuple[float, ...]]:
+        p = self.params
+        if p.release == "servo":
+            return mav.MAV_CMD_DO_SET_SERVO, (p.servo_output, p.servo_open_us)
+        return mav.MAV_CMD_DO_GRIPPER, (p.gripper, mav.GRIPPER_ACTION_RELEASE)
+
+    def _rules(self) -> list[Rule]:
+        p = self.params
+        rules = [
+            bits("GUID_OPTIONS", THRUST_AS_THRUST, "else thrust is read as a climb rate"),
+            equal("ATC_ANGLE_BOOST", 0.0, "else thrust grows with tilt"),
+            within("GUID_TIMEOUT", 0.0, 1.0, 0.5, "so long the last rates are flown when the runner is gone [s]"),
+            equal("EK3_SRC1_POSXY", 6.0, "holding after the throw needs an external position (ExternalNav)"),
+        ]
+        function = f"SERVO{p.servo_output}_FUNCTION"
+        if p.release == "servo":
+            rules.append(equal(function, SERVO_DISABLED, "DO_SET_SERVO is accepted on a used output and moves nothing"))
+        else:
+            rules.append(equal("GRIP_ENABLE", 1.0, "DO_GRIPPER is refused without it"))
+            if p.servo_output:
+                rules.append(equal(function, SERVO_GRIPPER, "the gripper's output, which is read back"))
+        return rules

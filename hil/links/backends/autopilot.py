@@ -1,0 +1,257 @@
+"""What ArduPilot and PX4 share: heartbeat, modes, set-points, release, parameters, over one MAVLink link.
+
+Who flies is decided by the pilot. A mode that the runner did not ask for counts as a pilot who has taken over: the runner
+stops commanding and asks for nothing any more, an abort included.
+"""
+
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from hil.links.backends.audit import Audit, Rule
+from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Release
+from hil.links.backends.thrust import ThrustParams
+from hil.links.mavlink_link import Link, attitude_target
+from hil.links.pymav import mav
+from hil.links.roster import MavlinkId, Party
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
+
+ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
+
+STREAM = (
+    (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000), (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
+    (mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000),
+)  # fmt: skip
+"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust in hover, and the mode, which a
+heartbeat of 1 Hz tells up to a second late."""
+
+SERVO_NEAR = 50  # an output this near to where the mechanism is open counts as open [us]
+
+ARMED = mav.MAV_MODE_FLAG_SAFETY_ARMED
+CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+@dataclass(frozen=True)
+class AutopilotParams(Bounded):
+    """A vehicle that speaks MAVLink."""
+
+    system: MavlinkId  # MAVLink id of the vehicle
+    component: MavlinkId  # of its autopilot
+    thrust: ThrustParams
+    mechanism_lag: NotNegative  # from the release command to separation [s]
+    release_timeout: Positive  # without a final answer the release has failed [s]
+    heartbeat_timeout: Positive  # silence after which the autopilot counts as lost [s]
+    take: bool  # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it over
+    arm: bool  # arm it when it is taken: bench and software only; else the pilot arms
+    audit: bool  # read parameters at connect and refuse to fly on a mismatch
+    servo_output: Annotated[int, Bound(0, 16)]  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    servo_open_us: Annotated[int, Bound(500, 2500)]  # there, with the mechanism open [us]
+
+
+class MavlinkAutopilot(Autopilot, ABC):
+    """An autopilot on a MAVLink link; the children say which modes there are and what the parameters must be."""
+
+    autopilot = mav.MAV_AUTOPILOT_GENERIC
+    holds = True
+
+    def __init__(self, link: Link, params: AutopilotParams, write: bool = False, tell: Callable[[str], None] | None = None) -> None:
+        """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table. Wrong parameters are written or not."""
+        super().__init__()
+        self.params, self._link, self._write, self._tell = params, link, write, tell
+        self._heartbeat: Any = None
+        self._heard = self._beat_at = self._asked_at = self._streamed = -1e9
+        self._wanted: str | None = None
+        self._may: set[str | None] = set()  # the last role that was ours, and those asked for since
+        self._reached = False
+        self._taken_over = False
+        self._ours = False  # whether it has ever followed
+        self._was_armed = False  # since the runner took the vehicle
+        self._arm_refused = ""
+        self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
+        self.release_record = Release(params.release_timeout, params.servo_output > 0)
+        self._servo = f"servo{params.servo_output}_raw"  # one string for good: Python's cache of attributes keeps each new one
+        self._begin_audit()
+        self._exact = False  # of the share
+        link.listen(self._hear)
+        link.roster.moved.append(self._came_back)
+
+    def _begin_audit(self) -> None:
+        rules = self._rules() if self.params.audit else ()
+        self.audit = Audit(rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell)
+
+    def _came_back(self, party: Party) -> None:
+        """Begin anew with what speaks from another address: it may be another vehicle of the same ids."""
+        if party.name == "autopilot":
+            self._heartbeat = None
+            self._streamed = -1e9
+            self._begin_audit()
+
+    @abstractmethod
+    def _rules(self) -> list[Rule]:
+        """Return what its parameters must be."""
+
+    @abstractmethod
+    def _role(self, mode: int) -> str | None:
+        """Return FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
+
+    @abstractmethod
+    def _mode_numbers(self, mode: str) -> tuple[float, float]:
+        """Return the second and third parameter of DO_SET_MODE."""
+
+    @abstractmethod
+    def _release_command(self) -> tuple[int, tuple[float, ...]]:
+        """Return the command that opens the mechanism, and its parameters."""
+
+    def _stored(self, value: float, kind: int) -> float:
+        """Return a parameter's value out of a PARAM_VALUE's field."""
+        return value
+
+    def _field(self, value: float, kind: int) -> float:
+        """Return a PARAM_SET's field for a value; inverse of :meth:`_stored`."""
+        return value
+
+    def _hear(self, message: Any, arrival: float) -> None:
+        p, kind = self.params, message.get_type()
+        if message.get_srcSystem() != p.system or message.get_srcComponent() != p.component:
+            return
+        if kind == "HEARTBEAT":
+            self._heartbeat, self._heard = message, arrival
+            self._judge_mode()
+        elif kind == "COMMAND_ACK":
+            self._acknowledged(message)
+        elif kind == "STATUSTEXT" and len(self.texts) < 1000:
+            self.texts.append(str(message.text))
+        elif kind == "SERVO_OUTPUT_RAW" and 1 <= p.servo_output <= 16:
+            value = getattr(message, self._servo, 0)
+            if value:
+                self.release_record.output(abs(value - p.servo_open_us) <= SERVO_NEAR)
+        elif kind == "PARAM_VALUE":
+            self._kinds[message.param_id] = message.param_type
+            self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
+        elif kind == "PARAM_ERROR":
+            self.audit.refuse(message.param_id, message.error)
+        elif kind == "ATTITUDE_TARGET":
+            self.share, self._exact = message.thrust, True
+        elif kind == "VFR_HUD" and not self._exact:  # in whole percent
+            self.share = 0.01 * message.throttle
+        elif kind == "SYS_STATUS" and 0 < message.voltage_battery < 65535:
+            self.voltage = 1e-3 * message.voltage_battery
+
+    def _judge_mode(self) -> None:
+        """Judge whether the mode is still one of ours."""
+        role = self._role(self._heartbeat.custom_mode)
+        if self._wanted is None:
+            return
+        self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
+        if role == self._wanted:
+            self._reached, self._taken_over, self._may = True, False, {role}
+            self._ours |= role == FOLLOW
+        elif self._reached or role not in self._may:
+            self._taken_over = True
+
+    def _acknowledged(self, message: Any) -> None:
+        result = message.result
+        if message.command == self._release_command()[0]:
+            if result == mav.MAV_RESULT_ACCEPTED:
+                self.release_record.answer(True)
+            elif result == mav.MAV_RESULT_IN_PROGRESS:
+                self.release_record.answer(None)
+            elif result != mav.MAV_RESULT_TEMPORARILY_REJECTED:
+                self.release_record.answer(False, f"refused with result {result}")
+        elif message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM and result != mav.MAV_RESULT_ACCEPTED:
+            self._arm_refused = f"arming refused with result {result}" + (f": {self.texts[-1]}" if self.texts else "")
+
+    def _note(self, now: float) -> tuple[str, str]:
+        p, beat = self.params, self._heartbeat
+        if beat is None or now - self._heard > p.heartbeat_timeout:
+            return "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s", WAIT
+        if not self.audit.done:
+            return "parameters are being read", WAIT
+        role, armed = self._role(beat.custom_mode), bool(beat.base_mode & ARMED)
+        if self._wanted is None:
+            if not armed and not p.arm:
+                return "disarmed", WAIT
+            ready = role == FOLLOW or (p.take and role == HOLD)
+            return ("", role) if ready else (f"in mode {self._mode_text(beat.custom_mode)}; expected {self._expected_modes()}", WAIT)
+        if self._taken_over:
+            return f"in mode {self._mode_text(beat.custom_mode)}, which the runner did not ask for: pilot or failsafe has it", WAIT
+        if armed or self._wanted == LAND:  # on the ground it disarms itself
+            return "", role or WAIT
+        if self._was_armed or self._arm_refused or not p.arm:
+            return self._arm_refused or "disarmed", WAIT
+        return "", WAIT
+
+    def _mode_text(self, mode: int) -> str:
+        return str(mode)
+
+    @abstractmethod
+    def _expected_modes(self) -> str:
+        """Return modes that a throw may begin in, in words."""
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        p = self.params
+        thrust, x, y, z = command
+        share = p.thrust.share(thrust, self.voltage)
+        return self._link.send(attitude_target(now, (p.system, p.component), share, (x, -y, -z)))
+
+    def ask(self, mode: str, now: float) -> None:
+        """Ask until the heartbeat shows the mode."""
+        if mode != self._wanted:
+            if self._wanted is None and self._heartbeat is not None:  # the first one that is ours was the pilot's
+                self._may.add(self._role(self._heartbeat.custom_mode))
+            self._may.add(mode)
+            self._wanted, self._reached, self._asked_at = mode, False, -1e9
+            if self._heartbeat is not None:
+                self._judge_mode()
+        if self._taken_over or now - self._asked_at < ASK_AGAIN:
+            return
+        beat = self._heartbeat
+        if beat is None or self._role(beat.custom_mode) != mode:
+            self._asked_at = now
+            self._command(mav.MAV_CMD_DO_SET_MODE, 0, CUSTOM, *self._mode_numbers(mode))
+            self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
+        elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
+            self._asked_at = now
+            self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
+
+    def service(self, now: float) -> None:
+        if now - self._beat_at >= 1.0:
+            self._beat_at = now
+            self._link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3))
+        if self._heartbeat is not None:
+            self.audit.service(now)
+            if now - self._streamed > 10.0 and self._wanted is None:
+                self._streamed = now
+                for number, period in STREAM:
+                    self._command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, period)
+        if self.release_record.due(now):
+            number, values = self._release_command()
+            self._command(number, self.release_record.sends - 1, *values)
+
+    def abort(self, now: float) -> None:
+        self.ask(LAND, now)
+
+    def _command(self, number: int, confirmation: int, *values: float) -> None:
+        p = self.params
+        seven = [*map(float, values), *([0.0] * (7 - len(values)))]
+        self._link.send(mav.MAVLink_command_long_message(p.system, p.component, number, min(confirmation, 255), *seven))
+
+    def _ask_parameter(self, name: str) -> None:
+        p = self.params
+        self._link.send(mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1))
+
+    def _write_parameter(self, name: str, value: float) -> None:
+        p, kind = self.params, self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
+        self._link.send(mav.MAVLink_param_set_message(p.system, p.component, name.encode(), self._field(value, kind), kind))
+
+
+def bytes_to_integer(value: float) -> float:
+    """Return the integer whose bytes stand in a float field, as PX4 writes them."""
+    return float(struct.unpack("<i", struct.pack("<f", value))[0])
+
+
+def integer_to_bytes(value: float) -> float:
+    """Return the float field whose bytes are those of an integer."""
+    return struct.unpack("<f", struct.pack("<i", int(value)))[0]

@@ -1,0 +1,288 @@
+"""What the runner needs of a back-end, the one that sends nothing, and one whose commands wait."""
+
+from collections import deque
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+from hil.links.backends.audit import Audit
+from hil.links.device import Port
+
+IDLE, PENDING, ACCEPTED, FAILED = "idle", "pending", "accepted", "failed"  # how far a release has come
+
+WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
+"""What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands by itself."""
+
+ROUNDING = 1e-6  # tolerance of times that are sums [s]: a microsecond early is in time
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a back-end knows of its autopilot at a tick; recorded, so that a replay decides alike."""
+
+    connected: bool  # heard from lately, armed, audited, and in a mode that it was asked for or may be taken from
+    note: str = ""  # why not, for people
+    release: str = IDLE  # IDLE, PENDING, ACCEPTED or FAILED
+    mode: str = FOLLOW  # WAIT, FOLLOW, HOLD or LAND
+    fault: str | None = None  # what ends the run, whatever else is well: a parameter audit that failed
+
+
+class Backend:
+    """Where commands go; no call waits or raises. What a child leaves out does nothing."""
+
+    name = ""
+    holds = False  # whether the autopilot has modes of its own that hold a place and land
+
+    def status(self, now: float) -> Status:
+        """Return what is known now."""
+        raise NotImplementedError
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up; whether it was taken."""
+        raise NotImplementedError
+
+    def ask(self, mode: str, now: float) -> None:
+        """Ask for FOLLOW, HOLD or LAND; called at every tick while it is wanted."""
+
+    def release(self, when: float) -> None:
+        """Open the mechanism at a time [s] on the runner's clock; called once a throw."""
+
+    def stop_release(self) -> None:
+        """Send no (further) release of this throw; one that was sent may still be answered."""
+
+    def rearm(self) -> None:
+        """Forget the last throw's release: the operator has armed the next one."""
+
+    def service(self, now: float) -> None:
+        """Do what is due: heartbeats, the release, its repetition."""
+
+    def due(self) -> float | None:
+        """Return when :meth:`service` is to be called at the latest [s]; None for the next tick."""
+        return None
+
+    def abort(self, now: float) -> None:
+        """Ask the autopilot to land; called at every tick of an aborted run. A pilot who has taken over is left alone."""
+
+    def finish(self, now: float) -> None:
+        """Put the autopilot at rest, as far as that is ours: the run is over."""
+
+    def close(self) -> None:
+        """Give back ports of its own."""
+
+
+class DryRun(Backend):
+    """Sends nothing; counts what it was given."""
+
+    name = "dry-run"
+
+    def __init__(self) -> None:
+        self.commands = self.releases = 0
+        self._release = IDLE
+
+    def status(self, now: float) -> Status:
+        return Status(True, "dry run", self._release)
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        self.commands += 1
+        return True
+
+    def release(self, when: float) -> None:
+        self.releases += 1
+        self._release = ACCEPTED
+
+    def rearm(self) -> None:
+        self._release = IDLE
+
+
+class Release:
+    """One release: sent at its time, repeated until it is answered, never again once it was answered or stopped.
+
+    Attributes:
+        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended. at: of the next send [s].
+        answers: of all throws, from the first send to the first answer [s].
+    """
+
+    REPEAT = 0.04  # between two sends that have no answer yet [s]; answers take 1 to 3 ms
+
+    def __init__(self, timeout: float, read_back: bool = False) -> None:
+        """Start at rest. Without a final answer within the time-out [s], and a movement where it is read back, it has failed."""
+        self.timeout, self.read_back = timeout, read_back
+        self.answers: list[float] = []
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last throw."""
+        self.state, self.note, self.sends = IDLE, "", 0
+        self.at: float | None = None
+        self._first = 0.0
+        self._sent: float | None = None  # until the first answer
+        self._answered = self._moved = self._closed = False
+
+    def start(self, when: float) -> None:
+        """Open at a time [s]."""
+        if self.state == IDLE:
+            self.state, self.at, self._first = PENDING, when, when
+
+    def stop(self) -> None:
+        """Send no more; what was never sent never happened."""
+        self.at = None
+        if self.state == PENDING and not self.sends:
+            self.state = IDLE
+
+    def answer(self, accepted: bool | None, text: str = "") -> None:
+        """Take an answer: True accepted, False refused, None at work on it."""
+        if self.state != PENDING or not self.sends:
+            return
+        self.at = None  # heard: not to be told again
+        if self._sent is not None:
+            self.answers.append(perf_counter() - self._sent)
+            self._sent = None
+        if accepted is False:
+            self._end(FAILED, text or "refused")
+        elif accepted:
+            self._answered = True
+            self._judge()
+
+    def output(self, is_open: bool) -> None:
+        """Note where the mechanism's output is; it has moved when it is open, and was seen closed in this throw before."""
+        self._closed |= not is_open
+        if is_open and self._closed and self.state == PENDING and self.sends:
+            self._moved = True
+            self._judge()
+
+    def due(self, now: float) -> bool:
+        """Return whether to send it now; the caller does."""
+        if self.state != PENDING:
+            return False
+        if now - self._first > self.timeout:
+            stood = "the output was not seen closed before" if self.read_back and not self._closed else "nothing moved"
+            why = f"accepted, but {stood}" if self._answered else "no final answer"
+            self._end(FAILED, f"{why} within {self.timeout:g} s")
+        elif self.at is not None and now >= self.at - ROUNDING:
+            if not self.sends:
+                self._sent = perf_counter()
+            self.sends, self.at = self.sends + 1, now + self.REPEAT
+            return True
+        return False
+
+    def _judge(self) -> None:
+        if self._answered and (self._moved or not self.read_back):
+            self._end(ACCEPTED, "")
+
+    def _end(self, state: str, note: str) -> None:
+        self.state, self.note, self.at = state, note, None
+
+
+class Autopilot(Backend):
+    """An autopilot with a release that is answered and settings that are audited; the children speak its protocol.
+
+    Attributes:
+        audit: of its settings. release_record: of this throw. texts: that it said, the newest last.
+        share: last share of thrust that it reported, 0 to 1. voltage: of its battery [V].
+    """
+
+    audit = Audit()
+    release_record: Release
+    share: float | None = None
+    voltage: float | None = None
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def _note(self, now: float) -> tuple[str, str]:
+        """Return what is wrong, or nothing; and what the autopilot does."""
+        raise NotImplementedError
+
+    def _hint(self) -> str:
+        """Return what it waits for, though nothing is wrong."""
+        return ""
+
+    def status(self, now: float) -> Status:
+        note, mode = self._note(now)
+        fault = self.audit.fault()
+        said = note or self._hint() or self.release_record.note
+        return Status(not note and fault is None, said, self.release_record.state, mode, fault)
+
+    def release(self, when: float) -> None:
+        self.release_record.start(when)
+
+    def stop_release(self) -> None:
+        self.release_record.stop()
+
+    def rearm(self) -> None:
+        self.release_record.reset()
+
+    def due(self) -> float | None:
+        return self.release_record.at
+
+
+class OnPort(Autopilot):
+    """A flight controller on a port of its own that neither holds nor lands by itself: it is taken, and given up by silence.
+
+    Where the runner falls silent its own failsafe or watchdog acts; so an abort has nothing to ask for. ``dropped`` counts packets that
+    could not be sent.
+    """
+
+    protocol = ""
+
+    def __init__(self, port: Port, silence: float) -> None:
+        """Take an open port; after a silence [s] the controller counts as lost."""
+        super().__init__()
+        self._port, self._silence, self._heard, self.dropped = port, silence, -1e9, 0
+        self._taken = self._raised = self._over = False  # asked for; has followed; over
+
+    def _note(self, now: float) -> tuple[str, str]:
+        silence = now - self._heard
+        if silence <= self._silence:
+            return self._known()
+        return f"no answer by {self.protocol}" + (f" for {silence:.1f} s" if self._heard >= 0.0 else ""), WAIT
+
+    def _known(self) -> tuple[str, str]:
+        """Return the same as `_note`, of one that is heard."""
+        raise NotImplementedError
+
+    def ask(self, mode: str, now: float) -> None:
+        self._taken |= mode == FOLLOW
+
+    def close(self) -> None:
+        self._port.close()
+
+    def _put(self, data: bytes) -> bool:
+        taken = self._port.write(data)
+        self.dropped += not taken
+        return taken
+
+
+class Held:
+    """A back-end whose commands go out a fixed time later; everything else is its own, the release with its own lag too.
+
+    A policy has learnt what its commands do after the trained delay. Poses can be carried forward to a slower vehicle's time; for one that
+    acts sooner than the vehicle of the training each command waits for the difference.
+    """
+
+    def __init__(self, backend: Backend, hold: float) -> None:
+        """Hold the commands of a back-end back by a time [s]."""
+        self._backend, self._hold, self._taken = backend, hold, True
+        self._waiting: deque[tuple[float, tuple[float, ...]]] = deque()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def send(self, command: tuple[float, ...], now: float) -> bool:
+        """Let a command wait; whether the last one that went out was taken."""
+        self._waiting.append((now + self._hold, command))
+        return self._taken
+
+    def service(self, now: float) -> None:
+        while self._waiting and self._waiting[0][0] <= now + ROUNDING:
+            self._taken = self._backend.send(self._waiting.popleft()[1], now)
+        self._backend.service(now)
+
+    def due(self) -> float | None:
+        times = [time for time in (self._backend.due(), self._waiting[0][0] if self._waiting else None) if time is not None]
+        return min(times, default=None)
+
+    def finish(self, now: float) -> None:
+        """End; nothing goes out after it."""
+        self._waiting.clear()
+        self._backend.finish(now)

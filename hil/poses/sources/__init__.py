@@ -1,0 +1,4 @@
+"""Sources of poses behind one face, live and replayed alike: MAVLink, .tlog, .BIN, .ulg, CSV, motion-capture systems.
+
+A source hands on raw poses, in its own frames; `hil.poses.frames` converts them.
+"""

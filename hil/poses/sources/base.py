@@ -1,0 +1,63 @@
+"""Source of poses: what the runner needs of it, what it may raise, and the one that plays recorded poses."""
+
+from collections.abc import Callable, Iterable
+
+from hil.errors import SourceError
+from hil.links.clock import Clock
+from hil.links.mavlink_link import Link, wait
+from hil.poses.pose import Pose
+
+
+class Source:
+    """Where poses come from; polling never waits and never raises."""
+
+    ended: bool = False  # nothing will come any more
+
+    def __init__(self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0) -> None:
+        """Serve links while it is polled; ``clock`` gives the arrivals [s]."""
+        self.links, self._clock = links, clock
+
+    def poll(self, now: float) -> list[Pose]:
+        """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
+        raise NotImplementedError
+
+    def wait(self, clock: Clock, until: float) -> None:
+        """Wait until a time [s], taking in what comes in the meantime, so that its arrival is known."""
+        wait(self.links, clock, self._clock, until)
+
+    def hold(self, flying: bool) -> None:
+        """Say whether the vehicle is ours in flight: then nobody's address on the links may change."""
+        for link in self.links:
+            link.roster.flying = flying
+
+    def close(self) -> None:
+        """Give ports and files back."""
+        for link in self.links:
+            link.close()
+
+
+class Recorded(Source):
+    """Recorded poses, each handed on when the runner's clock has reached its arrival."""
+
+    def __init__(self, poses: Iterable[Pose]) -> None:
+        """Sort by arrival; poses that arrived together keep their order. Raises `SourceError` where there is none."""
+        super().__init__()
+        self.poses = sorted(poses, key=lambda pose: pose.arrival)
+        if not self.poses:
+            raise SourceError("the recording holds no pose of a body that the config names")
+        self._next = 0
+
+    @property
+    def ended(self) -> bool:  # type: ignore[override]
+        return self._next >= len(self.poses)
+
+    @property
+    def start(self) -> float:
+        """Arrival of the first pose [s]."""
+        return self.poses[0].arrival
+
+    def poll(self, now: float) -> list[Pose]:
+        first = self._next
+        while self._next < len(self.poses) and self.poses[self._next].arrival <= now:
+            self._next += 1
+        return self.poses[first : self._next]

@@ -1,0 +1,239 @@
+"""Pictures of a real camera as a source of keypoints: a folder, a video or a live camera, looked at by one of `camera.detectors`.
+
+Times of recorded pictures are on the clock of the recorded poses, counted from their first arrival. Frames wait for no tick: of
+those that have come the newest is looked at, live ones in a thread of their own.
+"""
+
+import csv
+import math
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+
+from camera.detectors.contours import Detector, DetectorParams, Known
+from camera.detectors.following import Following
+from camera.detectors.learnt import LearntDetector
+from camera.fisheye import Fisheye
+from camera.mount import nominal_rot_cb
+from camera.params import CameraParams, FisheyeParams, MountParams
+from hil.errors import SourceError
+from hil.poses.detection import Detection
+from hil.poses.pose import Quaternion, Vector
+from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bound, Bounded
+from visthrow.onboard.observations import rotation_from_quat
+
+STAMPS = "stamps.csv"
+"""Beside the pictures of a folder, or named as a video is with this ending: a line ``file,time_s`` (``frame,time_s``) each."""
+
+SAME_PLACE = 0.01  # between the lens of the pictures and that of training [m]: directions of near things would differ by more than a degree
+
+
+@dataclass(frozen=True)
+class ImageParams(Bounded):
+    """Where pictures come from, and the camera that takes them."""
+
+    kind: Literal["folder", "video", "camera"]
+    path: str | None = None  # of the folder or video
+    device: int = 0  # number of a live camera
+    delay: Annotated[float, Bound(0.0, 0.5)] = 0.0  # from the exposure to the arrival of a picture [s]
+    hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts [s]
+    fisheye: FisheyeParams | None = None  # the lens; left out, that of training
+    mount: MountParams | None = None  # left out, that of training
+    detector: DetectorParams = field(default_factory=DetectorParams)
+    by: Literal["contours", "learnt"] = "contours"  # colour and shape with OpenCV, or the learnt networks
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind != "camera" and self.path is None:
+            raise ConfigError(f"images.path is none; expected the {self.kind} of the pictures")
+
+
+@dataclass(frozen=True)
+class Hint:
+    """What the runner knows when a picture is looked at, our frames."""
+
+    pos_w: Vector  # of the vehicle [m]
+    quat: Quaternion  # body to world, xyzw
+    ball_distance: tuple[float, float] | None  # of the payload from the lens, while it hangs [m]
+
+
+class Eyes:
+    """A source of detections; ``hint``: what is known now."""
+
+    hint: Hint | None = None
+
+    def __init__(self, params: ImageParams, training: CameraParams) -> None:
+        """Take lens and mount of the pictures; raises `ConfigError` for a lens that is not where that of training is."""
+        self._params = params
+        lens, mount = params.fisheye or training.fisheye, params.mount or training.mount
+        apart = math.dist(mount.position_b, training.mount.position_b)
+        if apart > SAME_PLACE:
+            raise ConfigError(
+                f"images.mount.position_b is {1e3 * apart:.0f} mm from that of training; expected {1e3 * SAME_PLACE:g} at most: "
+                "another lens at the same place can be converted, another place cannot"
+            )
+        kind = LearntDetector if params.by == "learnt" else Detector
+        self.detector = kind(Fisheye(lens), training.payload_radius, training.goal_side, params.detector)
+        self._rot_cb = nominal_rot_cb(mount).numpy()
+        self._position_b = np.array(mount.position_b)
+        # From the camera of the pictures to that of training.
+        self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
+        self._followed = Following(training.payload_radius)
+
+    def look(self, picture: np.ndarray, stamp: float) -> Detection:
+        """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
+        known, rot_wc, hint = Known(), None, self.hint
+        if hint is not None:
+            rot_wb = rotation_from_quat(torch.tensor([hint.quat], dtype=torch.float64))[0].numpy()
+            rot_wc = rot_wb @ self._rot_cb.T
+            height = hint.pos_w[2] + float(rot_wb[2] @ self._position_b)
+            known = self._followed.known(rot_wc, rot_wb[:, 2], height, hint.ball_distance, stamp)
+        try:
+            seen = self._followed.take(self.detector.detect(picture, known), rot_wc, stamp)
+        except ValueError as error:
+            raise SourceError(f"{error}: the pictures' size is not that of images.fisheye") from error
+        corners = None if seen.goal is None else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
+        ball = None if seen.ball is None else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
+        return Detection(stamp, corners, ball)
+
+
+    def poll(self, now: float) -> list[Detection]:
+        """Return detections that have come by a time [s]; never waits."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Give the camera back."""
+
+
+class RecordedImages(Eyes):
+    """Pictures of a folder or a video, each looked at when the runner's clock has reached its arrival."""
+
+    def __init__(self, params: ImageParams, training: CameraParams) -> None:
+        """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that cannot be opened."""
+        super().__init__(params, training)
+        self._read, times = (_folder if params.kind == "folder" else _video)(Path(params.path))
+        self._times = [time + params.delay for time in times]
+        self._next = 0
+
+    def poll(self, now: float) -> list[Detection]:
+        """Return detections that have come, of several pictures the newest; raises `SourceError` for one that cannot be read."""
+        first = self._next
+        while self._next < len(self._times) and self._times[self._next] <= now:
+            self._next += 1
+        if self._next == first:
+            return []
+        index = self._next - 1
+        return [self.look(self._read(index), self._times[index] - self._params.delay)]
+
+
+class LiveImages(Eyes):
+    """A camera, read and looked at in a thread of its own; ``failure`` is what ended it, and the keypoints go stale then."""
+
+    def __init__(self, params: ImageParams, training: CameraParams, clock: Callable[[], float], capture: Any = None) -> None:
+        """Open the camera, or take anything with OpenCV's ``read``; raises `SourceError` where there is none of this number."""
+        import cv2
+
+        super().__init__(params, training)
+        self._clock = clock
+        self._capture = cv2.VideoCapture(params.device) if capture is None else capture
+        if not self._capture.isOpened():
+            raise SourceError(f"camera {params.device} cannot be opened; expected the number of a camera, such as 0")
+        self._newest: Detection | None = None
+        self.failure: str | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="camera", daemon=True)
+        self._thread.start()
+
+    def _watch(self) -> None:
+        try:
+            while not self._stop.is_set():
+                good, picture = self._capture.read()
+                arrival = self._clock()
+                if not good:
+                    raise SourceError(f"camera {self._params.device} gave no picture")
+                self._newest = self.look(picture, arrival - self._params.delay)
+        except Exception as error:  # of the driver, or a picture of another size
+            self.failure = f"{type(error).__name__}: {error}"
+            print(f"camera stopped: {self.failure}", file=sys.stderr, flush=True)
+
+    def poll(self, now: float) -> list[Detection]:
+        detection, self._newest = self._newest, None
+        return [] if detection is None else [detection]
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(timeout=2.0)
+        self._capture.release()
+
+
+def open_images(params: ImageParams, training: CameraParams, clock: Callable[[], float]) -> Eyes:
+    """Open pictures; see the classes for what is refused."""
+    return LiveImages(params, training, clock) if params.kind == "camera" else RecordedImages(params, training)
+
+
+def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
+    """Return the reader of the pictures of a folder, and their times [s]."""
+    rows = _stamps(path / STAMPS, ("file", "time_s"))
+    missing = [name for name, _ in rows if not (path / name).is_file()]
+    if missing:
+        raise SourceError(f"{path / STAMPS} names {missing[0]}, which is not there")
+
+    def read(index: int) -> np.ndarray:
+        import cv2
+
+        picture = cv2.imread(str(path / rows[index][0]), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise SourceError(f"{path / rows[index][0]}: no picture that OpenCV can read")
+        return picture
+
+    return read, [time for _, time in rows]
+
+
+def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
+    """Return the reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
+    import cv2
+
+    video = cv2.VideoCapture(str(path))
+    if not path.is_file() or not video.isOpened():
+        raise SourceError(f"{path}: no video that OpenCV can open")
+    stamps = path.with_suffix(f".{STAMPS}")
+    if stamps.is_file():
+        times = [time for _, time in _stamps(stamps, ("frame", "time_s"))]
+    else:
+        rate = video.get(cv2.CAP_PROP_FPS)
+        if not rate > 0.0:
+            raise SourceError(f"{path}: the video names no rate; expected one, or {stamps.name} beside it")
+        times = [i / rate for i in range(int(video.get(cv2.CAP_PROP_FRAME_COUNT)))]
+    at = -1
+
+    def read(index: int) -> np.ndarray:
+        nonlocal at
+        good, picture = True, None
+        while at < index and good:  # seeking would land on key frames
+            good, picture = video.read()
+            at += 1
+        if not good or picture is None:
+            raise SourceError(f"{path}: frame {index} cannot be read; it has {at}")
+        return picture
+
+    return read, times
+
+
+def _stamps(path: Path, header: tuple[str, str]) -> list[tuple[str, float]]:
+    """Return rows of a file of stamps, times ascending; raises `SourceError` where it is missing, empty, or not as it must be."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+        found = [(name.strip(), float(time)) for name, time in rows[1:]]
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read: {error}; expected lines of {','.join(header)}") from error
+    times = [time for _, time in found]
+    if not found or [cell.strip() for cell in rows[0]] != list(header) or times != sorted(times):
+        raise SourceError(f"{path}; expected a first line {','.join(header)}, then a picture a line, times [s] ascending")
+    return found

@@ -1,0 +1,119 @@
+"""Opens the source that a config names."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.errors import SourceError
+from hil.links.backends import AUTOPILOTS
+from hil.links.clock import Clock
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link, LinkSync
+from hil.links.roster import Party, Roster
+from hil.links.writer import POSES_TLOG, TLOG, TlogWriter
+from hil.params import LIVE, HilParams
+from hil.poses.frames import FrameParams, Frames
+from hil.poses.pose import Pose
+from hil.poses.sources.base import Recorded
+from hil.poses.sources.mavlink import COMPANIONS, MavlinkSource
+from hil.poses.sources.mocap import open_mocap
+from hil.poses.sources.player import CHANNELS, read_autopilot, read_table, read_tlog
+from hil.poses.sources.ros2 import Ros2Source
+from visthrow.logs.check import physics
+from visthrow.logs.flightlog import Channel, FlightLog
+
+
+def read_poses(params: HilParams) -> list[Pose]:
+    """Return all raw poses of the recording that a config names; raises `SourceError` where the file cannot be read."""
+    source = params.source
+    if source.kind == "tlog":
+        return read_tlog(source.file, source.senders)
+    if source.kind in ("bin", "ulg"):
+        return read_autopilot(source.file, source.logs, source.kind)
+    return read_table(source.file, source.mapping)
+
+
+def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
+    """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks MAVLink, or both."""
+    found = []
+    if poses:
+        for ids in params.source.senders:
+            kinds = frozenset(COMPANIONS.get(ids.message, (ids.message,)))
+            found.append(Party(ids.body, ids.system, ids.component, kinds))
+    if autopilot and params.backend in AUTOPILOTS:
+        vehicle = getattr(params, params.backend)
+        found.append(Party("autopilot", vehicle.system, vehicle.component, autopilot=AUTOPILOTS[params.backend].autopilot))
+    return found
+
+
+def open_source(
+    params: HilParams, folder: Path, clock: Clock, key: bytes | None = None, tell: Callable[[str], None] | None = None
+) -> tuple[Any, Link | None, bool]:  # fmt: skip
+    """Open a source; ``key`` signs the links' messages, ``tell`` is handed who is refused and never waits.
+
+    Returns:
+        Source of poses, the autopilot's link where there is one, and whether the poses are recorded ones.
+
+    Raises:
+        SourceError, LinkError: it cannot be opened; the message says what was expected.
+    """
+    source = params.source
+    if source.kind not in LIVE:
+        poses = read_poses(params)
+        problems = unit_problems(poses, params.frames) if source.check_units else []
+        if problems:
+            raise SourceError(f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)")
+        return Recorded(poses), None, True
+    own = source.kind == "mavlink" and source.device is not None
+
+    def opened(device: str, tlog: str, who: list[Party]) -> Link:
+        port = open_port(check_device(device, remote=params.link.remote))
+        roster = Roster(who, params.link.allow, tell)
+        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / tlog), roster, key)
+        if params.delay.synchronise:
+            LinkSync(link)
+        return link
+
+    link = None
+    if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
+        link = opened(params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
+    if source.kind != "mavlink" and source.mocap.system == "ros2":
+        check_device(f"tcp:{source.mocap.host}:1", remote=params.link.remote)
+        return Ros2Source(source.mocap, source.bodies, clock.now, link), link, False
+    if source.kind != "mavlink":
+        return open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link), link, False
+    if not own:
+        return MavlinkSource(link, source.senders, clock.now), link, False
+    poses = opened(source.device, POSES_TLOG, parties(params, True, False))
+    return MavlinkSource(poses, source.senders, clock.now, link), link, False
+
+
+LEAST = 50  # poses below which nothing is said
+_KINDS = {"pos": ("m", "world"), "quat": ("1", "world"), "vel": ("m/s", "world"), "rate": ("rad/s", "body")}
+
+
+def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list[str]:
+    """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says which unit would make sense of it."""
+    poses, channels = list(poses), {}
+    for body, params in frames.items():
+        channels |= _channels([pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body])
+    return [f"{row.channel}: {row.text}" for row in physics.look(FlightLog(channels)) if (row.topic, row.verdict) == ("units", "bad")]
+
+
+def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict[str, Channel]:
+    """Return poses of one body as channels in our frames; what some of them lack is left out."""
+    ours = [frames.pose_from_source(p) for p in poses if np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))]
+    # A clock may be set in between: stamps that do not ascend are left to the gate.
+    ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]
+    times = np.array([p.stamp for p in ours])
+    ahead = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0 if len(times) else np.zeros(0, bool)
+    if np.sum(ahead) < LEAST:
+        return {}
+    found = {}
+    for name, (kind, (unit, frame)) in zip(names, _KINDS.items()):
+        values = [getattr(p, kind) for p, good in zip(ours, ahead) if good]
+        if all(value is not None and np.all(np.isfinite(value)) for value in values):
+            found[name] = Channel(times[ahead], np.array(values), unit, frame)
+    return found

@@ -1,0 +1,271 @@
+"""Poses of recordings: tables and flight logs by their channels, autopilots' logs by their messages.
+
+All files are read by ``visthrow.logs``. Autopilots write world north, east, down (or forward, right, down where PX4 was told
+so), body forward, right, down, quaternions wxyz; poses keep that, so that ``hil.poses.frames`` converts them as it does live ones.
+
+| log | message | what it is |
+|---|---|---|
+| .BIN | VISP | external pose as received; stamp CTimeMS, arrival TimeUS, reset counter |
+| .BIN | XKF1, NKF1 | estimate of one core |
+| .BIN | POS | estimate on the globe, with ATT's angles |
+| .ulg | vehicle_local_position | estimate, with vehicle_attitude and vehicle_angular_velocity |
+| .ulg | vehicle_odometry | estimate |
+| .ulg | vehicle_visual_odometry, vehicle_mocap_odometry | external pose as received |
+
+Source: ArduPilot, AP_VisualOdom/LogStructure.h, AP_NavEKF3/LogStructure.h, AP_AHRS/LogStructure.h; PX4 message definitions
+VehicleOdometry, VehicleLocalPosition, VehicleAttitude (names of fields before 1.14 too).
+"""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from hil.errors import SourceError
+from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Body, Pose
+from hil.poses.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder
+from visthrow.common.errors import LogError, suggest
+from visthrow.config.bounds import Bound, Bounded
+from visthrow.logs import read
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.mapping import TableMap
+from visthrow.logs.readers import messages
+from visthrow.logs.readers.messages import Fields, Messages
+
+CHANNELS = {
+    VEHICLE: ("pos_w", "quat_wb", "vel_w", "rate_b"),
+    PAYLOAD: ("payload_pos_w", "payload_quat_wb", "payload_vel_w", "payload_rate_b"),
+    GOAL: ("goal_w", "goal_quat_wb", "goal_vel_w", "goal_rate_b"),
+}
+"""Channels of a flight log that hold position, attitude, velocity and rates of each body."""
+
+EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
+BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
+
+Names = tuple[tuple[str, ...], ...]  # fields; of several sets the first that is there is taken
+
+
+@dataclass(frozen=True)
+class PoseMessage:
+    """Fields of a message that make a pose, or part of one."""
+
+    pos: Names = ()
+    quat: Names = ()  # wxyz
+    angles: Names = ()  # roll, pitch, yaw [deg], in place of a quaternion
+    vel: Names = ()
+    rate: Names = ()
+    resets: tuple[str, ...] = ()  # counters; their sum is the pose's
+    attitude: str = ""  # message of its attitude, of the same vehicle
+    rates: str = ""  # likewise of its rates
+
+
+def _index(name: str, count: int = 3) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))
+
+
+ANGLES, QUAT = (("Roll", "Pitch", "Yaw"), ("R", "P", "Y")), (_index("q", 4),)
+EKF = PoseMessage((("PN", "PE", "PD"),), angles=ANGLES, vel=(("VN", "VE", "VD"),))
+ODOMETRY = PoseMessage(
+    (_index("position"), ("x", "y", "z")), QUAT, vel=(_index("velocity"), ("vx", "vy", "vz")),
+    rate=(_index("angular_velocity"), ("rollspeed", "pitchspeed", "yawspeed")), resets=("reset_counter",),
+)  # fmt: skip
+LOCAL_RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "vxy", "z", "vz", "heading"))
+DATAFLASH = {
+    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt")), "XKF1": EKF, "NKF1": EKF,
+    "POS": PoseMessage((("N", "E", "D"),), attitude="ATT"),
+}  # fmt: skip
+ULOG = {
+    "vehicle_local_position": PoseMessage(
+        (("x", "y", "z"),), vel=(("vx", "vy", "vz"),), resets=LOCAL_RESETS,
+        attitude="vehicle_attitude", rates="vehicle_angular_velocity",
+    ),
+    "vehicle_odometry": ODOMETRY, "vehicle_visual_odometry": ODOMETRY, "vehicle_mocap_odometry": ODOMETRY,
+}  # fmt: skip
+_COMPANIONS = {
+    "ATT": PoseMessage(angles=ANGLES), "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
+    "vehicle_attitude": PoseMessage(quat=QUAT), "vehicle_angular_velocity": PoseMessage(rate=(_index("xyz"),)),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LogBody(Bounded):
+    """The message of one body in an autopilot's log."""
+
+    body: Body
+    message: str  # one of DATAFLASH or ULOG
+    instance: Annotated[int, Bound(0)] = 0  # core of XKF1; instance of a ULog topic
+    file: str | None = None  # of a logger of its own, say on the payload; else the source's file
+    time_offset: float = 0.0  # added to this log's times [s]: loggers do not share a clock
+
+
+@contextmanager
+def _as_source() -> Iterator[None]:
+    """Raise what a log's reader says as `SourceError`."""
+    try:
+        yield
+    except LogError as error:
+        raise SourceError(str(error)) from error
+
+
+@_as_source()
+def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
+    """Return poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
+
+    Raises:
+        SourceError: the file cannot be read, lacks a column, or holds no position of any body.
+    """
+    logs = read(path, mapping)
+    if len(logs) > 1:
+        raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
+    poses = [pose for body in BODIES for pose in _of_channels(logs[0], body)]
+    if not poses:
+        known = ", ".join(names[0] for names in CHANNELS.values())
+        raise LogError(f"{path}: no position of a body; expected one of the channels {known}; it has {', '.join(logs[0].channels)}")
+    return poses
+
+
+def _of_channels(log: FlightLog, body: str) -> list[Pose]:
+    """Return poses of one body; a sample that is not valid is NaN, for the gate to refuse."""
+    if CHANNELS[body][0] not in log:
+        return []
+    times, rows = log[CHANNELS[body][0]].time, []
+    for name in CHANNELS[body]:
+        found: list[tuple | None] = [None] * len(times)
+        if name in log:
+            values = np.where(log[name].valid[:, None], log[name].values.astype(float), np.nan).tolist()
+            found = [tuple(values[i]) if i >= 0 else None for i in _before(log[name].time, times)]
+        rows.append(found)
+    start = min(float(channel.time[0]) for channel in log.channels.values() if len(channel.time))
+    return [Pose(t, t - start, body, *parts) for t, *parts in zip(times.tolist(), *rows)]
+
+
+def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    """Return the index of the last time at or before each stamp; -1 where there is none, or an old one."""
+    index = np.searchsorted(times, stamps, side="right") - 1
+    return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
+
+
+@_as_source()
+def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
+    """Return poses of a .tlog; arrivals are seconds from its first message. Raises `SourceError` where nothing in it is a message."""
+    decoder, poses, first = MavlinkDecoder(bodies), [], None
+    for arrival, message in messages.telemetry(path):
+        first = arrival if first is None else first
+        pose = decoder.feed(message, arrival - first)
+        if pose is not None:
+            poses.append(pose)
+    return poses
+
+
+@_as_source()
+def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
+    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first one.
+
+    Raises:
+        SourceError: no body, no such file, a package is missing, or a message carries no pose or is not in the log.
+    """
+    known, reader = {"bin": (DATAFLASH, messages.read_dataflash), "ulg": (ULOG, messages.read_ulog)}[kind]
+    if not bodies:
+        raise SourceError(f"source.logs is empty; expected a body and one of the messages {', '.join(known)}")
+    poses: list[Pose] = []
+    for body in bodies:
+        if body.message not in known:
+            raise SourceError(f"message '{body.message}' of the {body.body} carries no pose; {suggest(body.message, known)}")
+        found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
+        if not found:
+            raise SourceError(f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of the {body.body}")
+        poses += [replace(pose, arrival=pose.arrival + body.time_offset) for pose in found]
+    start = min(pose.arrival for pose in poses)
+    return [replace(pose, arrival=pose.arrival - start) for pose in poses]
+
+
+def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) -> list[Pose]:
+    if body.message not in log.names:
+        names = ", ".join(name for name in known if name in log.names) or "none"
+        raise LogError(f"{log.path}: no {body.message} in this log; of the messages with poses it has: {names}")
+    data = log.fields.get((body.message, body.instance))
+    if data is None:
+        return []
+    kind = known[body.message]
+    if body.message == "POS":
+        data = data | _from_globe(data, log.first("ORGN"))
+    try:
+        pos, quat, vel, rate = (_columns_of(data, kind, name) for name in ("pos", "quat", "vel", "rate"))
+        count, arrivals, stamps = len(pos), data["arrival"], data["time"]
+        if kind.attitude:
+            other = log.first(kind.attitude)
+            if other is None:
+                raise LogError(f"{log.path}: {body.message} gives no attitude, and the log holds no {kind.attitude}")
+            quat = _paired(other, _COMPANIONS[kind.attitude], "quat", stamps)
+        if kind.rates and (other := log.first(kind.rates)) is not None:
+            rate = _paired(other, _COMPANIONS[kind.rates], "rate", stamps)
+    except KeyError as error:
+        listed = ", ".join(sorted(data.keys() - {"time", "arrival"}))
+        raise LogError(f"{log.path}: no field {error}; {body.message} has {listed}") from error
+    vel = _in_world(vel, quat, data.get("velocity_frame"))
+    counters = [data[name].astype(int) for name in kind.resets if name in data]
+    resets = sum(counters) if counters else np.zeros(count, int)
+    return [
+        Pose(float(stamps[i]), float(arrivals[i]), body.body, tuple(pos[i].tolist()), _known(quat, i), _known(vel, i),
+             _known(rate, i), int(resets[i]))
+        for i in range(count) if not kind.attitude or _known(quat, i) is not None
+    ]  # fmt: skip
+
+
+def _columns_of(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
+    """Return columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
+    if what == "quat" and message.angles:
+        from scipy.spatial.transform import Rotation
+
+        angles = _columns(data, message.angles)
+        return Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat()[:, [3, 0, 1, 2]]
+    names = getattr(message, what)
+    return _columns(data, names) if names else None
+
+
+def _columns(data: Fields, choices: tuple[tuple[str, ...], ...]) -> np.ndarray:
+    names = next((names for names in choices if names[0] in data), choices[0])
+    return np.column_stack([data[name] for name in names]).astype(float)
+
+
+def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
+    """Return another message's last value at or before each stamp, NaN where there is none or an old one."""
+    index = _before(other["time"], stamps)
+    values = _columns_of(other, message, what)[np.maximum(index, 0)]
+    values[index < 0] = np.nan
+    return values
+
+
+def _in_world(vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray | None) -> np.ndarray | None:
+    """Return velocities in the world, those of the body turned; NaN where the attitude is not known."""
+    if vel is None or frame is None:
+        return vel
+    from scipy.spatial.transform import Rotation
+
+    own = frame == BODY_FRAME
+    known = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
+    turned = np.where((own & ~known)[:, None], np.nan, vel)
+    both = own & known
+    if np.any(both):
+        turned[both] = Rotation.from_quat(quat[both][:, [1, 2, 3, 0]]).apply(vel[both])
+    return turned
+
+
+def _known(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
+    """Return a row; None where there is none or it holds NaN, PX4's word for unknown."""
+    return None if values is None or np.isnan(values[i]).any() else tuple(values[i].tolist())
+
+
+def _from_globe(data: Fields, origins: Fields | None) -> Fields:
+    """Return north, east and down [m] from the estimator's origin, else from the first position."""
+    at = np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
+    lat, lng = (origins[n][at[-1]] if len(at) else data[n][0] for n in ("Lat", "Lng"))
+    return {
+        "N": np.radians(data["Lat"] - lat) * EARTH_RADIUS,
+        "E": np.radians(data["Lng"] - lng) * EARTH_RADIUS * math.cos(math.radians(lat)),
+        "D": -(data["RelOriginAlt"] if "RelOriginAlt" in data else data["RelHomeAlt"]),
+    }

@@ -1,0 +1,112 @@
+"""``visthrow hil fake`` and ``direct``: the simulated vehicle over the wire, and behind a firmware in lock step."""
+
+import argparse
+import json
+import math
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.errors import RunError
+from hil.fakes.base import VEHICLE_ID, Fake, Options
+from hil.fakes.mocap import MocapParams
+from hil.fakes.process import AnsweringPort, ListeningPort, load_plant, make_fake, serve
+from hil.fakes.sitl.ardupilot import ArduPilotSitl
+from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl
+from hil.fakes.sitl.firmware import Firmware, needed
+from hil.fakes.sitl.sih import HangingBall, Px4Sih
+from hil.fakes.sitl.throw import throw
+from hil.flight import key_of, params_of
+from hil.links.clock import MonotonicClock
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from visthrow import config
+from visthrow.onboard.policy import Policy, find_policy
+
+PLANT, MOTORS, BALL = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors", "hil.simulated:make_ball"
+"""What makes the vehicle behind a fake, and behind a firmware; the ball below a firmware's own vehicle."""
+
+SITL = {"betaflight-sitl": MOTORS, "ardupilot-sitl": MOTORS, "px4-sih": BALL}
+"""Kinds of fake that are a bridge to a firmware in software, and what makes the vehicle behind it."""
+
+BRIDGE_ID = (254, 190)  # MAVLink ids of the bridge where it listens to an autopilot itself
+BALL_LAG = 0.06  # from the mechanism's output to separation below PX4's vehicle [s], as `visthrow.throws.wire_plant.MECHANISM`
+
+
+def direct(args: argparse.Namespace) -> int:
+    """Throw through a firmware in lock step; a line of JSON a seed."""
+    params = params_of(args)
+    policy = Policy.load(find_policy(params.policy))
+    for seed in args.seeds:
+        flown = load_plant(args.plant or MOTORS, args.policy or params.policy, seed)
+        report = throw(args.firmware, Path(args.folder) / f"{seed:03d}", params, policy, flown, MocapParams(), seed)
+        summary, landed = report.pop("run"), report["landing_w"]
+        error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])
+        told = {"seed": seed, "error": error, "state": summary["state"], "reason": summary["reason"], **report}
+        print(json.dumps(told), flush=True)
+    return 0
+
+
+def fake(args: argparse.Namespace) -> int:
+    """Fly a fake autopilot, or a bridge to a firmware in software, and print its report."""
+    options = config.loads(Options, "", [*args.overrides, f"answer={args.answer}"], "options of the fake")
+    mocap = MocapParams(rate=args.rate)
+    plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
+    link = Link(open_port(check_device(args.device)), *VEHICLE_ID, key=key_of(args))
+    with ExitStack() as ends:
+        if args.kind in SITL:
+            flown = _bridge(args, (plant, link, mocap, args.seed, options), ends)
+        else:
+            port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
+            if args.kind == "crazyflie":
+                port = AnsweringPort(check_device(f"udp:127.0.0.1:{args.msp_port}"))
+            flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
+            print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
+        ends.callback(flown.close)
+        report = serve(flown, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out), args.after)
+    periods = report["time"] / plant.period
+    if args.kind in SITL and report["late_periods"] > SLOW * periods:
+        print(
+            f"this machine is too slow: {report['late_periods']} of {periods:.0f} periods were late; slow both clocks, --speed "
+            f"{args.speed / 2:g} here and of the run", file=sys.stderr,
+        )  # fmt: skip
+    print(json.dumps(report, indent=2))
+    return 0
+
+
+def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack) -> Fake:
+    """Return the bridge to a firmware: its outputs fly the plant, or the ball hangs below PX4's own vehicle."""
+    params = config.load(HilParams, config.find("hil", args.config))
+    flown: Fake
+    if args.kind == "betaflight-sitl":
+        if args.firmware is None:
+            raise RunError("--kind betaflight-sitl without --firmware; expected Betaflight's program for a PC")
+        firmware = Firmware(args.firmware, args.folder)
+        ends.callback(firmware.stop)
+        kept = firmware.set_up(needed(params.betaflight))
+        firmware.start()
+        print("".join(f"{name:28} {value}\n" for name, value in kept.items()), end="", file=sys.stderr)
+        flown = BetaflightSitl(*vehicle, params.betaflight, firmware.stands)
+        flown.sensors.start()
+        said = "the firmware has its settings; it flies"
+    elif args.kind == "ardupilot-sitl":
+        flown, said = ArduPilotSitl(*vehicle, params.ardupilot), "waiting for ArduPilot: --model json:127.0.0.1"
+    else:
+        flown = Px4Sih(*vehicle, params.px4, Link(open_port(check_device(args.autopilot)), *BRIDGE_ID))
+        said = f"waiting for PX4 on {args.autopilot}"
+    print(said, file=sys.stderr, flush=True)
+    return flown
+
+
+def make_ball(policy: str, seed: int) -> HangingBall:
+    """Return the rope and ball that a policy was trained with, below a vehicle that is told where it is."""
+    contract = Policy.load(find_policy(policy)).contract
+    rope, alone = contract["rope"], contract["vehicle"]["body"]["mass"]
+    return HangingBall(
+        np.array(rope["mount"]), rope["length"] + rope["payload_offset"], BALL_LAG,
+        (alone + rope["rope_mass"] + rope["payload_mass"], alone), contract["action"]["max_thrust"],
+    )  # fmt: skip

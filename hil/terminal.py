@@ -1,0 +1,123 @@
+"""The operator at the terminal: words typed, signals that ask the process to end, and what is said; none of it ever waits."""
+
+import contextlib
+import os
+import queue
+import select
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from hil.control.states import Decision, OperatorInput
+from visthrow.onboard.calibration import Calibration
+
+ENDING = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
+                 "SIGPWR", "SIGIO")
+    if hasattr(signal, name)
+)  # fmt: skip
+"""Signals that would end the process and can be caught: Ctrl-C; systemd, ``timeout`` and a shutdown; a dropped ssh or a closed
+terminal; and those that nobody means."""
+
+PAUSING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
+"""Signals that would stop the process in mid flight: Ctrl-Z, and a terminal that belongs to another job."""
+
+MOST_UNSAID = 1000  # lines that wait for a terminal that takes none; those beyond are lost
+LAST_WORDS = 2.0  # that the end of a run waits for its lines to be taken [s]
+MOST_TYPED = 4096  # bytes of a line without an end
+
+
+class Console:
+    """Says lines on standard error by a thread of its own: a terminal that is gone or stands still holds up no tick."""
+
+    def __init__(self) -> None:
+        self._lines: queue.Queue[str | None] = queue.Queue(MOST_UNSAID)
+        self._thread = threading.Thread(target=self._speak, name="console", daemon=True)
+        self._thread.start()
+        self._before: tuple[str, str] = ("", "")
+
+    def say(self, text: str) -> None:
+        """Say a line; never waits and never raises."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(text)
+
+    def decision(self, decision: Decision) -> None:
+        """Say a change of state with its reason, or what a state waits for; a reason that was just said is not said again."""
+        head = f"{decision.time:12.3f} s  {decision.state:8} "
+        if decision.state != self._before[0]:
+            self.say(head + (decision.reason if decision.reason != self._before[1] else ""))
+            self._before = decision.state, decision.reason
+        if decision.calibration is not None:
+            found = decision.calibration
+            self.say(f"{head}calibration: {found if isinstance(found, str) else Calibration.of(found)}")
+        if decision.waits:
+            self.say(f"{head}waits: {decision.waits}")
+
+    def _speak(self) -> None:
+        while (text := self._lines.get()) is not None:
+            with contextlib.suppress(OSError, ValueError):
+                print(text, file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Say what is left, where somebody listens."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(None)
+        self._thread.join(LAST_WORDS)
+
+
+class Terminal:
+    """See `hil.control.loop.Operator`."""
+
+    def __init__(self, auto_arm: bool = False, simulated: Callable[[], bool] = lambda: False, say: Callable[[str], None] = print) -> None:
+        """Take over the signals.
+
+        Args:
+            auto_arm: whether the word is given whenever the run is ready, to a vehicle that has said that it is simulated and to no other.
+            say: never waits.
+        """
+        self._auto, self._simulated, self._say = auto_arm, simulated, say
+        self._why = ""
+        self._typed, self._warned = b"", False
+        try:
+            self._file = sys.stdin.fileno()
+        except (AttributeError, OSError, ValueError):  # there is no terminal
+            self._file = -1
+        for number in ENDING:
+            signal.signal(number, self._told_to_end)
+        for number in PAUSING:
+            signal.signal(number, signal.SIG_IGN)
+
+    def _told_to_end(self, number: int, frame: Any) -> None:
+        if number == signal.SIGINT and self._why.endswith("(Ctrl-C)"):
+            raise KeyboardInterrupt
+        if not self._why or number == signal.SIGINT:
+            name = signal.Signals(number).name
+            self._why = "the operator said abort (Ctrl-C)" if number == signal.SIGINT else f"the process was told to end ({name})"
+
+    def words(self, state: str) -> OperatorInput:
+        said = self._lines()
+        arm = "arm" in said
+        if self._auto and state == "ready" and not arm:
+            arm = self._simulated()
+            if not arm and not self._warned:
+                self._warned = True
+                self._say("--auto-arm: this vehicle does not say that it is simulated (`visthrow hil fake` does); type arm")
+        return OperatorInput(arm, "land" in said, "abort" in said or bool(self._why), self._why)
+
+    def _lines(self) -> set[str]:
+        """Return lines that were typed since the last call; half a line waits for its end."""
+        while self._file >= 0 and select.select([self._file], [], [], 0)[0]:
+            try:
+                data = os.read(self._file, MOST_TYPED)
+            except OSError:  # the terminal has gone
+                data = b""
+            if not data:
+                self._file = -1
+            self._typed += data
+        *whole, rest = self._typed.split(b"\n")
+        self._typed = rest[-MOST_TYPED:] if self._file >= 0 else b""
+        whole += [] if self._file >= 0 else [rest]
+        return {line.decode("utf-8", "replace").strip().lower() for line in whole}
