@@ -150,11 +150,7 @@ class AutopilotCheck:
 
 
 def hover_of_run(folder: str | Path) -> tuple[bool, str]:
-    """Return whether the hover of a recorded run took the weight, by what the runner commanded before its throws; and that in words.
-
-    Raises:
-        RunError: no folder of a run, or no steady hover in it.
-    """
+    """Return whether a run's hover took the weight, by what was commanded before its throws, and in words; raises `RunError`."""
     folder = Path(folder)
     require_run(folder)
     params = config.load(HilParams, folder / CONFIG)

@@ -72,12 +72,8 @@ class Terminal:
     """See `hil.control.loop.Operator`."""
 
     def __init__(self, auto_arm: bool = False, simulated: Callable[[], bool] = lambda: False, say: Callable[[str], None] = print) -> None:
-        """Take over the signals.
-
-        Args:
-            auto_arm: whether the word is given whenever the run is ready, to a vehicle that has said that it is simulated and to no other.
-            say: never waits.
-        """
+        """Take over the signals; ``say`` never waits. ``auto_arm``: the word is given whenever the run is ready, to a vehicle that has said
+        that it is simulated and to no other."""
         self._auto, self._simulated, self._say = auto_arm, simulated, say
         self._why = ""
         self._typed, self._warned = b"", False

@@ -127,13 +127,8 @@ class Calibrating:
         return sway(since, p.rate, p.frequency)
 
     def note(self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float) -> None:
-        """Take down a tick.
-
-        Args:
-            now: [s]. vehicle: as of the poses. thrust: commanded [N].
-            points: normalised keypoints of a frame that is new, shape (8, 2). valid: shape (8,).
-            age: by the frame's stamp, beyond that of the poses [s].
-        """
+        """Take down a tick: the vehicle as of the poses, the commanded thrust [N], normalised keypoints of a new frame, shape (8, 2), their
+        validity, shape (8,), and their age by the frame's stamp beyond that of the poses [s]."""
         if self._begin is not None and not self._waits and self.found is None:
             self._rows.append((now, vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, thrust, points, valid, age))
 

@@ -88,17 +88,10 @@ class Flight:
 
 
 def separation(times: np.ndarray, points: np.ndarray, expected: float) -> tuple[float, Vector] | None:
-    """Return when and where the rope let go: where the poses leave the free fall after it, carried backwards.
+    """Return when [s] and where [m] the rope let go: where the poses leave the free fall after it, carried backwards.
 
     While the rope holds, its pull bends the path away from the free fall by ``a (t_s - t)^2 / 2``; the root of the distance is
-    a line in time that ends at the separation.
-
-    Args:
-        times: of the poses [s], shape (N,). points: [m], shape (N, 3).
-        expected: about when [s].
-
-    Returns:
-        Time [s] and the payload's centre [m]; None where too few poses were seen on either side.
+    a line in time that ends at the separation. None where too few poses were seen on either side of the expected time [s].
     """
     free = (times > expected + FREE_AFTER) & (times < expected + FREE_AFTER + FREE_LONG)
     if np.count_nonzero(free) < FREE_LEAST:
@@ -134,16 +127,12 @@ class Latch:
     """
 
     def __init__(self, lag: float, mechanism_lag: float, hang: float, tolerance: float, height: float, later: float = 0.0) -> None:
-        """Start with the payload hanging.
+        """Start with the payload hanging; raises `RunError` where the mechanism is slower than the policy was trained for.
 
         Args:
             lag: trained, from latch to separation [s]. mechanism_lag: of the mechanism, from its command to separation [s].
             hang: of the payload's centre below the vehicle's at rest [m]. tolerance: within which the payload counts as hanging [m].
-            height: of the payload's centre as it lands [m].
-            later: by which all that the policy decides comes about later than in its training [s], the separation as well.
-
-        Raises:
-            RunError: the mechanism is slower than the policy was trained for.
+            height: of the payload's centre as it lands [m]. later: by which all that the policy decides comes later than in training [s].
         """
         if mechanism_lag > lag + later + LAG_TOLERANCE:
             raise RunError(

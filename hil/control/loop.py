@@ -64,7 +64,7 @@ def fly(
     most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
     eyes: Eyes | None = None, solver: Solver | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds.
+    """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds; returns `Loop.summary`.
 
     A vehicle that is ours is never left without a word: where the time is over in flight, or something raises, the run is aborted and
     goes on until it has ended. A second Ctrl-C ends it at once, after one more request to land.
@@ -73,10 +73,6 @@ def fly(
         runner: with its back-end. source: of poses. clock: of the ticks. operator: who arms. recorder: of the run's folder, if any.
         tell: called with the first decision of each state, and of each reason why it does not go on.
         stages: filled with the times of each stage. eyes: a camera, where keypoints are a detector's. solver: of its calibration.
-
-    Returns:
-        The runner's summary with ticks, misses (those that a tick of ours caused by taking too long, and all), and the
-        times of each stage.
     """
     loop = Loop(runner, source, clock, operator, recorder, tell, stages or Stages(), eyes, solver)
     begin, backend = clock.now(), runner.backend
@@ -175,7 +171,7 @@ class Loop:
             self.tell(decision)
 
     def summary(self) -> dict[str, Any]:
-        """See :func:`fly`."""
+        """Return the runner's summary with ticks, misses (all, and ours: of a tick that took too long), and each stage's times."""
         runner, backend, ticker = self.runner, self.runner.backend, self.ticker
         record = getattr(backend, "release_record", None)  # a dry run has none
         for delay in record.answers if record is not None else ():

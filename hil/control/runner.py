@@ -88,8 +88,7 @@ class Runner:
         """Build all parts; the mechanism's lag is from its command to separation [s].
 
         Raises:
-            MismatchError: the camera is not the one that the policy was trained with.
-            PolicyError: the policy is incomplete.
+            MismatchError, PolicyError: the camera is not the one that the policy was trained with, or the policy is incomplete.
             RunError: the mechanism is slower than the policy was trained for.
         """
         self.params, self.backend = params, backend
@@ -173,10 +172,8 @@ class Runner:
         return Hint(vehicle.pos, vehicle.quat, (0.5 * self.hang, 1.4 * self.hang) if hangs else None)
 
     def take(self, poses: list[Pose]) -> None:
-        """Take in poses that have come before the tick that they belong to, so that the tick has less to do.
-
-        A tick of the rest decides as one of all of them would: what goes wrong here comes up there.
-        """
+        """Take in poses before the tick that they belong to, so that it has less to do, and decides as with all of them: what goes wrong
+        here comes up there."""
         try:
             if self._untaken is None:
                 self._take(poses)

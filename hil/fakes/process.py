@@ -159,11 +159,7 @@ def interruptible() -> Iterator[threading.Event]:
 
 
 def serve(fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING) -> dict[str, Any]:
-    """Fly in real time until ``after`` seconds after the payload's landing, for ``most`` seconds, or until Ctrl-C.
-
-    Returns:
-        The report, with the number of periods that took longer than real time has.
-    """
+    """Fly in real time until ``after`` seconds after the landing, for ``most`` seconds, or until Ctrl-C; returns the report."""
     paced, begun = Paced(fake, clock), fake.plant.time
     with contextlib.suppress(KeyboardInterrupt), interruptible() as asked, collected():  # a collection of all takes a tenth of a second
         while fake.plant.time - begun < most and not asked.is_set():

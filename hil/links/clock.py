@@ -101,14 +101,11 @@ class Ticker:
 
 
 class TimeSync:
-    """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip of the last ones.
+    """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip; ``steps``: how often a clock was set.
 
     The peer answers ``tc1`` (its time) to ``ts1`` (ours). The true offset lies within half the round trip of
     ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one. Exchanges that contradict it, by more than both
     round trips and some drift allow, are set aside; several in a row say that a clock was set, and begin anew.
-
-    Attributes:
-        steps: how often a clock was set.
     """
 
     DRIFT = 1e-3  # that clocks may part by within the window: 200 parts in a million over 5 s [s]

@@ -31,11 +31,7 @@ class Device:
 
 
 def check_device(text: str, *, remote: bool = False) -> Device:
-    """Read a device string against the whitelist; addresses other than loopback ones only with ``remote``.
-
-    Raises:
-        LinkError: anything else, and what is allowed.
-    """
+    """Read a device string against the whitelist, loopback ones alone without ``remote``; raises `LinkError` with what is allowed."""
     found = _SERIAL.fullmatch(text)
     if found:
         return Device("serial", found[1], int(found[2]))

@@ -189,10 +189,8 @@ EARLY, LATE = 0.005, 0.2
 
 
 class LinkSync:
-    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one system may have two clocks.
-
-    ``foreign`` counts poses whose stamps are not of their sender's TIMESYNC clock.
-    """
+    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one system may have two clocks. ``foreign``
+    counts poses whose stamps are not of their sender's TIMESYNC clock."""
 
     def __init__(self, link: Link) -> None:
         """Listen to a link, and ask from its pump."""

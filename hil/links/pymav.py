@@ -25,11 +25,8 @@ FORGED = "Invalid signature"  # what pymavlink calls a message without a valid s
 
 
 class Parser:
-    """Bytes to messages. No byte string makes it raise.
-
-    Attributes:
-        errors: byte strings that were no message, or only in part. forged: messages of the last bytes without a valid signature.
-    """
+    """Bytes to messages; no byte string makes it raise. ``errors`` counts what was no message, or only in part; ``forged`` are messages of
+    the last bytes without a valid signature."""
 
     def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)) -> None:
         """Take what makes pymavlink's parser, which may ask for signatures."""
@@ -68,11 +65,8 @@ LEAST_WORD = 8  # characters of a pass phrase
 
 
 def read_key(path: str | Path) -> bytes:
-    """Read a key of 32 bytes: raw, as 64 hexadecimal digits, or by a pass phrase, whose SHA-256 it then is.
-
-    Raises:
-        LinkError: the file cannot be read, others than its owner may read it, or it holds no key.
-    """
+    """Read a key of 32 bytes: raw, as 64 hexadecimal digits, or by a pass phrase, whose SHA-256 it then is; raises `LinkError` for a file
+    that cannot be read, that others may read, or that holds no key."""
     path = Path(path)
     try:
         data, mode = path.read_bytes(), path.stat().st_mode

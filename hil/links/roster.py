@@ -98,10 +98,8 @@ class Roster:
     """
 
     def __init__(self, parties: Iterable[Party] = (), allow: Iterable[str] = (), tell: Callable[[str], None] | None = None) -> None:
-        """Wait for all parties; without one, the first valid message of anybody says who is heard and answered.
-
-        ``allow``: addresses that may send at all; none: any.
-        """
+        """Wait for all parties; without one, the first valid message of anybody says who is heard and answered. ``allow``: addresses that
+        may send at all; none: any."""
         self.parties, self._allow, self.tell = tuple(parties), check_allowed(allow), tell
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}

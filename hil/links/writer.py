@@ -21,10 +21,7 @@ MOST_BYTES = 65535  # length of a chunk of MSP in the file; a longer one is cut
 
 
 class Writer:
-    """A file that is added to; putting never waits and never raises.
-
-    ``failed`` counts chunks that could not be written; ``why`` the first one could not, or None.
-    """
+    """A file that is added to; putting never waits nor raises. ``failed`` counts chunks that were not written, ``why`` the first."""
 
     def __init__(self, path: str | Path) -> None:
         """Open the file; raises `StorageError` where it cannot be written."""

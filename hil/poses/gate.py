@@ -51,10 +51,8 @@ class GateParams(Bounded):
 
 
 class Gate:
-    """Decides about the poses of one body; ``last`` is the accepted one, ``refused`` counts by reason.
-
-    ``jumped``: the source's reset counter has changed since the last :meth:`restart`.
-    """
+    """Decides about one body's poses; ``last`` is the accepted one, ``refused`` counts by reason, ``jumped``: the source's reset counter
+    has changed since the last :meth:`restart`."""
 
     def __init__(self, params: GateParams) -> None:
         self.params = params

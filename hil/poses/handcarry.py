@@ -123,11 +123,8 @@ def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
 
 
 def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
-    """Say of each move whether it went where it was meant to by the config's frames, and which frames would fit.
-
-    Raises:
-        RunError: another number of moves than `MOVES`.
-    """
+    """Say of each move whether it went where it was meant to by the config's frames, and which frames would fit; raises `RunError` for
+    another number of moves than `MOVES`."""
     if len(steps) != len(MOVES):
         seen = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
         raise RunError(f"hand-carry: {len(steps)} moves between rests; expected {len(MOVES)}, a second of rest around each: {seen}")

@@ -80,11 +80,7 @@ class Track:
         return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
-        """Return the last pose taken, its stamp freed of steps of the source's clock, with the estimates of velocity and body rate.
-
-        Raises:
-            ValueError: there is none yet.
-        """
+        """Return the last pose, its stamp freed of clock steps, with velocity and body rate; raises `ValueError` where there is none."""
         if self._pose is None:
             raise ValueError("no pose was taken yet; sample() is for after the first one")
         return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self.filter.rate

@@ -113,12 +113,8 @@ def _cut(folder: str | Path, ticks: int) -> str | None:
 
 
 def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str | None) -> str:
-    """Return where a run went wrong.
-
-    Args:
-        turn: the first tick in abort: ``time`` [s], ``state`` before it, ``since`` when that lasted [s], ``reason``, and ``vehicle``
-            as it was seen. last: the last tick, in the same form, if any. cut: what is missing of the recording.
-    """
+    """Return where a run went wrong, by the first tick in abort (``time`` [s], ``state`` before it, ``since`` when [s], ``reason``,
+    ``vehicle`` as it was seen), the last tick in the same form, and what is missing of the recording."""
     at = turn or (last if cut else None)
     if at is None:
         return "It did not go wrong." if last is None else f"It did not go wrong: it ended in {last['state']} ({last['reason']})."

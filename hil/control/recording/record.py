@@ -79,11 +79,7 @@ class Recorder:
 
 
 def lines(path: Path) -> Iterator[Any]:
-    """Yield values of a file of lines; a last line that was cut short is left out.
-
-    Raises:
-        RunError: no such file, or a line before the last one is damaged.
-    """
+    """Yield a file's values, a line each; a last line that was cut short is left out. Raises `RunError` for no file, or a damaged line."""
     try:
         rows = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -135,11 +131,7 @@ def _replayable(path: Path) -> str:
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
-    """Return config, policy, ticks and raw poses of a run; a config or policy that cannot be read raises as where it was given.
-
-    Raises:
-        RunError: no folder of a run, or a damaged one.
-    """
+    """Return config, policy, ticks and raw poses by tick of a run; raises `RunError` for no folder of a run, or a damaged one."""
     folder = Path(folder)
     require_run(folder)
     params, policy = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG)), Policy.load(folder / POLICY)
@@ -177,11 +169,7 @@ def pack(folder: str | Path) -> Path:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[Path]:
-    """The folder of a run: the one that is named, or that of a bundle while it is looked at.
-
-    Raises:
-        RunError: a file that is no bundle, or one that unpacks to more than a run.
-    """
+    """Yield the folder of a run: the one that is named, or a bundle's while it is looked at; raises `RunError` for what is no bundle."""
     path = Path(path)
     if path.is_dir() or not path.exists():
         yield path

@@ -49,11 +49,7 @@ def throw_path(folder: Path, number: int, ending: str) -> Path:
 
 
 def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
-    """Write latency picture, and a flight log and picture a throw; of a run without throws one log of all of it.
-
-    Returns:
-        Lines that say what was written, and what could not be.
-    """
+    """Write latency picture, and a flight log and picture a throw, or one log of all; returns lines that say what was written."""
     folder, said = Path(folder), []
     try:
         if stages is not None:

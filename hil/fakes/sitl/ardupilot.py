@@ -62,11 +62,7 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
 
 
 class ArduPilotSitl(Bridge):
-    """See the head of this module.
-
-    Attributes:
-        frames: that were flown. repeated: that came again. restarts: of ArduPilot.
-    """
+    """See the head of this module; ``frames`` were flown, ``repeated`` came again, ``restarts`` of ArduPilot."""
 
     unknown = (*Bridge.unknown, "armed")
 

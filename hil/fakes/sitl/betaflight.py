@@ -38,11 +38,8 @@ class MotorPlant(WirePlant):
 
 
 class BetaflightSitl(Bridge):
-    """See the head of this module.
-
-    Attributes:
-        motors: outputs, 0 to 1, mean of the last period, shape (4,), in our order. answered: periods in which the firmware put out motors.
-    """
+    """See the head of this module; ``motors``: outputs, 0 to 1, mean of the last period, shape (4,), in our order; ``answered``: periods
+    in which the firmware put out motors."""
 
     def __init__(
         self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams,

@@ -57,10 +57,7 @@ PROMPT = b"\n# "
 
 
 def needed(params: BetaflightParams) -> dict[str, str]:
-    """Settings that a throw needs, by the name that the command line prints them under.
-
-    ``serial``, ``aux`` and ``feature`` lines stand under their first words; see `lines`.
-    """
+    """Return the settings that a throw needs, by the name or the first words that the command line prints them under."""
     rates = params.rates
     out = {
         "serial UART2": "1 115200 57600 0 115200",  # MSP for the bridge, beside the runner's
@@ -95,11 +92,7 @@ def line_of(name: str, value: str) -> str:
 
 
 class Firmware:
-    """One process of the firmware.
-
-    Attributes:
-        folder: that it runs in: settings, blackbox, what it prints (``firmware.txt``).
-    """
+    """One process of the firmware, in a ``folder`` of settings, blackbox and what it prints (``firmware.txt``)."""
 
     def __init__(self, program: str | Path, folder: str | Path) -> None:
         """Name program and folder; nothing runs yet. Raises `RunError`: there is no such program."""
@@ -112,11 +105,7 @@ class Firmware:
 
     def start(self) -> None:
         """Start it, its clock by the stamps of its samples, and wait until it is ready for them: one that came before its sensors are
-        begun would stop it for ever.
-
-        Raises:
-            RunError: it ends, does not listen in time, or another one is already there; no compiler for ``lockstep.c``.
-        """
+        begun would stop it for ever. Raises `RunError` where it ends, does not listen in time, or another one is there."""
         end = time.monotonic() + FREED
         while "failed" in (words := self._started()):  # a connection of the last one may still be in TIME_WAIT
             self.stop()
@@ -174,14 +163,7 @@ class Firmware:
         self._process = None
 
     def set_up(self, settings: dict[str, str]) -> dict[str, str]:
-        """Write settings, start anew, and read them back; it is not running afterwards.
-
-        Returns:
-            What was read back.
-
-        Raises:
-            RunError: a setting that the firmware refuses or does not keep.
-        """
+        """Write settings, start anew, and return them as read back, then end; raises `RunError` for one that is not kept."""
         try:
             kept = self._written(settings)
         finally:
@@ -205,11 +187,7 @@ class Firmware:
 
 
 def compiled(folder: Path) -> Path:
-    """The library of ``lockstep.c``, compiled into a folder where it is not there yet.
-
-    Raises:
-        RunError: no compiler, or one that refuses it.
-    """
+    """Return the library of ``lockstep.c``, compiled into a folder where it is not there yet; raises `RunError` without a compiler."""
     library = folder.resolve() / "lockstep.so"
     if not library.exists():
         command = [os.environ.get("CC", "gcc"), "-O2", "-shared", "-fPIC", "-o", library, LOCKSTEP, "-lpthread"]

@@ -59,18 +59,14 @@ class Sensors:
         self._last: tuple[Sequence[float], ...] = ((0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), (0.0, 0.0, 0.0, 1.0))
 
     def send(self, rates_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float) -> np.ndarray:
-        """Send samples, let the firmware run for a period [s] with each, and wait until it has.
+        """Send samples, let the firmware run for a period [s] with each, and wait until it has; raises `RunError` where it does not run.
 
         Args:
             rates_b: [rad/s], shape (N, 3), body frame; N at most 16.
             force_b: specific force [m/s^2], shape (3,), body frame. quat_wb: attitude xyzw.
-            period: between two samples [s].
 
         Returns:
             Motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the firmware is not ready.
-
-        Raises:
-            RunError: it does not run.
         """
         force, quat, packets = force_b.tolist(), quat_wb.tolist(), []
         for rate in rates_b.tolist():

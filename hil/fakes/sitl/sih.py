@@ -101,11 +101,7 @@ class HangingBall:
 
 
 class Px4Sih(Bridge):
-    """See the head of this module.
-
-    Attributes:
-        heard_of: positions that came. last_output: of the mechanism [us].
-    """
+    """See the head of this module; ``heard_of``: positions that came, ``last_output``: of the mechanism [us]."""
 
     plant: HangingBall
 

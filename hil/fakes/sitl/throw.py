@@ -101,19 +101,13 @@ def opened(
 def throw(
     program: str | Path, folder: Path, params: HilParams, policy: Policy, plant: MotorPlant, mocap: MocapParams, seed: int
 ) -> dict[str, Any]:  # fmt: skip
-    """Fly one throw.
+    """Fly one throw; returns the bridge's report, with the runner's summary under ``run``; raises `RunError` of the firmware.
 
     Args:
         program: of the firmware. folder: of the throw, made anew: the run's record (``run``) and the firmware's blackbox; its
             settings lie beside it.
         params: of the run. policy: on the CPU. plant: what flies behind the firmware.
         mocap: its faults. seed: of noise and loss.
-
-    Returns:
-        The bridge's report, with the runner's summary under ``run``.
-
-    Raises:
-        RunError: the firmware does not run.
     """
     with opened(program, folder, params, policy, plant, mocap, seed) as (runner, source, clock, fake):
         # Ticks and motion capture know nothing of each other: the seed says how old the newest pose is at a tick.

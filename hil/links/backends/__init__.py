@@ -29,16 +29,12 @@ def mechanism_lag(params: Any) -> float:
 def make_backend(
     params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None, folder: Path | None = None
 ) -> Backend | Held:
-    """Return the back-end of a run.
+    """Return the back-end of a run; raises `LinkError` or `RunError` where there is no link or port for it.
 
     Args:
         params: `hil.params.HilParams`. link: MAVLink link of the run; None where poses are recorded ones.
         write: whether wrong parameters of the autopilot are written. tell: is handed the audit's table.
         folder: of the run, where MSP is written down as the link's messages are in its .tlog.
-
-    Raises:
-        LinkError: the port of the flight controller cannot be opened.
-        RunError: a MAVLink back-end without a link.
     """
     name, vehicle = params.backend, getattr(params, params.backend.replace("-", "_"), None)
     backend: Backend

@@ -50,12 +50,9 @@ class Audit:
         self, rules: Iterable[Rule] = (), ask: Callable[[str], None] = lambda name: None,
         write: Callable[[str, float], None] | None = None, tell: Callable[[str], None] | None = None,
     ) -> None:  # fmt: skip
-        """Begin with nothing asked.
+        """Begin with nothing asked; without rules the audit is done.
 
-        Args:
-            rules: of the back-end; without any the audit is done.
-            ask: sends a question for a parameter. write: sends a new value; None: nothing is ever written.
-            tell: is handed the table, once.
+        ``ask`` sends a question for a parameter, ``write`` a new value (None: nothing is ever written), ``tell`` is handed the table, once.
         """
         self.rules, self._ask, self._write, self._tell = {rule.name: rule for rule in rules}, ask, write, tell
         self.found: dict[str, float] = {}

@@ -61,10 +61,8 @@ class MocapParams:
 
 
 class MocapSource(Source):
-    """Poses that a thread hands over; serves the autopilot's link as well where there is one.
-
-    ``failure`` is what ended the thread, or None; the bodies go stale then, which the runner acts on.
-    """
+    """Poses that a thread hands over, with the autopilot's link served where there is one. ``failure`` is what ended the thread, or None;
+    the bodies go stale then, which the runner acts on."""
 
     def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
         """Take the clock that arrivals are told by, and the link to serve."""
@@ -88,11 +86,8 @@ class MotionCaptureSource(MocapSource):
         self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None,
         module: Any = None,
     ) -> None:  # fmt: skip
-        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``module`` has the package's ``connect`` where it is not the package.
-
-        Raises:
-            SourceError: the package is missing, no body is named, or the system does not answer.
-        """
+        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``module`` stands for the package. Raises `SourceError` where that is
+        missing, no body is named, or the system does not answer."""
         super().__init__(clock, link)
         self._names = body_names(bodies)
         if module is None:
@@ -128,10 +123,8 @@ class MotionCaptureSource(MocapSource):
 
 
 class NatNetSource(MocapSource):
-    """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's.
-
-    ``untracked`` counts poses that Motive itself calls not tracked, which it sends on with the last position; they are dropped.
-    """
+    """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's. ``untracked`` counts poses that Motive
+    itself calls not tracked, which it sends on with the last position; they are dropped."""
 
     def __init__(
         self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None,

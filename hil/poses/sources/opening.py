@@ -51,13 +51,9 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
 def open_source(
     params: HilParams, folder: Path, clock: Clock, key: bytes | None = None, tell: Callable[[str], None] | None = None
 ) -> tuple[Any, Link | None, bool]:  # fmt: skip
-    """Open a source; ``key`` signs the links' messages, ``tell`` is handed who is refused and never waits.
+    """Open a source: it, the autopilot's link where there is one, and whether its poses are recorded; raises `SourceError`, `LinkError`.
 
-    Returns:
-        Source of poses, the autopilot's link where there is one, and whether the poses are recorded ones.
-
-    Raises:
-        SourceError, LinkError: it cannot be opened; the message says what was expected.
+    ``key`` signs the links' messages, ``tell`` is handed who is refused and never waits.
     """
     source = params.source
     if source.kind not in LIVE:

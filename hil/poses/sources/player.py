@@ -113,11 +113,8 @@ def _as_source() -> Iterator[None]:
 
 @_as_source()
 def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
-    """Return poses of a table, or of any file that ``visthrow.logs`` reads; arrivals are the stamps, counted from the first.
-
-    Raises:
-        SourceError: the file cannot be read, lacks a column, or holds no position of any body.
-    """
+    """Return poses of a table, or of any file that ``visthrow.logs`` reads, arrivals as the stamps, counted from the first; raises
+    `SourceError` where it cannot be read, lacks a column, or holds no position."""
     logs = read(path, mapping)
     if len(logs) > 1:
         raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
@@ -163,11 +160,8 @@ def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
 
 @_as_source()
 def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
-    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first one.
-
-    Raises:
-        SourceError: no body, no such file, a package is missing, or a message carries no pose or is not in the log.
-    """
+    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first; raises `SourceError` for no such file,
+    a missing package, or a message that carries no pose or is not in the log."""
     known, reader = {"bin": (DATAFLASH, messages.read_dataflash), "ulg": (ULOG, messages.read_ulog)}[kind]
     if not bodies:
         raise SourceError(f"source.logs is empty; expected a body and one of the messages {', '.join(known)}")

@@ -60,11 +60,7 @@ def message_types() -> dict[str, Any]:
 
 
 def domain(params: MocapParams) -> Any:
-    """Return what joins the ROS domain of ``settings.domain``, 0 where it is left out.
-
-    Raises:
-        SourceError: the package is missing, the number is none, or the address is not this machine's.
-    """
+    """Return what joins the ROS domain of ``settings.domain``, 0 where left out; raises `SourceError` for a wrong number or address."""
     dds = load_extra("cyclonedds.domain", "ros2", "ROS 2 topics", SourceError)
     number = params.settings.get("domain", "0")
     if not number.isdecimal() or not int(number) <= 232:
