@@ -20,11 +20,7 @@ class PolicyError(VisthrowError):
 
 
 class MismatchError(PolicyError):
-    """A policy was trained under other conditions than those it is to be used in.
-
-    Attributes:
-        keys: of its contract that differ, dotted.
-    """
+    """A policy was trained under other conditions than those it is to be used in: dotted ``keys`` of its contract differ."""
 
     def __init__(self, message: str, keys: tuple[str, ...] = ()) -> None:
         super().__init__(message)
@@ -64,15 +60,7 @@ MANY = 30
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Say what exists, and which of it is closest to a name that does not.
-
-    Args:
-        name: What the user wrote.
-        known: What exists.
-
-    Returns:
-        ``"did you mean 'mass'? Known: inertia, mass"``, or ``"Nothing is known here"`` for nothing.
-    """
+    """Say what exists, and which of it is closest to a name that does not: ``"did you mean 'mass'? Known: inertia, mass"``."""
     names = sorted(known)
     if not names:
         return "nothing is known here"

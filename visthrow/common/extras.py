@@ -7,13 +7,7 @@ from visthrow.common.errors import VisthrowError
 
 
 def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -> ModuleType:
-    """Import a package of an optional extra.
-
-    Args:
-        module: To import.
-        extra: Of visthrow that installs it.
-        what: Needs it, for the message.
-        error: To raise where it is not installed.
+    """Import a package of an optional extra, which ``what`` needs.
 
     Raises:
         VisthrowError: Of the type ``error``: it is not installed; the message names the extra.

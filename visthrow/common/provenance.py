@@ -69,27 +69,14 @@ def processors() -> dict[str, Any]:
 
 def collect() -> dict[str, Any]:
     """Return all of it, with the time [UTC]."""
-    return {
-        "commit": commit(),
-        "command": command(),
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions(),
-        "processors": processors(),
-    }
+    time = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"commit": commit(), "command": command(), "time": time, "versions": versions(), "processors": processors()}
 
 
 def write_run_folder(folder: str | Path, config_text: str, *, resume: bool = False, **extra: Any) -> dict[str, Any]:
-    """Write the resolved config and the provenance beside the results of a run.
+    """Write the resolved config, TOML, and the provenance with ``extra`` beside the results of a run; returns that.
 
-    Args:
-        folder: Folder of the run; made if it is not there.
-        config_text: The resolved config of the run as TOML, written to ``config.toml``.
-        resume: Whether the folder may hold a run already; its config is left, the provenance goes to the next free
-            ``provenance_<n>.json``.
-        **extra: JSON-able values that join the provenance, for instance ``seed=3``.
-
-    Returns:
-        What was written as provenance.
+    Where a folder holds a run that is resumed, its config is left, and the provenance goes to the next free ``provenance_<n>.json``.
 
     Raises:
         StorageError: If the folder holds a run already and ``resume`` is not set, or cannot be written.
@@ -108,17 +95,11 @@ def write_run_folder(folder: str | Path, config_text: str, *, resume: bool = Fal
 
 
 def check_free(folder: str | Path) -> None:
-    """Refuse a folder that holds a run.
-
-    Raises:
-        StorageError: it does.
-    """
+    """Refuse a folder that holds a run with a StorageError."""
     if (Path(folder) / "config.toml").exists():
         raise StorageError(f"{folder} holds a run already; name another folder, or resume it")
 
 
 def _git(root: Path, *arguments: str) -> str:
-    result = subprocess.run(
-        ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True, timeout=10
-    )
-    return result.stdout.strip()
+    words = ["git", "-C", str(root), *arguments]
+    return subprocess.run(words, capture_output=True, text=True, check=True, timeout=10).stdout.strip()

@@ -56,11 +56,7 @@ def _resampled(groups: list[np.ndarray], rng: np.random.Generator, draws: int) -
 
 
 def _checked(groups: Groups | np.ndarray) -> list[np.ndarray]:
-    """List of runs that have throws.
-
-    Raises:
-        ValueError: nothing to average.
-    """
+    """List of runs that have throws; ValueError where there is nothing to average."""
     listed = [groups] if isinstance(groups, np.ndarray) else list(groups)
     found = [np.asarray(group, dtype=float) for group in listed if len(group)]
     if not found or any(not np.all(np.isfinite(group)) for group in found):
@@ -80,13 +76,7 @@ def _mean(groups: list[np.ndarray]) -> np.ndarray:
 
 
 def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
-    """Mean over runs and throws with its interval.
-
-    Args:
-        groups: throws of each run, shape (N,); one array for one run.
-        seed: of the bootstrap.
-        draws: bootstrap samples.
-    """
+    """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so many bootstrap samples."""
     found = _checked(groups)
     samples = _resampled(found, np.random.default_rng(seed), draws)
     return _interval(float(_mean(found)), samples, len(found))
@@ -143,20 +133,13 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Bias:
-    """Where throws land on average, and how they scatter about that place.
+    """Where throws land on average, and how they scatter about that place."""
 
-    Attributes:
-        along: mean miss along the throw, positive past the target [m]. lateral: to the left of it [m].
-        offset: length of the mean miss [m].
-        scatter: root mean square distance from the mean landing point [m].
-        share: of the mean square miss that the offset makes up [-].
-    """
-
-    along: Interval
-    lateral: Interval
-    offset: float
-    scatter: float
-    share: float
+    along: Interval  # mean miss along the throw, positive past the target [m]
+    lateral: Interval  # to the left of it [m]
+    offset: float  # length of the mean miss [m]
+    scatter: float  # root mean square distance from the mean landing point [m]
+    share: float  # of the mean square miss that the offset makes up [-]
 
     @property
     def direction(self) -> str:
@@ -170,12 +153,9 @@ class Bias:
 
 
 def bias(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Bias:
-    """Split misses into a common offset and scatter: mean square = offset squared + scatter squared.
+    """Split misses of each run, shape (N, 2) [m], along the throw and to the left, into a common offset and scatter.
 
-    Args:
-        groups: misses of each run, shape (N, 2) [m]: along the throw, to the left.
-        seed: of the bootstrap.
-        draws: bootstrap samples.
+    Mean square = offset squared + scatter squared.
     """
     found = _checked(groups)
     samples = _resampled(found, np.random.default_rng(seed), draws)

@@ -14,13 +14,9 @@ from visthrow.common.errors import StorageError
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
-    """Write a file so that, whatever happens, the path holds the old content or the whole new one.
+    """Write bytes, or text as UTF-8, so that, whatever happens, the path holds the old content or the whole new one.
 
-    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in one step.
-
-    Args:
-        path: The file; its folder is made if it is not there.
-        content: Bytes, or text written as UTF-8.
+    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in one step; folders are made.
 
     Raises:
         StorageError: If the disk is full or the place cannot be written; nothing half-written is left.
@@ -35,7 +31,8 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644 & ~_umask())  # mkstemp makes it readable for its owner alone
+        os.umask(mask := os.umask(0))
+        os.chmod(temporary, 0o644 & ~mask)  # mkstemp makes it readable for its owner alone
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
@@ -47,11 +44,7 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make the folder of the results now, so that no work is done for results that could not be written.
-
-    Raises:
-        StorageError: it cannot be made or written.
-    """
+    """Make the folder of the results now, so that no work is done for results that could not be written; StorageError then."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -61,21 +54,12 @@ def writable(folder: Path) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither.
-
-    Raises:
-        StorageError: As ``atomic_write``.
-    """
+    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither."""
     atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
 
 
 def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays as a compressed ``.npz``, atomically and without pickle.
-
-    Raises:
-        ValueError: If an array holds Python objects.
-        StorageError: As ``atomic_write``.
-    """
+    """Write named arrays as a compressed ``.npz``, atomically and without pickle; ValueError if one holds Python objects."""
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"array '{name}' holds Python objects; expected numbers, bools or text")
@@ -87,20 +71,13 @@ def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.ndarray]:
     """Read all arrays of an ``.npz`` without pickle.
 
-    Args:
-        path: The file.
-        error: Exception class for whatever is wrong with the file.
-        what: What the file should be, for messages.
-
     Raises:
-        Exception: Of class ``error``: no such file, cut short, damaged, or not such a file at all.
+        Exception: Of class ``error``: no such file, cut short, damaged, or not what it should be.
     """
     path = Path(path)
     if not path.is_file():
         near = sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}")) if path.parent.is_dir() else []
-        raise error(
-            f"{path}: no such file; expected {what}. In that folder: {', '.join(near) or 'nothing of the kind'}"
-        )
+        raise error(f"{path}: no such file; expected {what}. In that folder: {', '.join(near) or 'nothing of the kind'}")
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -117,11 +94,7 @@ def json_array(value: Any) -> np.ndarray:
 
 
 def from_json_array(array: np.ndarray) -> Any:
-    """Undo ``json_array``.
-
-    Raises:
-        ValueError: If the array holds no JSON.
-    """
+    """Undo ``json_array``; ValueError if the array holds no JSON."""
     return json.loads(np.asarray(array, dtype=np.uint8).tobytes().decode("utf-8"))
 
 
@@ -133,9 +106,3 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         return _without_nan(value.tolist())
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

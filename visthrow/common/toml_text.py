@@ -9,13 +9,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def dumps(tree: dict[str, Any]) -> str:
-    """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values.
-
-    Args:
-        tree: Strings, bools, ints, finite floats, lists or tuples of them, and dictionaries with string keys.
-
-    Returns:
-        The text, plain keys first, each table under its own header.
+    """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values: plain keys first, then tables.
 
     Raises:
         ValueError: If a value has no TOML form (NaN, infinity, None, other types).

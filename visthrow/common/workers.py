@@ -33,12 +33,11 @@ class Workers:
     """
 
     def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = "") -> None:
-        """Start.
+        """Start at most so many processes.
 
         Args:
-            function: of a task, importable by its name; it may call :func:`progress`.
-            tasks: what it is called with. processes: at most; there are no more than tasks.
-            label: of a line of progress on the terminal; empty for none.
+            function, tasks: importable by its name; it may call :func:`progress`; what it is called with.
+            processes, label: of a line of progress on the terminal; empty for none.
         """
         tasks, context = list(tasks), mp.get_context("spawn")
         self.label, self._running, self._taken = label, {}, context.Value("i", 0)

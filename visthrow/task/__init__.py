@@ -242,11 +242,10 @@ class DiagnosedParams(Bounded):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.covariance) != len(self.effects) or any(len(row) != len(self.effects) for row in self.covariance):
-            raise ConfigError(
-                f"diagnosed.covariance has rows of {[len(row) for row in self.covariance]} for {len(self.effects)} effects; "
-                "expected one row and one column for each"
-            )
+        rows = [len(row) for row in self.covariance]
+        if rows != [len(self.effects)] * len(self.effects):
+            given = f"diagnosed.covariance has rows of {rows} for {len(self.effects)} effects"
+            raise ConfigError(f"{given}; expected one row and one column for each")
 
 
 @dataclass(frozen=True)
@@ -283,15 +282,12 @@ class Experiment:
 
     @property
     def _chosen(self) -> PPOParams | FirstOrderParams | DistillationParams:
-        chosen: PPOParams | FirstOrderParams | DistillationParams = getattr(self, self.algorithm)
-        return chosen
+        return {"ppo": self.ppo, "first_order": self.first_order, "distillation": self.distillation}[self.algorithm]
 
     def __post_init__(self) -> None:
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
-            raise ConfigError(
-                f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m; "
-                "expected the same ball"
-            )
+            given = f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m"
+            raise ConfigError(f"{given}; expected the same ball")
 
 
 def plant_of(experiment: Experiment) -> PlantParams:
@@ -330,10 +326,7 @@ def contract_of(experiment: Experiment) -> dict[str, Any]:
 def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or nothing is uncertain.
 
-    A draw that an effect's physical bounds forbid is put on the bound.
-
-    Raises:
-        ConfigError: An effect that the catalogue does not hold, or a covariance that is none.
+    A draw that an effect's physical bounds forbid is put on the bound. ConfigError for a covariance that is none.
     """
     diagnosed, plant = experiment.diagnosed, plant_of(experiment)
     if diagnosed.plants == 1 or not diagnosed.effects:

@@ -12,16 +12,15 @@ of the release, and the unit of time [s], by which links and sensors are older o
 knows on board: an upper bound, and what the critic is given.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 
 from sim.fleet import draw
 from sim.params import GRAVITY, PlantParams
 from sim.units import FORCE, LENGTH, NONE, PLANT, RATE, TIME, Dimension, Units, in_units
+from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
@@ -60,13 +59,9 @@ HIDDEN = (
 
 @dataclass(frozen=True)
 class Member:
-    """A vehicle of a fleet with its rope and release.
+    """A vehicle of a fleet with its rope and release."""
 
-    Attributes:
-        plant: stated in ``units``. units: of length and mass.
-    """
-
-    plant: PlantParams
+    plant: PlantParams  # stated in these units
     units: Units
 
     @property
@@ -155,17 +150,11 @@ def specialised(policy: Policy, experiment: Experiment, number: int = 0) -> tupl
     first = policy.weights[0]
     bias = policy.biases[0] + first[:, known:] @ ((told - policy.mean[known:]) / spread[known:])
     contract = contract_of(one)
-    made_by = {**policy.made_by, "config": _plain(one)}
+    made_by = {**policy.made_by, "config": config.to_dict(one, defaults=False)}
     return Policy(
         (first[:, :known], *policy.weights[1:]), (bias, *policy.biases[1:]), policy.activation, contract, made_by,
         policy.mean[:known] * sizes, spread[:known] * sizes,
     ), one  # fmt: skip
-
-
-def _plain(experiment: Experiment) -> dict[str, Any]:
-    from visthrow import config
-
-    return config.to_dict(experiment, defaults=False)
 
 
 def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
@@ -177,15 +166,3 @@ def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
     places = ([length] * 2 + [1.0] * 4)[: layout.located]
     motion, step = [speed] * layout.motion, [speed] * 3 + [rate] * 3 + [1.0] * 4
     return torch.tensor(vehicle + [1.0] * 5 + offsets + [1.0] * (1 + layout.validity) + places + motion + step * layout.response)
-
-
-def check_dimensions(schema: type) -> list[str]:
-    """Names of fields of a dataclass and of the tables in it whose dimension nobody told."""
-    names = {name for group in TASK.get(schema.__name__, {}).values() for name in group.split()}
-    missing = []
-    for f in dataclasses.fields(schema):
-        if dataclasses.is_dataclass(f.type):
-            missing += check_dimensions(f.type)  # type: ignore[arg-type]
-        elif f.name not in names and f.name != "laws":
-            missing.append(f"{schema.__name__}.{f.name}")
-    return missing

@@ -18,24 +18,16 @@ LANDED = 0.95
 
 @dataclass(frozen=True)
 class Throws:
-    """Results of N throws at one target; entries of failed throws are NaN.
+    """Results of N throws at one target; entries of failed throws are NaN."""
 
-    Attributes:
-        target: [m] along x.
-        success: shape (N,), bool.
-        landing_w: [m], shape (N, 2). error: [m], shape (N,). duration: [s], shape (N,). clearance: [m], shape (N,).
-        smoothness: root mean square change of the normalised commands from step to step, shape (N,).
-        goal_w: where a moving goal is at impact [m], shape (N, 2); None where goals stand still.
-    """
-
-    target: float
-    success: np.ndarray
-    landing_w: np.ndarray
-    error: np.ndarray
-    duration: np.ndarray
-    clearance: np.ndarray
-    smoothness: np.ndarray
-    goal_w: np.ndarray | None = None
+    target: float  # [m] along x
+    success: np.ndarray  # shape (N,), bool
+    landing_w: np.ndarray  # [m], shape (N, 2)
+    error: np.ndarray  # [m], shape (N,)
+    duration: np.ndarray  # [s], shape (N,)
+    clearance: np.ndarray  # [m], shape (N,)
+    smoothness: np.ndarray  # root mean square change of the normalised commands from step to step, shape (N,)
+    goal_w: np.ndarray | None = None  # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
 
     def within(self, error: float) -> bool:
         """Whether they land so near on average [m], and all but one in twenty land."""
@@ -47,17 +39,11 @@ class Throws:
             return {"target": self.target, "throws": len(self.success), "success": 0.0}
         good = self.success
         goal = np.array([[self.target, 0.0]]) if self.goal_w is None else self.goal_w[good]
-        bias = (self.landing_w[good] - goal).mean(axis=0)
+        bias, error, duration = (self.landing_w[good] - goal).mean(axis=0), self.error[good], self.duration[good]
         return {
-            "target": self.target,
-            "throws": len(good),
-            "success": float(good.mean()),
-            "error_mean": float(self.error[good].mean()),
-            "error_std": float(self.error[good].std()),
-            "duration_mean": float(self.duration[good].mean()),
-            "duration_std": float(self.duration[good].std()),
-            "bias_x": float(bias[0]),
-            "bias_y": float(bias[1]),
-            "clearance_min": float(self.clearance[good].min()),
-            "smoothness": float(self.smoothness[good].mean()),
-        }
+            "target": self.target, "throws": len(good), "success": float(good.mean()),
+            "error_mean": float(error.mean()), "error_std": float(error.std()),
+            "duration_mean": float(duration.mean()), "duration_std": float(duration.std()),
+            "bias_x": float(bias[0]), "bias_y": float(bias[1]),
+            "clearance_min": float(self.clearance[good].min()), "smoothness": float(self.smoothness[good].mean()),
+        }  # fmt: skip

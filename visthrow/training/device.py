@@ -8,13 +8,7 @@ from visthrow.common.errors import DeviceError
 
 
 def resolve(name: str = "auto") -> str:
-    """Turn what the user wrote into a device that is there.
-
-    Args:
-        name: ``auto`` (a CUDA device if there is one, else the CPU), ``cpu``, ``cuda`` or ``cuda:<i>``.
-
-    Returns:
-        ``cpu`` or ``cuda:<i>``, as torch and Warp both understand it.
+    """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu`` or ``cuda:<i>``.
 
     Raises:
         DeviceError: If there is no such device.

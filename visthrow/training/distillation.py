@@ -6,7 +6,6 @@ regression to the exact observation on the states that it meets (DAgger: Ross et
 through the whole throw. Throws that the exact observation flies would teach it to read the truth out of the action before.
 """
 
-import math
 from types import SimpleNamespace
 
 import torch
@@ -22,7 +21,7 @@ from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training.env import ThrowEnv
-from visthrow.training.ppo.network import averaged, normalizer_state
+from visthrow.training.ppo.network import averaged, cosine_rate, normalizer_state
 from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
@@ -39,12 +38,9 @@ class Network(nn.Module):
     """The estimator as it is trained; see :class:`visthrow.onboard.estimator.Estimator` for its parts and shapes."""
 
     def __init__(self, kept: Tensor, learnt: Tensor, width: int, hidden: int, memory: int):
-        """Begin with an estimate of what is kept.
+        """Begin with an estimate of what is kept: the entry of the observation that each estimate corrects, ``width`` for none, shape (S,).
 
-        Args:
-            kept: entry of the observation that each estimate corrects, ``width`` for none, shape (S,).
-            learnt: which estimates are learnt, bool, shape (S,); the others are what is kept.
-            width: D. hidden: N. memory: H.
+        ``learnt``: which estimates are learnt, bool, shape (S,). width: D. hidden: N. memory: H.
         """
         super().__init__()
         self.encoder, self.gru, self.output = nn.Linear(width, hidden), nn.GRU(hidden, memory), nn.Linear(memory, len(kept))
@@ -97,7 +93,7 @@ class Distillation:
         self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(device)
         ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
-        scales = [SCALES[0], SCALES[1], SCALES[2], SCALES[3], 1.0, SCALES[4], SCALES[5], 1.0]
+        scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
         make = {"device": device, "dtype": torch.float32}
         self._scales = torch.cat([torch.full((width,), scale, **make) for width, scale in zip(widths, scales)])
         self._obs, self._truth = torch.zeros(T, E, env.layout.dimension, **make), torch.zeros(T, E, self._layout.dimension, **make)
@@ -134,10 +130,7 @@ class Distillation:
         self.rollout()
 
     def learn(self, done: float) -> dict[str, float]:
-        p = self.p
-        rate = p.final_rate + 0.5 * (p.learning_rate - p.final_rate) * (1.0 + math.cos(math.pi * done))
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+        rate = cosine_rate(self.optimizer, done, self.p.learning_rate, self.p.final_rate)
         if done * self.iterations < WATCHED:
             self.network.normalizer.update(self._obs.flatten(0, 1))
         return self._descend() | self.env.episode_means() | {"learning_rate": rate}
@@ -190,12 +183,9 @@ class Distillation:
         return {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer", "env")}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        self.network.load_state_dict(saved["network"])
-        self.average.load_state_dict(saved["average"])
-        self.optimizer.load_state_dict(saved["optimizer"])
+        for name in ("network", "average", "optimizer", *["env"] * own_throws):
+            getattr(self, name).load_state_dict(saved[name])
         self._refresh()
-        if own_throws:
-            self.env.load_state_dict(saved["env"])
 
 
 def _passed(seen: ob.Layout, wanted: ob.Layout) -> tuple[Tensor, Tensor]:

@@ -55,16 +55,12 @@ class ThrowEnv(VecEnv):
         """Build simulator and buffers and start all episodes.
 
         Args:
-            experiment: plant, camera, task.
-            device: "cpu" or "cuda:0".
+            experiment, device: plant, camera, task; "cpu" or "cuda:0".
             seed: of the simulator's resets; torch's own generator draws the noise and is the caller's to seed.
             count: number of environments; default the experiment's.
         """
-        self.cfg = experiment
-        task = experiment.task
-        self.num_envs = count or experiment.ppo.environments
-        self.num_actions = act.ACTIONS
-        self.device = device
+        self.cfg, self.device, task = experiment, device, experiment.task
+        self.num_envs, self.num_actions = count or experiment.ppo.environments, act.ACTIONS
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
         fleet = members(experiment)
         plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
@@ -164,9 +160,7 @@ class ThrowEnv(VecEnv):
     def begin_throws(self, found: tuple[Tensor, Tensor]) -> TensorDict:
         """Begin throws where the vehicles are, with what a calibration in the hover before found.
 
-        Args:
-            found: the cameras' turns [rad], shape (E, 3), and relative errors of their focal lengths [-], shape (E,), that keypoints are
-                corrected for from here on.
+        Keypoints are corrected from here on for the cameras' turns [rad], shape (E, 3), and errors of focal length [-], shape (E,).
         """
         self._found = found
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
@@ -221,12 +215,7 @@ class ThrowEnv(VecEnv):
     def carry(self, actions: Tensor, mask: wp.array | None = None) -> TensorDict:
         """Apply unclipped actions, shape (E, 5), for one control period with the latch shut, whatever becomes of it: no episode ends.
 
-        Args:
-            actions: of all.
-            mask: plants that move on, shape (E,), int32; default all.
-
-        Returns:
-            Observations.
+        ``mask``: plants that move on, shape (E,), int32; default all.
         """
         self._memory["previous"].copy_(self._apply(actions, True, mask))
         self._observations = self._observe(self._memory["continued"])
@@ -270,24 +259,12 @@ class ThrowEnv(VecEnv):
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step just made."""
-        task, state, out = self.cfg.task, self.views.state, self.views.out
-        period = self.cfg.sim.control_period
-        p = task.reward
-        rot_wb = ob.rotation_from_quat(state["quat_wb"])
-        released = out["separated"] != 0
-        latched = state["release_timer"] >= 0.0
-        time = self.episode_length_buf * period
-        payload = out["payload_pos_w"]
+        task, state, out, period = self.cfg.task, self.views.state, self.views.out, self.cfg.sim.control_period
+        p, time, released, latched = task.reward, self.episode_length_buf * period, out["separated"] != 0, state["release_timer"] >= 0.0
         negative = ~released & terminations.negative(
-            task.bounds,
-            state["pos_w"],
-            rot_wb,
-            payload,
-            state["status"],
-            latched,
-            time,
+            task.bounds, state["pos_w"], ob.rotation_from_quat(state["quat_wb"]), out["payload_pos_w"], state["status"], latched, time,
             self.cfg.release.landing_height,
-        )
+        )  # fmt: skip
         goal = self._goal_at_impact()
         error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
         attached = (
@@ -301,15 +278,9 @@ class ThrowEnv(VecEnv):
             + rewards.proximity(p, out["clearance"], self.cfg.release.clearance_margin)
         )
         reward = torch.where(released, at_release, attached) + rewards.carry_time(p, period) - p.termination * negative
-        self.last = {
-            "released": released,
-            "negative": negative,
-            "landing_error": error,
-            "duration": time - period + out["separation_time"] + out["time_to_impact"],
-            "landing_w": out["landing_w"].clone(),
-            "clearance": out["clearance"].clone(),
-            "action": action,
-        }
+        duration = time - period + out["separation_time"] + out["time_to_impact"]
+        copied = {name: out[name].clone() for name in ("landing_w", "clearance")}
+        self.last = {"released": released, "negative": negative, "landing_error": error, "duration": duration, "action": action} | copied
         if task.target.moves:
             self.last["goal_w"] = goal
         return p.scale * reward, released | negative
@@ -333,13 +304,10 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf.masked_fill_(fresh, 0)
         torch.where(fresh[:, None], self._start_action, memory["previous"], out=memory["previous"])
         spreads = {
-            "frame_bias": noise.observation_bias,
-            "command_bias": noise.command_bias,
-            "keypoint_bias": camera.noise.bias_std,
-            "extrinsic_rotation": camera.mount.rotation_error_std,
-            "extrinsic_offset": camera.mount.position_error_std,
+            "frame_bias": noise.observation_bias, "command_bias": noise.command_bias, "keypoint_bias": camera.noise.bias_std,
+            "extrinsic_rotation": camera.mount.rotation_error_std, "extrinsic_offset": camera.mount.position_error_std,
             "scale_error": camera.noise.scale_std,
-        }
+        }  # fmt: skip
         for name, std in spreads.items():
             if std > 0.0:
                 old = memory[name]
@@ -394,12 +362,11 @@ class ThrowEnv(VecEnv):
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
         self.measured = measured, valid
         time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
-        goal_vel = places = None
+        goal_vel = places = answers = None
         if self.layout.fits:
             fitted = fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
             memory["goal_fit"].copy_(fitted.sums)
             _, goal_vel, places, measured, valid = fitted
-        answers = None
         if self.layout.response:
             memory["answers"].copy_(hist.push(memory["answers"], ob.answer(measured, memory["previous"]), fresh))
             answers = memory["answers"][:, 1:]
@@ -420,26 +387,15 @@ class ThrowEnv(VecEnv):
             true_history = hist.push(memory["true_history"], offset[:, 2:], fresh)
             memory["true_history"].copy_(true_history)
             parts = [vehicle, memory["previous"], offset[:, :2], true_history.flatten(1)]
-        known = {
-            "payload_velocity": self.views.out["payload_vel_w"],
-            "release_timer": state["release_timer"][:, None],
-            "time": time[:, None],
-            "mass": state["mass_scale"][:, None],
-            "voltage": state["voltage"][:, None],
-        }
-        parts += [value for name, value in known.items() if name in named]
-        if "exact" in named:
-            parts.append(state["attached"].to(torch.float32)[:, None])
-        if self.cfg.task.target.moves and "goal_velocity" in named:
-            parts.append(memory["goal_vel"][:, :2])
-        if self._cargo is not None and "cargo" in named:
-            parts.append(self._cargo)
-        if "mount" in named:
-            parts += [memory["extrinsic_rotation"], memory["extrinsic_offset"]]
-        if "pose_age" in named:
-            parts.append(memory["pose_age"][:, None])
-        if "vehicle" in named and self._known is not None:
-            parts.append(self._known)
+        known = (
+            ("payload_velocity", self.views.out["payload_vel_w"]), ("release_timer", state["release_timer"][:, None]),
+            ("time", time[:, None]), ("mass", state["mass_scale"][:, None]), ("voltage", state["voltage"][:, None]),
+            ("exact", state["attached"].to(torch.float32)[:, None]),
+            ("goal_velocity", memory["goal_vel"][:, :2] if self.cfg.task.target.moves else None), ("cargo", self._cargo),
+            ("mount", memory["extrinsic_rotation"]), ("mount", memory["extrinsic_offset"]), ("pose_age", memory["pose_age"][:, None]),
+            ("vehicle", self._known),
+        )  # fmt: skip
+        parts += [value for name, value in known if name in named and value is not None]
         return torch.cat(parts, dim=-1) if len(parts) > 1 else actor
 
     def _late_goal(self) -> Tensor:
@@ -448,9 +404,7 @@ class ThrowEnv(VecEnv):
             return self.views.goal_w
         return self.views.goal_w - self._memory["goal_vel"] * self._memory["pose_age"][:, None]
 
-    def _see(
-        self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _see(self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints as the detector reports them: errors of mount and focal length, latency, noise, drop-out, held images."""
         memory, camera = self._memory, self.cfg.camera
         points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
@@ -476,28 +430,16 @@ class ThrowEnv(VecEnv):
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""
-        found = {f"sim.{k}": v for k, v in self.views.state.items()} | {
-            f"out.{k}": v for k, v in self.views.out.items()
-        }
-        found |= {f"memory.{k}": v for k, v in self._memory.items()} | {
-            f"obs.{k}": v for k, v in self._observations.items()
-        }
-        return found | {
-            "episode": wp.to_torch(self.sim.episode),
-            "goal_w": self.views.goal_w,
-            "length": self.episode_length_buf,
-        }
+        groups = {"sim": self.views.state, "out": self.views.out, "memory": self._memory, "obs": self._observations}
+        found = {f"{group}.{name}": tensor for group, tensors in groups.items() for name, tensor in tensors.items()}
+        return found | {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copy of all that the next step depends on, besides torch's generators."""
         return {k: v.clone() for k, v in self._tensors().items()}
 
     def load_state_dict(self, saved: dict[str, Tensor]) -> None:
-        """Take up a state of :meth:`state_dict` of an environment of the same experiment and size.
-
-        Raises:
-            ValueError: a missing entry or another shape.
-        """
+        """Take up a state of :meth:`state_dict`; ValueError where it is of an environment of another experiment or size."""
         for name, target in self._tensors().items():
             if name not in saved or saved[name].shape != target.shape:
                 have = tuple(saved[name].shape) if name in saved else "nothing"

@@ -34,13 +34,11 @@ class TrainLog:
     """
 
     def __init__(self, path: Path, samples: int, last: int, done: int = 0, minutes: float | None = None):
-        """Open the file.
+        """Open the CSV file.
 
         Args:
-            path: of the CSV file.
-            samples: environment steps an iteration.
-            last: iteration that the run ends at.
-            done: iterations that a resumed run has behind it.
+            path, samples: environment steps an iteration.
+            last, done: iteration that the run ends at, and those that a resumed run has behind it.
             minutes: that it may take, where they are limited.
         """
         self.samples, self.last, self.done, self.minutes = samples, last, done, minutes
@@ -67,11 +65,7 @@ class TrainLog:
                 raise
 
     def row(self, figures: dict, throws: Throws | None = None) -> None:
-        """Write one iteration's figures and, where it ended in throws, what came of them.
-
-        Raises:
-            OSError: the disk is full or gone.
-        """
+        """Write one iteration's figures and, where it ended in throws, what came of them; OSError where the disk is full."""
         gone = time.perf_counter() - self._start
         figures = figures | {"wall_s": self._before + gone} | (evaluated(throws) if throws is not None else {})
         self._writer.writerow(figures)
@@ -123,14 +117,13 @@ class Picture:
     def lines(self) -> list[str]:
         """The picture without its head line."""
         left = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
-        points = []
-        if self._last is not None:
-            good, middle = self._last.success, (self._last.target, 0.0)
-            offsets = (self._last.landing_w if self._last.goal_w is None else self._last.landing_w - self._last.goal_w + middle) - middle
-            points = [(-float(y), float(x)) for x, y in offsets[good]]
+        points, last = [], self._last
+        if last is not None:
+            offsets = last.landing_w - ((last.target, 0.0) if last.goal_w is None else last.goal_w)
+            points = [(-float(y), float(x)) for x, y in offsets[last.success]]
         right = terminal.scatter(points, REACH, *SCATTER)
-        heads = ["landing error: . training, o throws at 2.0 m"], [f"landings within {REACH:g} m: {self._said}"]
-        return terminal.side_by_side([*heads[0], *left], [*heads[1], *right])
+        heads = "landing error: . training, o throws at 2.0 m", f"landings within {REACH:g} m: {self._said}"
+        return terminal.side_by_side([heads[0], *left], [heads[1], *right])
 
 
 def evaluated(throws: Throws) -> dict[str, float]:
@@ -147,7 +140,5 @@ def figures_text(figures: dict) -> str:
 def _rows(path: Path, done: int) -> list[dict]:
     """Whole rows of a log up to an iteration."""
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [
-            row for row in csv.DictReader(file) if (row.get("iteration") or "").isdigit() and row[COLUMNS[-1]] is not None
-        ]
-    return [row for row in rows if int(row["iteration"]) <= done]
+        whole = [row for row in csv.DictReader(file) if (row.get("iteration") or "").isdigit() and row[COLUMNS[-1]] is not None]
+    return [row for row in whole if int(row["iteration"]) <= done]

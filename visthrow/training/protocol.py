@@ -26,15 +26,12 @@ def throw(
     experiment: Experiment, policy, target: float, count: int, device: str = "cpu", seed: int = 0,
     build: Callable[..., ThrowEnv] = ThrowEnv, begin: Callable[[ThrowEnv], TensorDict] = ThrowEnv.reset,
 ) -> Throws:  # fmt: skip
-    """Throw ``count`` times in the training simulator, with all its noise.
+    """Throw ``count`` times in the training simulator, with all its noise, as one batch, at a target [m] along x.
 
     Args:
-        experiment: plant, camera, task; its start is replaced by :func:`hover_start`.
-        policy: function of observations (E, D) -> actions (E, 5).
-        target: [m] along x.
-        count: throws, flown as one batch.
-        device: of the simulator and the policy.
-        seed: of starts and noise; torch's generators are put back afterwards.
+        experiment: its start is replaced by :func:`hover_start`.
+        policy: function of observations (E, D) -> actions (E, 5), on the device.
+        target, count, device, seed: of starts and noise; torch's generators are put back afterwards.
         build: makes the environment, as the class does.
         begin: brings it to where the throws begin and returns what is observed there.
     """
@@ -47,12 +44,10 @@ def throw(
 
 
 def _fly(env: ThrowEnv, policy, target: float, count: int, begin: Callable[[ThrowEnv], TensorDict]) -> Throws:
-    observations = begin(env)
+    observations, previous = begin(env), env.previous_action.clone()
     open_ = torch.ones(count, dtype=torch.bool, device=env.device)
     kept: dict[str, torch.Tensor] = {}
-    previous = env.previous_action.clone()
-    change = torch.zeros(count, device=env.device)
-    steps = torch.zeros(count, device=env.device)
+    change, steps = torch.zeros(2, count, device=env.device)
     for _ in range(env.max_episode_length + 1):
         observations, _, done, _ = env.step(policy(observations["actor"]))
         action = env.last["action"][:, :4]
@@ -61,10 +56,8 @@ def _fly(env: ThrowEnv, policy, target: float, count: int, begin: Callable[[Thro
         previous = env.last["action"]
         ended = open_ & (done > 0)
         for name, value in env.last.items():
-            if name not in kept:
-                kept[name] = torch.zeros_like(value)
             mask = ended.view(-1, *(1,) * (value.dim() - 1))
-            kept[name] = torch.where(mask, value, kept[name])
+            kept[name] = torch.where(mask, value, kept.get(name, torch.zeros_like(value)))
         open_ &= ~ended
         if not bool(open_.any()):  # most throws take a fifth of the time limit
             break
@@ -72,13 +65,6 @@ def _fly(env: ThrowEnv, policy, target: float, count: int, begin: Callable[[Thro
     blank = np.where(success, 1.0, np.nan)
     array = {k: v.cpu().numpy().astype(np.float64) for k, v in kept.items()}
     smoothness = (change / steps.clamp(min=1)).sqrt().cpu().numpy().astype(np.float64)
-    return Throws(
-        target,
-        success,
-        array["landing_w"][:, :2] * blank[:, None],
-        array["landing_error"] * blank,
-        array["duration"] * blank,
-        array["clearance"] * blank,
-        smoothness * blank,
-        array["goal_w"][:, :2] * blank[:, None] if "goal_w" in array else None,
-    )
+    landing_w, goal_w = (array[name][:, :2] * blank[:, None] if name in array else None for name in ("landing_w", "goal_w"))
+    measured = (array[name] * blank for name in ("landing_error", "duration", "clearance"))
+    return Throws(target, success, landing_w, *measured, smoothness * blank, goal_w)

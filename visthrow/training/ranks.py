@@ -16,18 +16,12 @@ BUCKET_MB = 64.0
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among those of its training; the default is a training in one process.
+    """This process among those of its training; the default is a training in one process."""
 
-    Attributes:
-        rank: of this process, from 0. local: of this process on its machine.
-        world: number of processes.
-        device: "cpu" or "cuda:0".
-    """
-
-    device: str = "cpu"
-    rank: int = 0
-    local: int = 0
-    world: int = 1
+    device: str = "cpu"  # or "cuda:0"
+    rank: int = 0  # of this process
+    local: int = 0  # of this process on its machine
+    world: int = 1  # number of processes
 
     @classmethod
     def join(cls, on_gpu: bool) -> "Ranks":

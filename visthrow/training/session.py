@@ -5,6 +5,7 @@ It stops at its last iteration, at an error that was asked for, by the clock, or
 """
 
 import contextlib
+import json
 import os
 import signal
 import sys
@@ -15,7 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from visthrow import config
+from visthrow.common import provenance
 from visthrow.common.arguments import EXIT_INTERRUPTED
+from visthrow.common.errors import CheckpointError, StorageError, TrainError
+from visthrow.common.storage import write_json
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.task import Experiment
+from visthrow.task.measurement import TARGETS
+from visthrow.training import device
+from visthrow.training.progress import TrainLog
+from visthrow.training.ranks import Ranks
+from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, fitted
 
 EVALUATION_TARGET = 2.0  # [m]
 
@@ -48,12 +60,6 @@ Viewer = Callable[[Any], AbstractContextManager[Callable[[Any], None]]]
 
 def run(args: Options, viewer: Viewer | None = None) -> int:
     """Train; returns the exit status of the command."""
-    from visthrow import config
-    from visthrow.common import provenance
-    from visthrow.training import device
-    from visthrow.training.ranks import Ranks
-    from visthrow.training.trainer import CHECKPOINT, Trainer
-
     _check(args)
     experiment, policy, folder, seed = _resumed(args) if args.resume else _begun(args)
     name = device.resolve(args.device)
@@ -83,13 +89,7 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
 
 
 def _check(args: Options) -> None:
-    """Refuse numbers that stop nothing or everything.
-
-    Raises:
-        TrainError: one of them, or words that contradict each other.
-    """
-    from visthrow.common.errors import TrainError
-
+    """Refuse numbers that stop nothing or everything, and words that contradict each other, with a TrainError."""
     for name in ("iterations", "minutes", "until", "evaluate_every", "checkpoint_every"):
         value = getattr(args, name)
         if value is not None and not value > 0:
@@ -103,17 +103,7 @@ def _check(args: Options) -> None:
 
 
 def _begun(args: Options) -> tuple:
-    """Experiment, policy to start from or None, folder and seed of a new run.
-
-    Raises:
-        StorageError: the folder holds a run already.
-    """
-    from visthrow import config
-    from visthrow.common import provenance
-    from visthrow.onboard.policy import Policy, find_policy
-    from visthrow.task import Experiment
-    from visthrow.training.trainer import ADAPTATION, fitted
-
+    """Experiment, policy to start from or None, folder and seed of a new run; StorageError where the folder holds one already."""
     path, seed = config.find("train", args.config), 1 if args.seed is None else args.seed
     folder = Path(args.out or f"runs/{path.stem}-{seed}")
     provenance.check_free(folder)
@@ -124,18 +114,7 @@ def _begun(args: Options) -> tuple:
 
 
 def _resumed(args: Options) -> tuple:
-    """Experiment, None, folder and seed of the run in the folder; what is named besides must agree with it.
-
-    Raises:
-        CheckpointError: no checkpoint there, or a word that contradicts the run's configuration.
-    """
-    import json
-
-    from visthrow import config
-    from visthrow.common.errors import CheckpointError
-    from visthrow.task import Experiment
-    from visthrow.training.trainer import CHECKPOINT
-
+    """Experiment, None, folder and seed of the run in the folder; CheckpointError where there is none, or what is named contradicts it."""
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
     if not (folder / CHECKPOINT).exists():
@@ -157,11 +136,7 @@ def _origin(name: str, policy) -> dict:
 
 
 class StopRequest:
-    """Ctrl-C and SIGTERM taken down while it is entered, so that no iteration is cut in two; a second Ctrl-C interrupts.
-
-    Attributes:
-        asked: whether one came.
-    """
+    """Ctrl-C and SIGTERM taken down, ``asked``, while it is entered, so that no iteration is cut in two; a second Ctrl-C interrupts."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -189,12 +164,7 @@ class Evaluations:
     """When to throw on the way: every so many iterations, or as often as a share of the wall time allows."""
 
     def __init__(self, every: int | None, wanted: bool):
-        """Begin.
-
-        Args:
-            every: iterations between two; None leaves it to the clock.
-            wanted: whether there are any where it is left to the clock.
-        """
+        """Begin; None leaves it to the clock, ``wanted`` says whether there are any then."""
         self._every, self._wanted = every, wanted
         self._after, self._cost = time.perf_counter(), 1.0
 
@@ -216,13 +186,8 @@ class Evaluations:
 def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None) -> str:
     """Train with log, evaluation and checkpoints, the last one at the end; return why it ended.
 
-    Raises:
-        TrainError: A file cannot be written; what the last checkpoint holds is not lost.
+    TrainError where a file cannot be written; what the last checkpoint holds is not lost.
     """
-    from visthrow.common.errors import StorageError, TrainError
-    from visthrow.training.progress import TrainLog
-    from visthrow.training.trainer import CHECKPOINT
-
     start, kept, why, ranks = time.perf_counter(), trainer.iteration, DONE, trainer.ranks
     evaluations = Evaluations(args.evaluate_every, bool(args.until or viewer or sys.stdout.isatty()))
     shown = viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
@@ -255,20 +220,12 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
 
 def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -> None:
     """Throw at all targets, write the policy with what came of it, and print it."""
-    from visthrow.common.storage import write_json
-    from visthrow.task.measurement import TARGETS
-    from visthrow.training.trainer import finish
-
-    rows = [trainer.evaluate(target) for target in TARGETS]
-    figures = {
-        "throws": rows,
-        "wall_s": wall,
-        "iterations": trainer.iteration,
-        "env_steps": trainer.iteration * trainer.algorithm.samples,
-        "seconds": dict(trainer.seconds),
-    }
+    rows = [trainer.throw(target).summary() for target in TARGETS]
+    steps = trainer.iteration * trainer.algorithm.samples
+    spent = {"wall_s": wall, "iterations": trainer.iteration, "env_steps": steps, "seconds": dict(trainer.seconds)}
+    figures = {"throws": rows, **spent}
     finish(trainer, folder, figures, finished)
-    print(f"\n{trainer.iteration} iterations, {figures['env_steps'] / 1e6:.1f} M environment steps, {wall:.1f} s")
+    print(f"\n{trainer.iteration} iterations, {steps / 1e6:.1f} M environment steps, {wall:.1f} s")
     for row in rows:
         if row["success"] > 0:
             print(

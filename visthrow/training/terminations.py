@@ -30,15 +30,12 @@ def out_of_bounds(p: BoundsParams, pos_w: Array) -> dict[str, Array]:
 def while_carrying(
     p: BoundsParams, pos_w: Array, upright: Array, payload_w: Array, time: Array | float, landing_height: float
 ) -> dict[str, Array]:
-    """What ends a throw before the latch has tripped only.
-
-    The payload on the ground is not in the paper, whose bounds leave it open.
+    """What ends a throw before the latch has tripped only; the payload on the ground is not in the paper, whose bounds leave it open.
 
     Args:
-        p: bounds.
+        p, landing_height: bounds; [m].
         pos_w, payload_w: [m], shape (E, 3). upright: vertical component of the body's z axis, shape (E,).
         time: since the start [s], shape (E,) or one for all.
-        landing_height: [m].
     """
     return {
         "the vehicle tilted too far": upright < math.cos(math.radians(p.tilt_deg)),
@@ -55,11 +52,8 @@ def negative(
     """All negative ends of an episode. Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
 
     Args:
-        p: bounds.
-        pos_w, payload_w: [m], shape (E, 3). rot_wb: shape (E, 3, 3).
-        status: bits of :mod:`sim.kernels.state`, shape (E,).
-        latched: shape (E,), bool. time: since the start [s], shape (E,).
-        landing_height: [m].
+        p, pos_w, payload_w, time, landing_height: as of :func:`while_carrying`. rot_wb: shape (E, 3, 3).
+        status: bits of :mod:`sim.kernels.state`, shape (E,). latched: shape (E,), bool.
     """
     always = (*out_of_bounds(p, pos_w).values(), (status & (COLLISION | NONFINITE)) != 0)
     carrying = while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)

@@ -34,26 +34,14 @@ TASK = ("observation", "action", "control_period")
 
 
 class Algorithm(Protocol):
-    """What a trainer drives: one way to a better policy, an iteration at a time.
+    """What a trainer drives: one way to a better policy, an iteration at a time."""
 
-    Attributes:
-        env: environment that it learns in.
-        iterations: of a whole training.
-        samples: environment steps an iteration, over all ranks.
-    """
-
-    env: ThrowEnv
-    iterations: int
-    samples: int
+    env: ThrowEnv  # that it learns in
+    iterations: int  # of a whole training
+    samples: int  # environment steps an iteration, over all ranks
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        """Build environment and networks.
-
-        Args:
-            experiment: the run's configuration.
-            device: "cpu" or "cuda:0".
-            seed: of the environment; torch's own generators are the caller's to seed.
-            ranks: this process among those of the training.
+        """Build environment, of this seed, and networks; torch's own generators are the caller's to seed.
 
         Raises:
             ConfigError: what this algorithm cannot train.
@@ -63,11 +51,9 @@ class Algorithm(Protocol):
         """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for schedules."""
 
     def learn(self, done: float) -> dict[str, float]:
-        """Learn from the last batch.
+        """Learn from the last batch; returns figures for the log, of :data:`visthrow.training.progress.COLUMNS` those that there are.
 
-        Returns:
-            Figures for the log, :data:`visthrow.training.progress.COLUMNS` of those that the algorithm has; always the finished
-            episodes' :meth:`ThrowEnv.episode_means`.
+        Always there are the finished episodes' :meth:`ThrowEnv.episode_means`.
         """
 
     def export(self, contract: dict, made_by: dict) -> Policy:
@@ -101,8 +87,7 @@ def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algor
 def fitted(experiment: Experiment, policy: Policy) -> Experiment:
     """The experiment with the policy's layers as its actor's, for a training that starts from the policy.
 
-    Raises:
-        MismatchError: the experiment's task observes or acts otherwise; the message names every difference.
+    MismatchError where the experiment's task observes or acts otherwise; the message names every difference.
     """
     try:
         policy.require(contract_of(experiment), TASK, allow=("observation.latency",))
@@ -125,14 +110,7 @@ class Trainer:
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks | None = None):
-        """Build the algorithm.
-
-        Args:
-            experiment: the run's configuration.
-            device: "cpu" or "cuda:0".
-            seed: of everything random.
-            ranks: of a training in several processes.
-        """
+        """Build the algorithm; the seed is that of everything random."""
         ranks = ranks or Ranks(device)
         torch.manual_seed(seed * 1000 + ranks.rank)
         if device.startswith("cuda"):
@@ -167,10 +145,6 @@ class Trainer:
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
         return protocol.throw(self.experiment, policy.actor(count), target, count, self.device, seed)
 
-    def evaluate(self, target: float, count: int | None = None, seed: int = 12345) -> dict[str, float]:
-        """Summary of :meth:`throw`."""
-        return self.throw(target, count, seed).summary()
-
     def save(self, path: Path) -> None:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped, all processes' in one; all or nothing."""
         own = {
@@ -199,9 +173,7 @@ class Trainer:
         except Exception as error:
             raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
         if saved["config"] != config.dumps(self.experiment) or saved["seed"] != self.seed:
-            raise CheckpointError(
-                f"{path}: written by a run of another configuration or seed; resume with the same ones"
-            )
+            raise CheckpointError(f"{path}: written by a run of another configuration or seed; resume with the same ones")
         self.iteration = saved["iteration"]
         rank, parts = self.ranks.rank, saved["ranks"]
         known = rank < len(parts)

@@ -19,7 +19,7 @@ from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import Layers, Setting, backward
 from visthrow.training.first_order.surrogate import Course, Flights, course, fit
-from visthrow.training.ppo.network import Network
+from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
 ALTITUDE, GROUND, ABOVE, UPRIGHT = 0.15, 0.1, 0.08, 0.15
@@ -188,9 +188,7 @@ class FirstOrder:
     def learn(self, done: float) -> dict[str, float]:
         p, parameters, T = self.p, list(self.network.mlp.parameters()), self.flights.last
         highest, lowest = (p.adapting_rate, 0.1 * p.adapting_rate) if self._adapting else (p.learning_rate, p.final_rate)
-        rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        rate = cosine_rate(self.optimizer, done, highest, lowest)
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
         most = OUTLIER * size.kthvalue(len(size) // 2 + 1).values  # a few wild flights must not outweigh the rest

@@ -23,44 +23,24 @@ WARM_UP_RATE = 2e-3
 
 def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
     """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
-    network = {
-        "class_name": Network,
-        "activation": p.activation,
-        "obs_normalization": p.normalize,
-        "bfloat16": p.products == "bfloat16",
-    }
+    network = {"class_name": Network, "activation": p.activation, "obs_normalization": p.normalize, "bfloat16": p.products == "bfloat16"}
     spread = {"class_name": CapturableGaussian, "init_std": p.initial_std, "std_type": "log"}
     algorithm = {
-        "class_name": CapturedPPO,
-        "num_learning_epochs": p.epochs,
-        "num_mini_batches": p.minibatches,
-        "learning_rate": p.learning_rate,
-        "schedule": p.schedule,
-        "desired_kl": p.desired_kl,
-        "gamma": p.discount,
-        "lam": p.gae_lambda,
-        "clip_param": p.clip,
-        "entropy_coef": p.entropy,
-        "value_loss_coef": p.value_coefficient,
-        "max_grad_norm": p.max_grad_norm,
+        "class_name": CapturedPPO, "num_learning_epochs": p.epochs, "num_mini_batches": p.minibatches, "learning_rate": p.learning_rate,
+        "schedule": p.schedule, "desired_kl": p.desired_kl, "gamma": p.discount, "lam": p.gae_lambda, "clip_param": p.clip,
+        "entropy_coef": p.entropy, "value_loss_coef": p.value_coefficient, "max_grad_norm": p.max_grad_norm,
         "use_clipped_value_loss": True,
-    }
+    }  # fmt: skip
     return {
-        "num_steps_per_env": p.steps,
+        "num_steps_per_env": p.steps, "algorithm": algorithm, "multi_gpu": ranks.rsl_rl,
         "actor": {**network, "hidden_dims": list(p.hidden), "distribution_cfg": spread},
         "critic": {**network, "hidden_dims": list(p.critic or p.hidden)},
-        "algorithm": algorithm,
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
-        "multi_gpu": ranks.rsl_rl,
-    }
+    }  # fmt: skip
 
 
 class PPOTraining:
-    """PPO on :class:`ThrowEnv`, as the trainer drives it; see :class:`visthrow.training.trainer.Algorithm`.
-
-    Attributes:
-        alg: rsl_rl's algorithm object.
-    """
+    """PPO on :class:`ThrowEnv` by rsl_rl's algorithm object, ``alg``; see :class:`visthrow.training.trainer.Algorithm`."""
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         p = experiment.ppo
@@ -125,7 +105,6 @@ class PPOTraining:
     def export(self, contract: dict, made_by: dict) -> Policy:
         return Policy.from_actor_state(self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by)
 
-    @torch.no_grad()
     def take_up(self, policy: Policy) -> None:
         self.alg.actor.take_up(policy)
 

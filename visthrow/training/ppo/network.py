@@ -1,5 +1,6 @@
 """rsl_rl's network and Gaussian as a CUDA graph can hold them, with products in bfloat16 as a switch."""
 
+import math
 import os
 
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
@@ -83,6 +84,14 @@ class Network(MLPModel):
             for layer in hidden:
                 x = layer(x)
         return last(x.float())
+
+
+def cosine_rate(optimizer: torch.optim.Optimizer, done: float, highest: float, lowest: float) -> float:
+    """Set the learning rate at this share of the training, half a cosine from the highest to the lowest one."""
+    rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
+    for group in optimizer.param_groups:
+        group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+    return rate
 
 
 def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
