@@ -18,7 +18,7 @@ import dataclasses
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, suggest
@@ -44,26 +44,15 @@ def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
         ConfigError: If a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the
             message names file, key path, what came, what was expected and what exists.
     """
-    tree = _read(schema, Path(path), ())
-    for override in overrides:
-        _override(schema, tree, override)
-    built: T = _schema.build(schema, tree)
-    return built
+    return _built(schema, _read(schema, Path(path), ()), overrides)
 
 
 def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str = "(text)") -> T:
-    """Load TOML text, for instance a resolved config stored in a checkpoint; includes are looked up under the root.
+    """Load TOML text, which messages call by a name, as :func:`load` does a file; includes are looked up under the root."""
+    return _built(schema, _parse(schema, text, name, configs_root(), ()), overrides)
 
-    Args:
-        schema: Dataclass that the text must fill.
-        text: TOML.
-        overrides: As for ``load``.
-        name: What messages call the text.
 
-    Raises:
-        ConfigError: As for ``load``.
-    """
-    tree = _parse(schema, text, name, configs_root(), ())
+def _built(schema: type[T], tree: Table, overrides: Iterable[str]) -> T:
     for override in overrides:
         _override(schema, tree, override)
     built: T = _schema.build(schema, tree)
@@ -71,29 +60,18 @@ def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str =
 
 
 def configs_root() -> Path:
-    """Return the folder of shipped configs: inside the installed package, else beside it in a checkout.
-
-    Raises:
-        ConfigError: If neither is there.
-    """
+    """Return the folder of shipped configs: inside the installed package, else beside it in a checkout; ConfigError without either."""
     here = Path(__file__).resolve().parents[1]
     for root in (here / "configs", here.parent / "configs"):
         if root.is_dir():
             return root
-    raise ConfigError(
-        f"no configs folder; expected {here / 'configs'} (installed) or {here.parent / 'configs'} (in a checkout)"
-    )
+    raise ConfigError(f"no configs folder; expected {here / 'configs'} (installed) or {here.parent / 'configs'} (in a checkout)")
 
 
 def find(kind: str, name: str | Path) -> Path:
     """Find a config by name (``find("vehicle", "paper")``) or by an explicit path.
 
-    Args:
-        kind: Folder of ``configs``: vehicle, rope, camera, task, train, ...
-        name: Name without ``.toml``, or the path of a file.
-
-    Returns:
-        The path of an existing file.
+    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ...
 
     Raises:
         ConfigError: If there is none; the message lists what exists.
@@ -109,9 +87,7 @@ def find(kind: str, name: str | Path) -> Path:
     if not (root / kind).is_dir():
         kinds = (folder.name for folder in root.iterdir() if folder.is_dir())
         raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, kinds)}")
-    raise ConfigError(
-        f"no {kind} config '{text}' (neither a shipped name nor a file); {suggest(text, available(kind))}"
-    )
+    raise ConfigError(f"no {kind} config '{text}' (neither a shipped name nor a file); {suggest(text, available(kind))}")
 
 
 def available(kind: str) -> list[str]:
@@ -122,12 +98,7 @@ def available(kind: str) -> list[str]:
 def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
     """Turn a config into nested dictionaries of plain values (tuples become lists), for JSON, TOML or a comparison.
 
-    Args:
-        config: Instance of a dataclass.
-        defaults: Whether fields that hold their default are written too.
-
-    Raises:
-        TypeError: If ``config`` is no dataclass instance.
+    ``defaults``: whether fields that hold their default are written too. TypeError if ``config`` is no dataclass instance.
     """
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         raise TypeError(f"got {config!r}; expected an instance of a dataclass")
@@ -167,14 +138,12 @@ def without_none(value: Any) -> Any:
 
 def _shown(path: Path) -> str:
     """Name a file as the user would: relative to where the command runs, if below it."""
-    resolved = path.resolve()
-    cwd = Path.cwd()
+    resolved, cwd = path.resolve(), Path.cwd()
     return str(resolved.relative_to(cwd)) if resolved.is_relative_to(cwd) else str(path)
 
 
 def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> Table:
-    name = _shown(path)
-    resolved = path.resolve()
+    name, resolved = _shown(path), path.resolve()
     if resolved in stack:
         chain = " -> ".join(_shown(step) for step in (*stack, resolved))
         raise ConfigError(f"{name}: files that include or build on each other in a circle: {chain}")
@@ -213,7 +182,7 @@ def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], p
         here = f"{path}.{key}" if path else key
         if isinstance(node, Table):
             _include(wanted, node, folder, stack, here)
-        elif isinstance(node.value, str) and not (node.value == NONE_WORD and _schema.is_union(annotation)):
+        elif _names_file(node, annotation):
             tree.items[key] = _read(wanted, _lookup(wanted, node.value, folder, node.source, here), stack)
 
 
@@ -252,12 +221,14 @@ def _override(schema: type, tree: Table, override: str) -> None:
             tree = child
     node = _schema.as_node(_toml_value(text.strip()), source)
     tree.items[keys[-1]] = node
-    wanted = dataclass_of(current)
-    if wanted is None:
-        return
-    optional_none = isinstance(node, Leaf) and node.value == NONE_WORD and _schema.is_union(current)
-    if isinstance(node, Leaf) and isinstance(node.value, str) and not optional_none:
+    if (wanted := dataclass_of(current)) is not None and _names_file(node, current):
         tree.items[keys[-1]] = _read(wanted, _lookup(wanted, node.value, Path.cwd(), source, ".".join(keys)), ())
+
+
+def _names_file(node: Leaf | Table, annotation: Any) -> TypeGuard[Leaf]:
+    """Whether a string stands where a table is wanted, which is then the path of a file, unless it is the word for None."""
+    none = isinstance(node, Leaf) and node.value == NONE_WORD and _schema.is_union(annotation)
+    return isinstance(node, Leaf) and isinstance(node.value, str) and not none
 
 
 def _toml_value(text: str) -> Any:

@@ -25,11 +25,7 @@ def _tables() -> tuple[Any, ...]:
 
 @cache
 def catalogue() -> dict[str, Any]:
-    """Return every effect, a ``SettingEffect``, by its name.
-
-    Raises:
-        ConfigError: A file does not fill its schema.
-    """
+    """Return every effect, a ``SettingEffect``, by its name."""
     return {name: effect for table in _tables() for name, effect in table.effects.items()}
 
 
@@ -40,11 +36,7 @@ def random_effects() -> tuple[Any, ...]:
 
 
 def chosen(names: Iterable[str]) -> dict[str, Any]:
-    """Return the effects of these names.
-
-    Raises:
-        ConfigError: The catalogue does not hold one of them.
-    """
+    """Return the effects of these names; ConfigError for one that the catalogue does not hold."""
     known = catalogue()
     for name in names:
         if name not in known:

@@ -26,11 +26,7 @@ SCHEMAS = {
 
 
 def schema_of(kind: str, name: str = "") -> type:
-    """Return the schema of a config; its module is imported only now.
-
-    Raises:
-        ConfigError: If no schema is known for the kind.
-    """
+    """Return the schema of a config, whose module is imported only now; ConfigError for a kind of which none is known."""
     target = SCHEMAS.get(f"{kind}/{name}") or SCHEMAS.get(kind)
     if target is None:
         raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, (key for key in SCHEMAS if '/' not in key))}")

@@ -1,7 +1,7 @@
 """Strict conversion of parsed TOML into frozen dataclasses, with the source of every value at hand for messages."""
 
 import dataclasses
-import math
+import sys
 import types
 import typing
 from dataclasses import dataclass, field
@@ -43,11 +43,9 @@ def dataclass_of(annotation: Any) -> type | None:
     """Return the dataclass that an annotation asks for (``X`` or ``X | None``), or None."""
     if dataclasses.is_dataclass(annotation) and isinstance(annotation, type):
         return annotation
-    if is_union(annotation):
-        found = [dataclass_of(option) for option in typing.get_args(annotation)]
-        found = [option for option in found if option is not None]
-        return found[0] if len(found) == 1 else None
-    return None
+    options = typing.get_args(annotation) if is_union(annotation) else ()
+    found = [option for option in map(dataclass_of, options) if option is not None]
+    return found[0] if len(found) == 1 else None
 
 
 def dict_values(annotation: Any) -> Any:
@@ -91,15 +89,7 @@ def fail(source: str, path: str, problem: str) -> typing.NoReturn:
 
 
 def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
-    """Convert one node of the parsed tree into the type that the schema asks for.
-
-    Args:
-        annotation: Type of the field.
-        node: What the files and overrides say.
-        path: Dotted key path, for messages.
-
-    Returns:
-        A value of that type: dataclass, tuple, dict, number, bool, string or None.
+    """Convert one node of the parsed tree, at a dotted path, into the type that the schema asks for.
 
     Raises:
         ConfigError: If anything is unknown, missing or of another type.
@@ -115,7 +105,7 @@ def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
             _wrong_type(annotation, node, path)
         return {key: build(args[1], item, _join(path, key)) for key, item in _rows(args[1], node, path).items()}
     if isinstance(node, Table):
-        fail(node.source, path, f"got a table with the keys {', '.join(node.items)}; expected {describe(annotation)}")
+        _wrong_type(annotation, node, path)
     if origin is tuple:
         return _build_tuple(annotation, node, path)
     if origin is Literal:
@@ -144,17 +134,12 @@ def _build_union(annotation: Any, node: Leaf | Table, path: str) -> Any:
 def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
     if not isinstance(node, Table):
         _wrong_type(schema, node, path)
-    types_of = hints(schema)
+    types_of, unset = hints(schema), dataclasses.MISSING
     for key, item in node.items.items():
         if key not in types_of:
             fail(item.source, _join(path, key), f"unknown key; {suggest(key, types_of)}")
-    required = [
-        f.name
-        for f in dataclasses.fields(schema)
-        if f.init and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    ]
-    missing = [name for name in required if name not in node.items]
-    if missing:
+    required = [f.name for f in dataclasses.fields(schema) if f.init and f.default is unset and f.default_factory is unset]
+    if missing := [name for name in required if name not in node.items]:
         given = ", ".join(node.items) or "nothing"
         wanted = ", ".join(f"{name} ({describe(types_of[name])})" for name in missing)
         fail(node.source, path, f"missing {wanted}; given: {given}")
@@ -221,13 +206,9 @@ def _build_tuple(annotation: Any, node: Leaf, path: str) -> tuple:
 def _build_scalar(annotation: Any, node: Leaf, path: str) -> Any:
     value = node.value
     if annotation is float and type(value) in (int, float):
-        try:
-            number = float(value)
-        except OverflowError:
-            number = math.inf
-        if not math.isfinite(number):
+        if not abs(value) <= sys.float_info.max:
             fail(node.source, path, f"got {value}; expected a finite number")
-        return number
+        return float(value)
     if annotation in (int, bool, str) and type(value) is annotation:
         return value
     _wrong_type(annotation, node, path)
@@ -244,10 +225,8 @@ def as_table(values: dict[str, Any], source: str) -> Table:
 
 
 def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:
-    if isinstance(node, Table):
-        came = f"a table with the keys {', '.join(node.items) or '(none)'}"
-    else:
-        came = f"{node.value!r} ({type(node.value).__name__})"
+    table = isinstance(node, Table)
+    came = f"a table with the keys {', '.join(node.items) or '(none)'}" if table else f"{node.value!r} ({type(node.value).__name__})"
     fail(node.source, path, f"got {came}; expected {describe(annotation)}")
 
 

@@ -282,7 +282,8 @@ class Experiment:
 
     @property
     def _chosen(self) -> PPOParams | FirstOrderParams | DistillationParams:
-        return {"ppo": self.ppo, "first_order": self.first_order, "distillation": self.distillation}[self.algorithm]
+        chosen: PPOParams | FirstOrderParams | DistillationParams = getattr(self, self.algorithm)
+        return chosen
 
     def __post_init__(self) -> None:
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:

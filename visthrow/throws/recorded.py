@@ -48,7 +48,8 @@ class _Full(Recording):
     def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:
         truth = ("payload_vel_w", "motor_speed", "battery_voltage", "attached")
         super().__init__((*MEASURED, *truth), 1, meta)
-        self.pilots, self.latch = pilots, None
+        self.pilots = pilots
+        self.latch: float | None = None
         for name, unit in MEASURED.items():
             self.recorders[0].declare(f"measured_{name}", unit, "body" if name == "rate_b" else "world")
         self._resting: LooseRope | None = None
@@ -189,7 +190,6 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     result["hovering_again"] = bool(np.linalg.norm(now.vel_w[0]) < 2 * QUIET_SPEED and now.pos_w[0, 2] > 0.5)
     recorder.meta |= {"times": times, "result": result}
     log = recorder.log()
-    if "separation" in times:
-        begins = times["separation"]
+    if (begins := times.get("separation")) is not None:
         log.channels["separation"] = Channel(np.array([begins]), log["payload_pos_w"].at(begins)[None], "m", "world")
     return log
