@@ -82,7 +82,8 @@ class FakeBetaflight(PortFake):
             answer = answers[frame.command]()
         else:
             direction = msp.REFUSAL
-        self._answer(msp.Frame(frame.command, answer, direction))
+        out = msp.pack(msp.Frame(frame.command, answer, direction))
+        self.later(self.options.answer_delay, lambda: self.port.write(out))
 
     def _settings(self, command: int) -> bytes:
         """Return the answer that tells settings."""
@@ -91,9 +92,6 @@ class FakeBetaflight(PortFake):
             if told.command == command:
                 struct.pack_into(told.code, out, told.at, round(self.parameters.get(name, 0) / told.scale))
         return bytes(out)
-
-    def _answer(self, frame: msp.Frame) -> None:
-        self.later(self.options.answer_delay, lambda: self.port.write(msp.pack(frame)))
 
     def _sticks_came(self, channels: list[int]) -> None:
         if len(channels) < STICKS:
@@ -109,24 +107,16 @@ class FakeBetaflight(PortFake):
         self.channels, self._heard = channels, self.plant.time
         self._low_first |= back and not self.armed and channels[STICKS + ARM_AUX - 1] > 1700
         self._first = self.plant.time if self._first is None else self._first
-        self._arm_channel(throttle)
+        if self.options.all_channels:
+            high = channels[STICKS + ARM_AUX - 1] > 1700
+            self._low_first &= high
+            if high and not (self.armed or self._low_first) and idle and self.options.arming:
+                self.armed = self.override = True
+            elif not high:
+                self.armed = self.override = False
         self.set_point((0.0 if idle else self.thrust_map.thrust(share), *rates), self.override)
-        self._release_channel()
-
-    def _arm_channel(self, throttle: int) -> None:
-        if not self.options.all_channels:
-            return
-        high = self.channels[STICKS + ARM_AUX - 1] > 1700
-        self._low_first &= high
-        if high and not (self.armed or self._low_first) and throttle <= MINIMUM and self.options.arming:
-            self.armed = self.override = True
-        elif not high:
-            self.armed = self.override = False
-
-    def _release_channel(self) -> None:
-        """Release on the change to open, while the channels are ours."""
         at = STICKS + RELEASE_AUX - 1
-        opened = self.override and at < len(self.channels) and self.channels[at] > 1700
+        opened = self.override and at < len(channels) and channels[at] > 1700  # while the channels are ours
         if self.output(opened, self.heard) and self.options.answer not in ("silent", "denied"):
             self.witness.answered()
 

@@ -94,11 +94,6 @@ class Ticker:
         self.worst = max(self.worst, behind)
         return now
 
-    def wait(self) -> float:
-        """Wait for the next tick and begin it; returns the time now [s]."""
-        self.clock.sleep_until(self.due())
-        return self.take()
-
 
 class TimeSync:
     """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip; ``steps``: how often a clock was set.

@@ -147,13 +147,7 @@ class Problem:
     """Residuals of a hover, over their spreads; all arguments carry a batch axis B in front, for differences."""
 
     def __init__(self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads) -> None:
-        """Take the measurements.
-
-        Args:
-            hovered: of a hover.
-            camera: nominal, float64.
-            contract: of the policy: masses, rope.
-            spreads: see there.
+        """Take the measurements, the nominal camera, float64, and of the policy's contract masses and rope.
 
         Raises:
             CalibrationError: too few steps, or too few that show the ball.
@@ -225,19 +219,13 @@ class Problem:
         across = falling - along * (falling * along).sum(-1, keepdim=True)
         coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0  # Magnus: of a rate that is linear in a step
         turned = _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
-        return torch.cat(
-            [
-                _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push,
-                across[..., :2] / s.pendulum,
-                (jump(pos) - mean(vel) * dt) / 1e-4,
-                (jump(swing) - mean(swing_rate) * dt) / 2e-4,
-                turned / (s.rate * dt + 1e-4),
-                (pos - self.pos)[:, :-1] / s.pos,
-                (vel - self.vel)[:, :-1] / s.vel,
-                (turn + c["attitude"][:, None])[:, :-1] / self.attitude,
-            ],
-            -1,
-        )
+        off = (
+            _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push, across[..., :2] / s.pendulum,
+            (jump(pos) - mean(vel) * dt) / 1e-4, (jump(swing) - mean(swing_rate) * dt) / 2e-4, turned / (s.rate * dt + 1e-4),
+            (pos - self.pos)[:, :-1] / s.pos, (vel - self.vel)[:, :-1] / s.vel,
+            (turn + c["attitude"][:, None])[:, :-1] / self.attitude,
+        )  # fmt: skip
+        return torch.cat(off, -1)
 
     def places(self, latency: Tensor) -> tuple[Tensor, Tensor]:
         """Steps j that sightings fall behind, and the share of the way to j + 1, each (N,)."""

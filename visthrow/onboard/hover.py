@@ -53,16 +53,7 @@ class HoverController:
     """Position controller with an integral, one for each of E vehicles."""
 
     def __init__(self, params: HoverParams, period: float, count: int = 1) -> None:
-        """Start with empty integrals.
-
-        Args:
-            params: Gains and limits.
-            period: Time between two calls [s].
-            count: Number of vehicles E.
-
-        Raises:
-            ValueError: If the period or count is not positive.
-        """
+        """Start with empty integrals of E vehicles; the period is between two calls [s]. Raises `ValueError`: either is not positive."""
         if not (period > 0.0 and count >= 1):
             raise ValueError(f"period {period} s and count {count}; expected both above 0")
         self.params = params
@@ -74,14 +65,9 @@ class HoverController:
         self._integral_w[slice(None) if mask is None else np.asarray(mask, dtype=bool)] = 0.0
 
     def step(
-        self,
-        pos_w: np.ndarray,
-        quat_wb: np.ndarray,
-        vel_w: np.ndarray,
-        goal_w: np.ndarray,
-        mass: float | np.ndarray,
+        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, goal_w: np.ndarray, mass: float | np.ndarray,
         yaw: float | np.ndarray = 0.0,
-    ) -> np.ndarray:
+    ) -> np.ndarray:  # fmt: skip
         """Return the command that brings the vehicles to their goals.
 
         Args:

@@ -168,18 +168,9 @@ def answer(frame: Tensor, previous_action: Tensor) -> Tensor:
 
 
 def observe(
-    layout: Layout,
-    frame: Tensor,
-    valid: Tensor | None,
-    previous_action: Tensor,
-    attached: Tensor,
-    history: Tensor,
-    fresh: Tensor,
-    goal_vel_w: Tensor | None = None,
-    places: Tensor | None = None,
-    answers: Tensor | None = None,
-    setup: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+    layout: Layout, frame: Tensor, valid: Tensor | None, previous_action: Tensor, attached: Tensor, history: Tensor, fresh: Tensor,
+    goal_vel_w: Tensor | None = None, places: Tensor | None = None, answers: Tensor | None = None, setup: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Assemble the actor's input and move the history on.
 
     Args:

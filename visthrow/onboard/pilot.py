@@ -50,13 +50,9 @@ class PilotOutput:
 def camera_conditions(params: CameraParams) -> dict[str, Any]:
     """Return what a vision policy's contract says of the camera: lens, mount and sizes, without noise."""
     camera = config.to_dict(params)
-    return {
-        "fisheye": camera["fisheye"],
-        "mount": {key: camera["mount"][key] for key in ("position_b", "rpy_deg")},
-        "goal_side": camera["goal_side"],
-        "payload_radius": camera["payload_radius"],
-        "invalid_reads": camera["noise"]["invalid_reads"],
-    }
+    mount = {key: camera["mount"][key] for key in ("position_b", "rpy_deg")}
+    same = {key: camera[key] for key in ("fisheye", "goal_side", "payload_radius")}
+    return {**same, "mount": mount, "invalid_reads": camera["noise"]["invalid_reads"]}
 
 
 def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
@@ -100,13 +96,9 @@ class Pilot:
             self.period = float(contract["control_period"])
             mass = policy.total_mass
         except (KeyError, AttributeError, TypeError) as error:
-            raise PolicyError(
-                f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train"
-            ) from error
+            raise PolicyError(f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train") from error
         if self.layout.dimension != policy.obs_dim:
-            raise PolicyError(
-                f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}"
-            )
+            raise PolicyError(f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}")
         if self.layout.name == "vision":
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
@@ -139,17 +131,9 @@ class Pilot:
 
     @torch.inference_mode()
     def act(
-        self,
-        pos_w: np.ndarray,
-        quat_wb: np.ndarray,
-        vel_w: np.ndarray,
-        rate_b: np.ndarray,
-        payload_w: np.ndarray,
-        goal_w: np.ndarray,
-        attached: np.ndarray | bool = True,
-        keypoints: tuple[np.ndarray, np.ndarray] | None = None,
-        now: float | None = None,
-    ) -> PilotOutput:
+        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray,
+        attached: np.ndarray | bool = True, keypoints: tuple[np.ndarray, np.ndarray] | None = None, now: float | None = None,
+    ) -> PilotOutput:  # fmt: skip
         """Decide one control step.
 
         Args:
@@ -236,9 +220,7 @@ class Pilot:
             at += width
         return torch.from_numpy(self._views)
 
-    def _observed(
-        self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
-    ) -> tuple[Tensor, ...]:
+    def _observed(self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor) -> tuple[Tensor, ...]:
         """Assemble the observation, shape (E, D).
 
         Args:
@@ -270,9 +252,7 @@ class Pilot:
             sums = (new,)
         answers = tuple(push(held, ob.answer(frame, previous), fresh) for held in answers)
         earlier = answers[0][:, 1:] if answers else None
-        observation, history = ob.observe(
-            self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places, earlier
-        )
+        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places, earlier)
         return observation, history, *answers, *sums, *seen
 
     def _decision(self, observation: Tensor, memory: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -283,9 +263,7 @@ class Pilot:
         return action, command, act.release_asked(raw, self._threshold), memory
 
     @torch.inference_mode()
-    def see(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def see(self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity, shape (E, 8).
 
         Raises:
@@ -294,14 +272,8 @@ class Pilot:
         """
         if self.camera is None:
             raise PolicyError("this pilot has no camera")
-        rot = ob.rotation_from_quat(self._tensor("quat_wb", quat_wb, 4))
-        goal = self._tensor("goal_w", np.broadcast_to(np.asarray(goal_w), (self.count, 3)), 3)
-        payload = self._tensor("payload_w", payload_w, 3)
-        points, valid = ob.vision_part(self.camera, self._tensor("pos_w", pos_w, 3), rot, goal, payload)
+        still, goal_w = np.zeros((self.count, 3)), np.asarray(goal_w).reshape(-1, 3)
+        views = self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1)))
+        pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
+        points, valid = ob.vision_part(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()
-
-    def _tensor(self, name: str, value: np.ndarray, width: int) -> Tensor:
-        array = np.array(value, dtype=np.float32)  # a copy: torch warns of read-only memory
-        if array.shape != (self.count, width):
-            raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
-        return torch.from_numpy(array)

@@ -15,7 +15,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,17 +39,9 @@ RSL_RL_EPS = 1e-2
 """What rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part of its state."""
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "elu": F.elu,
-    "selu": F.selu,
-    "relu": F.relu,
-    "lrelu": F.leaky_relu,
-    "tanh": torch.tanh,
-    "sigmoid": torch.sigmoid,
-    "softplus": F.softplus,
-    "gelu": F.gelu,
-    "swish": F.silu,
-    "mish": F.mish,
-}
+    "elu": F.elu, "selu": F.selu, "relu": F.relu, "lrelu": F.leaky_relu, "tanh": torch.tanh, "sigmoid": torch.sigmoid,
+    "softplus": F.softplus, "gelu": F.gelu, "swish": F.silu, "mish": F.mish,
+}  # fmt: skip
 """By rsl_rl's names; its "crelu" is missing, as it stands for another function than the name says."""
 
 
@@ -163,21 +155,9 @@ class Policy:
 
     def to(self, device: str | torch.device) -> "Policy":
         """Return the policy with its tensors on another device."""
-
-        def move(tensor: Tensor | None) -> Tensor | None:
-            return None if tensor is None else tensor.to(device)
-
-        return Policy(
-            tuple(weight.to(device) for weight in self.weights),
-            tuple(bias.to(device) for bias in self.biases),
-            self.activation,
-            self.contract,
-            self.made_by,
-            move(self.mean),
-            move(self.std),
-            self.eps,
-            None if self.estimator is None else self.estimator.to(device),
-        )
+        layers = {name: tuple(tensor.to(device) for tensor in getattr(self, name)) for name in ("weights", "biases")}
+        parts = {name: getattr(self, name) for name in ("mean", "std", "estimator")}
+        return replace(self, **layers, **{name: part.to(device) for name, part in parts.items() if part is not None})
 
     def require(
         self, contract_now: Mapping[str, Any], sections: Collection[str] | None = None, allow: Collection[str] = ()
@@ -197,18 +177,12 @@ class Policy:
             MismatchError: Naming every key that differs without allowance, with both values.
         """
         trained, now = _flat(self.contract, sections), _flat(contract_now, sections)
-        differing = [
-            key
-            for key in sorted(trained.keys() | now.keys())
-            if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))
-        ]
+        known = sorted(trained.keys() | now.keys())
+        differing = [key for key in known if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))]
         allowed = [key for key in differing if any(re.match(rf"{re.escape(name)}(?![^.\[])", key) for name in allow)]
-        refused = [
-            f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}" for key in differing if key not in allowed
-        ]
-        if refused:
-            keys = tuple(key for key in differing if key not in allowed)
-            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(refused), keys)
+        if refused := tuple(key for key in differing if key not in allowed):
+            lines = (f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}" for key in refused)
+            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(lines), refused)
         return {key: now.get(key) for key in allowed}
 
     def save(self, path: str | Path) -> None:
@@ -218,12 +192,8 @@ class Policy:
             PolicyError: If contract or made_by cannot be written as JSON.
             StorageError: If the place cannot be written.
         """
-        header = {
-            "format_version": FORMAT_VERSIONS[self.estimator is not None],
-            "activation": self.activation,
-            "contract": self.contract,
-            "made_by": self.made_by,
-        }
+        header = {"format_version": FORMAT_VERSIONS[self.estimator is not None], "activation": self.activation}
+        header |= {"contract": self.contract, "made_by": self.made_by}
         try:
             arrays = {"header": json_array(header)}
         except (TypeError, ValueError) as error:
@@ -274,12 +244,9 @@ class Policy:
 
     @staticmethod
     def from_actor_state(
-        state: Mapping[str, Tensor],
-        activation: str,
-        contract: dict[str, Any],
-        made_by: dict[str, Any] | None = None,
+        state: Mapping[str, Tensor], activation: str, contract: dict[str, Any], made_by: dict[str, Any] | None = None,
         eps: float = RSL_RL_EPS,
-    ) -> "Policy":
+    ) -> "Policy":  # fmt: skip
         """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
 
         Args:
@@ -317,7 +284,6 @@ class Policy:
         )
 
 
-
 _ABSENT = object()
 
 
@@ -343,9 +309,7 @@ def _check_shapes(policy: Policy) -> None:
         if tensor is not None and not bool(torch.isfinite(tensor).all()):
             raise PolicyError(f"{name} holds numbers that are not finite")
     if policy.std is not None and not bool((policy.std + policy.eps > 0.0).all()):
-        raise PolicyError(
-            f"normalizer std + eps must be above 0; the smallest is {float((policy.std + policy.eps).min())}"
-        )
+        raise PolicyError(f"normalizer std + eps must be above 0; the smallest is {float((policy.std + policy.eps).min())}")
 
 
 def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:

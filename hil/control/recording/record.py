@@ -113,9 +113,9 @@ def read_poses(folder: Path) -> dict[int, list[Pose]]:
     return found
 
 
-def require_run(folder: Path) -> None:
+def require_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> None:
     """Raise `RunError` for what is no folder of a run, with what was expected in it."""
-    if not (folder / CONFIG).is_file() or not (folder / TICKS).is_file():
+    if not all((folder / name).is_file() for name in parts):
         raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it")
 
 

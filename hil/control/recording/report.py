@@ -6,7 +6,6 @@ from typing import Any
 from hil.control.recording.flightlogs import read, throws, whole
 from hil.control.recording.latency import Stages, draw, slowed, table
 from visthrow.common.errors import VisthrowError
-from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.calibration import Calibration
 
 LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
@@ -50,6 +49,8 @@ def throw_path(folder: Path, number: int, ending: str) -> Path:
 
 def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
     """Write latency picture, and a flight log and picture a throw, or one log of all; returns lines that say what was written."""
+    from visthrow.view import strip
+
     folder, said = Path(folder), []
     try:
         if stages is not None:
@@ -62,26 +63,11 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
         for number, log in enumerate(throws(played), start=1):
             path = throw_path(folder, number, ".npz")
             log.save(path)
-            said.append(f"{path}  throw {number}: {outcome(log)}")
+            result = log.meta["result"]
+            how = f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s" if result["success"] else None
+            said.append(f"{path}  throw {number}: {how or 'no landing counted: ' + result['failure']}")
             if "landing" in log:
-                picture(folder, number, log, played.playback.params.camera)
+                strip.draw(throw_path(folder, number, ".png"), log, played.playback.params.camera)
     except VisthrowError as error:
         said.append(f"not all could be written: {error}")
     return said
-
-
-def outcome(log: FlightLog) -> str:
-    """Return how a throw ended, in words."""
-    result = log.meta["result"]
-    if not result["success"]:
-        return f"no landing counted: {result['failure']}"
-    return f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s"
-
-
-def picture(folder: Path, number: int, log: FlightLog, camera: Any) -> Path:
-    """Draw a throw's strip; returns its path."""
-    from visthrow.view import strip
-
-    path = throw_path(folder, number, ".png")
-    strip.draw(path, log, camera)
-    return path

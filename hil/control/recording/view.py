@@ -20,8 +20,7 @@ import numpy as np
 
 from hil.control.recording.flightlogs import Samples, events, meta_of, read
 from hil.control.recording.playback import Playback, Tick
-from hil.control.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of
-from hil.errors import RunError
+from hil.control.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of, require_run
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from visthrow import config
@@ -105,8 +104,7 @@ class Follower:
 
     def __init__(self, folder: Path) -> None:
         """Read config, policy and provenance, which a run writes before it waits for poses; raises `RunError` for no folder of a run."""
-        if not all((folder / name).is_file() for name in (CONFIG, POLICY, PROVENANCE)):
-            raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY} and {PROVENANCE} in it")
+        require_run(folder, (CONFIG, POLICY, PROVENANCE))
         self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
         self.playback = Playback(self.params, Policy.load(folder / POLICY))
         self.provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
@@ -158,29 +156,24 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
 
 
 def write(folder: str | Path, path: str | Path) -> None:
-    """Write a whole run as a ``.rrd`` file; errors as of :func:`read`, and where the place cannot be written."""
-    from visthrow.view import rerun_view
+    """Write a whole run as a ``.rrd`` or ``.mcap`` file; errors as of :func:`read`, and where the place cannot be written, or a package is
+    missing."""
+    from visthrow.view import mcap_view, rerun_view
 
     played = read(folder)
+    if Path(path).suffix == ".mcap":
+        samples = Samples(played.playback, meta_of(played.playback, played.provenance, played.ticks[0].line["time"]))
+        for tick in played.ticks:
+            samples.add(tick)
+        log = samples.flush()
+        log.meta["events"] = events(played.ticks)
+        mcap_view.write(path, log, sizes(played.playback.runner.pilot))
+        return
     layout = rerun_view.blueprint(np.array(played.playback.params.goal_w), {"state"})
     with rerun_view.recording(path, layout) as stream:
         show = Show(stream, played.playback, played.provenance, played.ticks[0].line["time"])
         for first in range(0, len(played.ticks), MOST_SHOWN // 10):
             show.take(played.ticks[first : first + MOST_SHOWN // 10])
-
-
-def write_mcap(folder: str | Path, path: str | Path) -> None:
-    """Write a whole run as an MCAP file; errors as of :func:`write`, and `LogError` where the package mcap is not installed."""
-    from visthrow.view import mcap_view
-
-    played = read(folder)
-    meta = meta_of(played.playback, played.provenance, played.ticks[0].line["time"])
-    samples = Samples(played.playback, meta)
-    for tick in played.ticks:
-        samples.add(tick)
-    log = samples.flush()
-    log.meta["events"] = events(played.ticks)
-    mcap_view.write(path, log, sizes(played.playback.runner.pilot))
 
 
 def start_viewer(folder: Path) -> subprocess.Popen:
@@ -206,8 +199,8 @@ def run(args: argparse.Namespace) -> int:
             while True:
                 time.sleep(1.0)
     path = Path(args.out) if args.out is not None else folder / "run.rrd"
-    foxglove = path.suffix == ".mcap"
-    (write_mcap if foxglove else write)(folder, path)
-    print(f"{path}  the run in 3D, image plane and signals; open it with{' Foxglove' if foxglove else f': rerun {path}'}")
+    write(folder, path)
+    opens = "with Foxglove" if path.suffix == ".mcap" else f"with: rerun {path}"
+    print(f"{path}  the run in 3D, image plane and signals; open it {opens}")
     print("\n".join(finish(folder)))
     return 0

@@ -118,8 +118,10 @@ class Firmware:
 
     def _started(self) -> str:
         """Start the process; its words once it listens, or cannot."""
-        if _listens(PORTS[0]):
-            raise RunError(f"something listens on port {PORTS[0]} already; expected no other firmware beside this one")
+        try:  # nothing is connected, as the firmware serves one peer
+            socket.create_server(("127.0.0.1", PORTS[0])).close()
+        except OSError:
+            raise RunError(f"something listens on port {PORTS[0]} already; expected no other firmware beside this one") from None
         self.stands, said = os.pipe()
         library = compiled(self.folder).name  # by its place in the folder that it runs in: a path may hold no space
         environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(said)}
@@ -250,17 +252,6 @@ class CommandLine:
         """Keep the settings: they are in its file when it says that it restarts. Raises `RunError`: it does not."""
         self._socket.sendall(b"save\n")
         self._heard(b"Rebooting")
-
-
-def _listens(port: int) -> bool:
-    """Whether somebody listens; nothing is connected, as the firmware serves one peer."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return True
-    return False
 
 
 def _end_with_parent() -> None:

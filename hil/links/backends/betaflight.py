@@ -298,11 +298,6 @@ class Told:
     code: str = "B"  # as of `struct`
     scale: float = 1.0
 
-    def read(self, frame: msp.Frame) -> float | None:
-        """Return its value in an answer; None where that is cut short."""
-        number = frame.number(self.code, self.at)
-        return None if number is None else self.scale * number
-
 
 SETTINGS = {
     "api_version": Told(msp.API_VERSION, 1), "deadband": Told(msp.RC_DEADBAND, 0), "yaw_deadband": Told(msp.RC_DEADBAND, 1),
@@ -325,8 +320,8 @@ def blocked(flags: int) -> str:
 
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     """Return settings that an answer tells; what is cut short tells nothing."""
-    read = {name: told.read(frame) for name, told in SETTINGS.items() if told.command == frame.command}
-    found = {name: float(value) for name, value in read.items() if value is not None}
+    mine = {name: told for name, told in SETTINGS.items() if told.command == frame.command}
+    found = {name: float(told.scale * n) for name, told in mine.items() if (n := frame.number(told.code, told.at)) is not None}
     if "api_version" in found:
         minor = frame.number("B", 2)
         found = {} if minor is None else {"api_version": found["api_version"] + 0.01 * minor}
@@ -339,11 +334,8 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
 
 def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
     """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
-    found = [
-        frame.payload[i + 1] + 1
-        for i in range(0, len(frame.payload) - 3, 4)
-        if frame.payload[i] == box and frame.payload[i + 2] < frame.payload[i + 3]
-    ]
+    entries = [frame.payload[i : i + 4] for i in range(0, len(frame.payload) - 3, 4)]
+    found = [channel + 1 for of, channel, first, last in entries if of == box and first < last]
     return float(preferred if preferred in found else found[0] if found else 0)
 
 

@@ -112,14 +112,8 @@ class Px4(MavlinkAutopilot):
         if p.output_parameter:
             function = 430.0 if p.release == "gripper" else 300.0 + p.gripper
             rules.append(equal(p.output_parameter, function, "what drives the output that the mechanism hangs on"))
-            rules += self._ends()
-        return rules
-
-    def _ends(self) -> list[Rule]:
-        """Return the rule that the end of the output at which the mechanism is open is the one that is read back."""
-        p = self.params
         open_end = {-1.0: "MIN", 1.0: "MAX"}.get(-1.0 if p.release == "gripper" else p.actuator_open)
-        if not p.servo_output or open_end is None or "FUNC" not in p.output_parameter:
-            return []
-        name, why = p.output_parameter.replace("FUNC", open_end), "the output with the mechanism open, which is read back [us]"
-        return [Rule(name, f"{p.servo_open_us} (servo_open_us)", why, lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR)]
+        if p.servo_output and open_end is not None and "FUNC" in p.output_parameter:
+            name, why = p.output_parameter.replace("FUNC", open_end), "the output with the mechanism open, which is read back [us]"
+            rules.append(Rule(name, f"{p.servo_open_us} (servo_open_us)", why, lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR))
+        return rules
