@@ -94,7 +94,6 @@ def _listen(args: argparse.Namespace) -> int:
 
 
 def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
-    """Return a body in a line."""
     state, refused = track.state(now), json.dumps(track.gate.refused) if track.gate.refused else "none"
     if state is None:
         return f"{name}: no pose; refused by the gate: {refused}"

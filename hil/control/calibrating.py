@@ -88,7 +88,6 @@ class Solver:
 
 
 def _warm() -> None:
-    """Import what the sums need."""
     import scipy.sparse.linalg
     import torch
 

@@ -44,7 +44,6 @@ class Lander:
     """Another operator, who lands too once the camera is calibrated: for a run that is flown for nothing else."""
 
     def __init__(self, operator: Operator, calibrating: Calibrating) -> None:
-        """Take the operator whose words count, and what is waited for."""
         self._operator, self._calibrating = operator, calibrating
 
     def words(self, state: str) -> OperatorInput:

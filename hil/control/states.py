@@ -161,7 +161,6 @@ class Machine:
         return "; ".join(texts)
 
     def _lasted(self, now: float, holds: bool, time: float) -> bool:
-        """Return whether a condition has now held for a time."""
         if not holds:
             self._held = None
             return False

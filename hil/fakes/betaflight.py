@@ -86,7 +86,6 @@ class FakeBetaflight(PortFake):
         self.later(self.options.answer_delay, lambda: self.port.write(out))
 
     def _settings(self, command: int) -> bytes:
-        """Return the answer that tells settings."""
         out = bytearray(SIZES[command])
         for name, told in SETTINGS.items():
             if told.command == command:

@@ -68,7 +68,6 @@ Spoil = Callable[[list[Pose], "MocapFault"], list[Pose]]
 
 
 def _each(change: Callable[[Pose], dict[str, Any]]) -> Spoil:
-    """Return a fault that changes fields of every pose."""
     return lambda poses, fault: [replace(p, **change(p)) for p in poses]
 
 

@@ -109,32 +109,6 @@ def make_fake(
     return KINDS[kind](plant, link, mocap, seed, options, **more)
 
 
-class Paced:
-    """A fake in real time, a period at a call; ``late`` counts periods that took longer than real time has."""
-
-    def __init__(self, fake: Fake, clock: Clock) -> None:
-        """Start now; where the machine is late the vehicle's clock is as late as the vehicle."""
-        self.fake, self.clock, self.late = fake, clock, 0
-        self._start = clock.now() - fake.plant.time
-        fake.wall, fake.question_lag = self._wall, 0.0
-
-    def _wall(self) -> float:
-        plant = self.fake.plant
-        return plant.time + min(max(self.clock.now() - self._start - plant.time, 0.0), plant.period)
-
-    def step(self) -> None:
-        """Wait until the next period is over, hearing what comes, and fly it."""
-        fake, clock = self.fake, self.clock
-        time = fake.plant.time + fake.plant.period
-        due = self._start + time
-        self.late += clock.now() > due
-        while clock.now() < due:  # what comes meanwhile acts from when it comes
-            clock.wait_for([fake.port], due)
-            fake.hear()
-        fake.deliver(time)  # poses leave before a period is worked out
-        fake.step()
-
-
 @contextlib.contextmanager
 def interruptible() -> Iterator[threading.Event]:
     """Event that the first Ctrl-C sets; the second interrupts.
@@ -160,14 +134,24 @@ def interruptible() -> Iterator[threading.Event]:
 
 def serve(fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING) -> dict[str, Any]:
     """Fly in real time until ``after`` seconds after the landing, for ``most`` seconds, or until Ctrl-C; returns the report."""
-    paced, begun = Paced(fake, clock), fake.plant.time
+    plant, begun, late = fake.plant, fake.plant.time, 0
+    start = clock.now() - begun  # where the machine is late the vehicle's clock is as late as the vehicle
+    fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
+    fake.question_lag = 0.0
     with contextlib.suppress(KeyboardInterrupt), interruptible() as asked, collected():  # a collection of all takes a tenth of a second
-        while fake.plant.time - begun < most and not asked.is_set():
-            paced.step()
-            landed = fake.plant.landing["landing_time"]
-            if landed is not None and fake.plant.time > landed + after:
+        while plant.time - begun < most and not asked.is_set():
+            time = plant.time + plant.period
+            due = start + time
+            late += clock.now() > due
+            while clock.now() < due:  # what comes meanwhile acts from when it comes
+                clock.wait_for([fake.port], due)
+                fake.hear()
+            fake.deliver(time)  # poses leave before a period is worked out
+            fake.step()
+            landed = plant.landing["landing_time"]
+            if landed is not None and plant.time > landed + after:
                 break
-    report = {**fake.report(), "late_periods": paced.late}
+    report = {**fake.report(), "late_periods": late}
     if out is not None:
         out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report

@@ -193,7 +193,6 @@ class LinkSync:
     counts poses whose stamps are not of their sender's TIMESYNC clock."""
 
     def __init__(self, link: Link) -> None:
-        """Listen to a link, and ask from its pump."""
         self._link = link
         self._asked, self._pause, self._random = -1e9, 0.0, random.Random(0)
         self.peers: dict[tuple[int, Address], TimeSync] = {}

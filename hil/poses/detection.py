@@ -51,7 +51,6 @@ class Detection:
 
 
 def _rotation(quat: Quaternion) -> np.ndarray:
-    """Return the rotation from body to world, shape (3, 3)."""
     return rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
 
 

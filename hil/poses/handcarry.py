@@ -96,7 +96,6 @@ def find_steps(poses: Sequence[Pose]) -> list[Step]:
 
 
 def _rests(poses: Sequence[Pose]) -> list[slice]:
-    """Return stretches in which the vehicle rests."""
     if len(poses) < 3:
         return []
     times = np.array([p.arrival for p in poses])

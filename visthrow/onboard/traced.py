@@ -21,7 +21,6 @@ class Traced:
         self._call: Callable[..., Any] | None = None
 
     def __call__(self, *tensors: Any) -> Any:
-        """Call the function."""
         if self._call is None:
             self._call = self._recorded(tensors)
         return self._call(*tensors)

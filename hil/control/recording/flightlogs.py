@@ -94,7 +94,6 @@ class Samples:
     """Fills a recorder with ticks."""
 
     def __init__(self, playback: Playback, meta: dict) -> None:
-        """Begin with nothing; ``meta``: of the log."""
         self.params, self.runner = playback.params, playback.runner
         self.recorder = FlightRecorder(meta)
         self._declare()

@@ -64,8 +64,10 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
             path = throw_path(folder, number, ".npz")
             log.save(path)
             result = log.meta["result"]
-            how = f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s" if result["success"] else None
-            said.append(f"{path}  throw {number}: {how or 'no landing counted: ' + result['failure']}")
+            how = f"no landing counted: {result['failure']}"
+            if result["success"]:
+                how = f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s"
+            said.append(f"{path}  throw {number}: {how}")
             if "landing" in log:
                 strip.draw(throw_path(folder, number, ".png"), log, played.playback.params.camera)
     except VisthrowError as error:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -75,28 +75,15 @@ def sizes(pilot: Any) -> SimpleNamespace:
     return SimpleNamespace(camera=pilot.camera.params, vehicle=SimpleNamespace(rotors=rotors), rope=rope)
 
 
-class Tail:
-    """Whole lines that are added to a file."""
-
-    def __init__(self, path: Path) -> None:
-        """Begin at its start; it may not be there yet."""
-        self._path, self._file, self._rest = path, None, ""
-
-    def lines(self) -> Iterator[Any]:
-        """Yield values of the lines that were completed since the last call."""
-        if self._file is None:
-            if not self._path.is_file():
-                return
-            self._file = self._path.open(encoding="utf-8")
-        self._rest += self._file.read()
-        *whole, self._rest = self._rest.split("\n")
-        for row in whole:
-            yield json.loads(row)
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
+def tail(path: Path) -> Generator[list[Any], None, None]:
+    """Yield, each time, the values of the lines that were completed since the last one; the file may not be there yet."""
+    while not path.is_file():
+        yield []
+    with path.open(encoding="utf-8") as file:
+        rest = ""
+        while True:
+            *whole, rest = (rest + file.read()).split("\n")
+            yield [json.loads(row) for row in whole]
 
 
 class Follower:
@@ -108,16 +95,16 @@ class Follower:
         self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
         self.playback = Playback(self.params, Policy.load(folder / POLICY))
         self.provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-        self._tails = {name: Tail(folder / name) for name in (TICKS, POSES)}
+        self._tails = {name: tail(folder / name) for name in (TICKS, POSES)}
         self._lines: deque[dict[str, Any]] = deque()
         self._poses: dict[int, list[Pose]] = {}
 
     def ticks(self) -> list[Tick]:
         """Return ticks that were written since the last call, with all their poses."""
-        for row in self._tails[POSES].lines():
+        for row in next(self._tails[POSES]):
             index, pose = pose_of(row)
             self._poses.setdefault(index, []).append(pose)
-        self._lines.extend(self._tails[TICKS].lines())
+        self._lines.extend(next(self._tails[TICKS]))
         found = []
         while self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]:
             line = self._lines.popleft()
@@ -131,8 +118,8 @@ class Follower:
 
     def close(self) -> None:
         """Close its files."""
-        for tail in self._tails.values():
-            tail.close()
+        for lines in self._tails.values():
+            lines.close()
 
 
 def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:

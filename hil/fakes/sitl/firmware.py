@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from hil.errors import RunError
-from hil.fakes.sitl.packets import StillSensors, stood
+from hil.fakes.sitl.packets import at_rest, stood
 from hil.links.backends.betaflight import STICKS, BetaflightParams
 
 PORTS = (5761, 5762)  # TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
@@ -177,14 +177,14 @@ class Firmware:
 
     def _written(self, settings: dict[str, str]) -> dict[str, str]:
         self.start()
-        with StillSensors(self.stands), CommandLine() as line:
+        with at_rest(self.stands), CommandLine() as line:
             for name, value in settings.items():
                 line.ask(line_of(name, value))
             line.save()
             self._end()
         self.stop()
         self.start()
-        with StillSensors(self.stands), CommandLine() as line:
+        with at_rest(self.stands), CommandLine() as line:
             return {name: line.read(name) for name in settings}
 
 

@@ -15,7 +15,8 @@ import select
 import socket
 import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 import numpy as np
 
@@ -96,25 +97,21 @@ class Sensors:
         self._socket.close()
 
 
-class StillSensors:
-    """A vehicle at rest, while nothing flies yet: the firmware calibrates its gyro and answers only with samples."""
+@contextmanager
+def at_rest(stands: int) -> Iterator[None]:
+    """Feed a firmware with a vehicle at rest, while nothing flies yet: it calibrates its gyro and answers only with samples."""
+    done, sensors = threading.Event(), Sensors(stands)
 
-    def __init__(self, stands: int) -> None:
-        self._done, self._sensors = threading.Event(), Sensors(stands)
+    def feed() -> None:
+        with suppress(RunError):  # the firmware has ended, as it does where it is told to keep its settings
+            while not done.wait(STILL / 10.0):
+                sensors.rest(STILL)
 
-    def __enter__(self) -> "StillSensors":
-        self._thread = threading.Thread(target=self._feed, daemon=True)
-        self._thread.start()
-        return self
-
-    def _feed(self) -> None:
-        try:
-            while not self._done.wait(STILL / 10.0):
-                self._sensors.rest(STILL)
-        except RunError:  # the firmware has ended, as it does where it is told to keep its settings
-            pass
-
-    def __exit__(self, *_: object) -> None:
-        self._done.set()
-        self._thread.join()
-        self._sensors.close()
+    thread = threading.Thread(target=feed, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+        sensors.close()

@@ -39,7 +39,6 @@ class FlightClock:
     """A clock that goes as far as the vehicle behind the firmware has flown; see `hil.links.clock.Clock`."""
 
     def __init__(self, fake: Fake) -> None:
-        """Begin at the vehicle's time."""
         self._fake, self._now = fake, fake.plant.time
 
     def now(self) -> float:

@@ -108,7 +108,6 @@ class Audit:
                 self._ask(name)
 
     def _wrong(self) -> list[Rule]:
-        """Return rules that what was found breaks."""
         found = self.found
         return [r for r in self.rules.values() if not (r.good(found[r.name]) if r.name in found else r.optional)]
 

@@ -54,7 +54,6 @@ class Crazyflie(OnPort):
     name, protocol = "crazyflie", "CRTP"
 
     def __init__(self, port: Port, params: CrazyflieParams) -> None:
-        """Speak CRTP on an open port."""
         super().__init__(port, params.silence)
         self.params = params
         self.release_record = Release(params.release_timeout)

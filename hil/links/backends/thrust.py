@@ -52,7 +52,6 @@ class ThrustParams(Bounded):
         return max(0.0, self.weight * (1.0 + self.slope * (relative - 1.0)))
 
     def _command(self, share: float) -> float:
-        """Return the motors' command, 0 to 1, at a share."""
         return self.idle + (1.0 - self.idle) * share
 
     @property

@@ -1,5 +1,6 @@
 """Source of poses: what the runner needs of it, what it may raise, and the one that plays recorded poses."""
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 
 from hil.errors import SourceError
@@ -57,7 +58,5 @@ class Recorded(Source):
         return self.poses[0].arrival
 
     def poll(self, now: float) -> list[Pose]:
-        first = self._next
-        while self._next < len(self.poses) and self.poses[self._next].arrival <= now:
-            self._next += 1
+        first, self._next = self._next, bisect_right(self.poses, now, self._next, key=lambda pose: pose.arrival)
         return self.poses[first : self._next]

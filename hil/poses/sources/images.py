@@ -8,6 +8,7 @@ import csv
 import math
 import sys
 import threading
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,9 +125,7 @@ class RecordedImages(Eyes):
 
     def poll(self, now: float) -> list[Detection]:
         """Return detections that have come, of several pictures the newest; raises `SourceError` for one that cannot be read."""
-        first = self._next
-        while self._next < len(self._times) and self._times[self._next] <= now:
-            self._next += 1
+        first, self._next = self._next, bisect_right(self._times, now, self._next)
         if self._next == first:
             return []
         index = self._next - 1

@@ -53,7 +53,6 @@ class MavlinkDecoder:
         return None
 
     def _paired(self, message: Any, sender: tuple[int, int], body: str, arrival: float) -> Pose | None:
-        """Return the pose of a LOCAL_POSITION_NED with the sender's last attitude."""
         attitude = self._attitudes.get(sender)
         if attitude is None or abs(message.time_boot_ms - attitude.time_boot_ms) > 1e3 * PAIR_AGE:
             return None

@@ -65,7 +65,6 @@ class MocapSource(Source):
     the bodies go stale then, which the runner acts on."""
 
     def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
-        """Take the clock that arrivals are told by, and the link to serve."""
         super().__init__(() if link is None else (link,), clock)
         self._waiting: deque[Pose] = deque(maxlen=MOST_WAITING)
         self.failure: str | None = None
