@@ -1,7 +1,9 @@
 """``visthrow hil``: poses of a motion-capture system in, commands of a trained policy out."""
 
 import argparse
+import contextlib
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 ACTIONS = {
@@ -29,24 +31,19 @@ While a run goes on, type 'arm' (one throw), 'land' or 'abort' and Enter; Ctrl-C
 """
 
 
-def above_zero(text: str) -> float:
-    """Return a number above 0 of the command line."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not value > 0.0:
-        raise argparse.ArgumentTypeError(f"'{text}'; expected a number above 0")
-    return value
+def checked(kind: type, good: Callable[[float], bool], expected: str) -> Callable[[str], float]:
+    """Return what reads a number of the command line that must be good."""
+
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if good(value := kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"'{text}'; expected {expected}")
+
+    return parse
 
 
-def seed(text: str) -> int:
-    """Return a whole number from 0 on of the command line."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}'; expected a whole number of 0 or more")
-    return int(text)
-
-
+ABOVE_ZERO, SEED = checked(float, lambda x: x > 0.0, "a number above 0"), checked(int, lambda x: x >= 0, "a whole number of 0 or more")
 FLIES, FAKES = ("run", "record", "calibrate"), ("fake", "direct")
 FLAG, OVERRIDES = {"action": "store_true"}, {"dest": "overrides", "action": "append", "default": []}
 KINDS = "ardupilot, px4, betaflight, crazyflie; or a bridge to software: betaflight-sitl, ardupilot-sitl, px4-sih"
@@ -57,7 +54,7 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
     (("run", "check", "record", "calibrate"), "--config", "NAME", "of configs/hil, or a file", {"default": "dry_run"}),
     (("direct",), "--config", "NAME", "of configs/hil, or a file", {"default": "betaflight_sitl"}),
     (("run", "check", "record", "calibrate", "direct"), "--set", "KEY=VALUE", None, OVERRIDES),
-    (("run", "check", "record", "calibrate"), "--seconds", None, "end after this time", {"type": above_zero}),
+    (("run", "check", "record", "calibrate"), "--seconds", None, "end after this time", {"type": ABOVE_ZERO}),
     (("run", "check", "record", "calibrate"), "--speed", None, "of the clock; below 1 with a fake of the same speed",
      {"type": float, "default": 1.0}),
     (("run", "check", "record", "calibrate"), "--sign", "KEYFILE", "sign MAVLink messages, and hear none that is not signed", {}),
@@ -74,7 +71,7 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
     (("view",), "--out", "FILE", FILE, {}),
     (("view",), "--web-port", "N", "of the live view (default: 9090)", {"type": int, "default": 9090}),
     (("view",), "--data-port", "N", "of its data (default: 9876)", {"type": int, "default": 9876}),
-    (("direct",), "--seeds", "N", "of starts, noise and loss; a throw each", {"type": seed, "nargs": "+", "default": [0]}),
+    (("direct",), "--seeds", "N", "of starts, noise and loss; a throw each", {"type": SEED, "nargs": "+", "default": [0]}),
     (("fake",), "--rate", "HZ", "poses a second of each body", {"type": float, "default": 100.0}),
     (("direct",), "--policy", "POLICY", "whose plant is flown (default: the one that throws)", {}),
     (("direct",), "--firmware", "PROGRAM", "Betaflight's for a PC, to fly the plant's motors", {"required": True}),
@@ -84,9 +81,9 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
     (("fake",), "--device", None, "the runner's port", {"default": "udpout:127.0.0.1:14560"}),
     (("fake",), "--sign", "KEYFILE", "as of `hil run`", {}),
     (("fake",), "--policy", "POLICY", "whose plant is flown", {"default": "vision"}),
-    (("fake",), "--seed", None, "of start, noise and loss", {"type": seed, "default": 0}),
-    (("fake",), "--seconds", None, "end after this time", {"type": above_zero, "default": 60.0}),
-    (("fake",), "--after", None, "end this long after the payload's landing [s]", {"type": above_zero, "default": 10.0}),
+    (("fake",), "--seed", None, "of start, noise and loss", {"type": SEED, "default": 0}),
+    (("fake",), "--seconds", None, "end after this time", {"type": ABOVE_ZERO, "default": 60.0}),
+    (("fake",), "--after", None, "end this long after the payload's landing [s]", {"type": ABOVE_ZERO, "default": 10.0}),
     (("fake",), "--speed", None, "of the clock", {"type": float, "default": 1.0}),
     (("fake",), "--answer", None, "to the release: accepted, in-progress, denied, silent, stuck", {"default": "accepted"}),
     (("fake",), "--kind", None, f"of autopilot: {KINDS}", {"default": "ardupilot"}),

@@ -42,7 +42,9 @@ class FakeCrazyflie(PortFake):
             values = crtp.POSE.unpack(data)[1:]
             self.placed.append((values[:3], values[3:]))
         elif place == (crtp.SUPERVISOR, crtp.INFO) and data[:1] == bytes([crtp.STATE]):
-            self._answer(crtp.SUPERVISOR, crtp.INFO, bytes([crtp.STATE | crtp.ANSWER]) + self._state().to_bytes(4, "little"))
+            flying, stopped = bool(self.last_thrust > 0.0), self._stopped
+            state = crtp.CAN_FLY | crtp.ARMED * self.armed | crtp.FLYING * flying | crtp.LOCKED * stopped
+            self._answer(crtp.SUPERVISOR, crtp.INFO, bytes([crtp.STATE | crtp.ANSWER]) + state.to_bytes(4, "little"))
         elif place == (crtp.SUPERVISOR, crtp.COMMAND) and data[:1] == bytes([crtp.ARM]) and len(data) == 2:
             self.armed = bool(data[1]) and self.options.arming and not self._stopped
             self.happened("armed" if self.armed else "disarmed")
@@ -51,9 +53,6 @@ class FakeCrazyflie(PortFake):
 
     def _answer(self, port: int, channel: int, data: bytes) -> None:
         self.later(self.options.answer_delay, lambda: self.port.write(crtp.Packet(port, channel, data).pack()))
-
-    def _state(self) -> int:
-        return crtp.CAN_FLY | crtp.ARMED * self.armed | crtp.FLYING * bool(self.last_thrust > 0.0) | crtp.LOCKED * self._stopped
 
     def _set_parameter(self, data: bytes) -> None:
         group, name, rest = data[1:].split(b"\0", 2)

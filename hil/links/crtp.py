@@ -73,11 +73,6 @@ def arm(on: bool) -> bytes:
     return Packet(SUPERVISOR, COMMAND, bytes([ARM, on])).pack()
 
 
-def ask_state() -> bytes:
-    """Return the question for the supervisor's state."""
-    return Packet(SUPERVISOR, INFO, bytes([STATE])).pack()
-
-
 class CflibPort:
     """A radio or USB link of cflib; a `hil.links.device.Port`."""
 

@@ -7,11 +7,11 @@ the boundary between MAVLink's units and orders and ours.
 import math
 import random
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from hil.links.clock import Clock, TimeSync
+from hil.links.clock import TimeSync
 from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
 from hil.links.pymav import Parser, Signed, mav
 from hil.links.roster import Address, Roster, Seen, shown
@@ -120,20 +120,6 @@ class Link:
         self.port.close()
         if self._tlog is not None:
             self._tlog.close()
-
-
-def pump(links: Sequence[Link], clock: Callable[[], float]) -> int:
-    """Hand on all that has arrived on some links; returns the number of chunks that were read."""
-    return sum([link.pump(clock) for link in links])
-
-
-def wait(links: Sequence[Link], clock: Clock, arrivals: Callable[[], float], until: float) -> None:
-    """Wait by a clock until a time [s], handing on what comes in the meantime; ``arrivals`` is the clock of that."""
-    while links and clock.now() < until:
-        clock.wait_for([link.port for link in links], until)
-        if not pump(links, arrivals):
-            break
-    clock.sleep_until(until)
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:

@@ -84,7 +84,7 @@ class LoggedPort:
 
     def __init__(self, port: Port, path: str | Path) -> None:
         """Open the file; raises `StorageError` where it cannot be written."""
-        self._port, self.whole, self.sender, self.peer = port, port.whole, None, None
+        self._port = port
         try:
             self.log = Writer(path)
         except StorageError:
@@ -107,8 +107,8 @@ class LoggedPort:
             self._note(b"<", data)
         return taken
 
-    def fileno(self) -> int:
-        return self._port.fileno()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._port, name)
 
     def close(self) -> None:
         self._port.close()

@@ -50,7 +50,8 @@ class Detection:
         return Seen(ball, goal)
 
 
-def _rotation(quat: Quaternion) -> np.ndarray:
+def rotation_of(quat: Quaternion) -> np.ndarray:
+    """Return the rotation from body to world, shape (3, 3), float64."""
     return rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
 
 
@@ -77,12 +78,12 @@ class Detections:
 
     def along(self, now: float, pos: Vector, quat: Quaternion) -> None:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than these."""
-        self._path.append((now, np.array(pos), _rotation(quat)))
+        self._path.append((now, np.array(pos), rotation_of(quat)))
 
     def take(self, detection: Detection, quat: Quaternion, aged: float = 0.0) -> None:
         """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age at a tick [s]."""
         seen = detection.seen()
-        rot_wb = _rotation(quat)
+        rot_wb = rotation_of(quat)
         if self._turn is not None and self._path:
             seen = self._carried(seen, detection.stamp - self._latency + aged)
         points, valid = detected_keypoints(self._camera, seen, rot_wb)

@@ -113,12 +113,6 @@ class Samples:
             self.recorder.declare(f"age_{name}", "s")
         self.recorder.declare("state", "1")
 
-    def _later(self, name: str, time: float) -> float:
-        """Return the time, or a moment after the channel's last sample."""
-        time = max(time, self._last.get(name, -np.inf) + LEAST_STEP)
-        self._last[name] = time
-        return time
-
     def add(self, tick: Tick) -> None:
         """Add all that one tick holds."""
         attached = tick.attached
@@ -151,7 +145,8 @@ class Samples:
 
     def _pose(self, sample: Sample, attached: bool) -> None:
         pose = sample.pose
-        time = self._later(sample.body, measured(sample, self.params) if sample.time is None else sample.time)
+        time = measured(sample, self.params) if sample.time is None else sample.time
+        time = self._last[sample.body] = max(time, self._last.get(sample.body, -np.inf) + LEAST_STEP)
         if sample.body == PAYLOAD:
             self.recorder.add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
             self._note(payload_vel_w=pose.vel)

@@ -102,7 +102,7 @@ class Crazyflie(OnPort):
                 self._hear(packet, now)
         if now - self._asked >= ASK:
             self._asked = now
-            self._put(crtp.ask_state())
+            self._put(crtp.Packet(crtp.SUPERVISOR, crtp.INFO, bytes([crtp.STATE])).pack())
         if now - self._set >= SET_AGAIN:
             self._set = now
             for name, told in self._told.items():

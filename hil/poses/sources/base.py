@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 
 from hil.errors import SourceError
 from hil.links.clock import Clock
-from hil.links.mavlink_link import Link, wait
+from hil.links.mavlink_link import Link
 from hil.poses.pose import Pose
 
 
@@ -24,7 +24,15 @@ class Source:
 
     def wait(self, clock: Clock, until: float) -> None:
         """Wait until a time [s], taking in what comes in the meantime, so that its arrival is known."""
-        wait(self.links, clock, self._clock, until)
+        while self.links and clock.now() < until:
+            clock.wait_for([link.port for link in self.links], until)
+            if not self.pump():
+                break
+        clock.sleep_until(until)
+
+    def pump(self) -> int:
+        """Hand on all that has arrived on the links; returns the number of chunks that were read."""
+        return sum([link.pump(self._clock) for link in self.links])
 
     def hold(self, flying: bool) -> None:
         """Say whether the vehicle is ours in flight: then nobody's address on the links may change."""

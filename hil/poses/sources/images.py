@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
 
 from camera.detectors.contours import Detector, DetectorParams, Known
 from camera.detectors.following import Following
@@ -24,11 +23,10 @@ from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb
 from camera.params import CameraParams, FisheyeParams, MountParams
 from hil.errors import SourceError
-from hil.poses.detection import Detection
+from hil.poses.detection import Detection, rotation_of
 from hil.poses.pose import Quaternion, Vector
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
-from visthrow.onboard.observations import rotation_from_quat
 
 STAMPS = "stamps.csv"
 """Beside the pictures of a folder, or named as a video is with this ending: a line ``file,time_s`` (``frame,time_s``) each."""
@@ -92,7 +90,7 @@ class Eyes:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
         known, rot_wc, hint = Known(), None, self.hint
         if hint is not None:
-            rot_wb = rotation_from_quat(torch.tensor([hint.quat], dtype=torch.float64))[0].numpy()
+            rot_wb = rotation_of(hint.quat)
             rot_wc = rot_wb @ self._rot_cb.T
             height = hint.pos_w[2] + float(rot_wb[2] @ self._position_b)
             known = self._followed.known(rot_wc, rot_wb[:, 2], height, hint.ball_distance, stamp)

@@ -6,7 +6,7 @@ from itertools import combinations
 from typing import Annotated, Any, Literal
 
 from hil.errors import SourceError
-from hil.links.mavlink_link import Link, pose_from_message, pump
+from hil.links.mavlink_link import Link, pose_from_message
 from hil.links.roster import MavlinkId
 from hil.poses.pose import Body, Pose
 from hil.poses.sources.base import Source
@@ -80,6 +80,6 @@ class MavlinkSource(Source):
             self._waiting.append(pose if sync is None else sync.dated(pose, message.get_srcSystem()))
 
     def poll(self, now: float) -> list[Pose]:
-        pump(self.links, self._clock)
+        self.pump()
         poses, self._waiting = self._waiting, []
         return poses

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from hil.errors import SourceError
 from hil.links.device import check_device
-from hil.links.mavlink_link import Link, pump
+from hil.links.mavlink_link import Link
 from hil.poses.pose import BODIES, Body, Pose
 from hil.poses.sources.base import Source
 from visthrow.common.errors import ConfigError, suggest
@@ -74,7 +74,7 @@ class MocapSource(Source):
         self._waiting.append(pose)
 
     def poll(self, now: float) -> list[Pose]:
-        pump(self.links, self._clock)
+        self.pump()
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 
