@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from sim.params import RandomizationParams
 from tests.bench import start
 from tests.bench.loop import PLANT, add_arguments, explained, named, recorded
 from visthrow import config
@@ -136,7 +135,7 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
         DiagnoseError: A throw failed.
     """
     plant, rng = make_plant(plant_name, loaded.experiment, len(goals_w), seed), np.random.default_rng(seed)
-    home = place_in_hover(plant, loaded.experiment, config.load(RandomizationParams, config.find("start", "hover")), rng)
+    home = place_in_hover(plant, loaded.experiment, rng)
     meta = {"policy": loaded.name, "plant": plant.name}
     recording = Recording(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
     flight, landed = Flight(plant, Policies([loaded], goals_w), recording, home), 0

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from camera.keypoints import KeypointCamera
-from sim.params import RandomizationParams
 from sim.reference.extras import ReferenceExtras
 from visthrow import config
 from visthrow.common.workers import Workers
@@ -49,7 +48,7 @@ def in_training(flown: Experiment, count: int, seed: int, device: str) -> tuple[
 def on_reference(flown: Experiment, name: str, count: int, seed: int) -> tuple[list, np.ndarray, np.ndarray]:
     """The same on a reference plant."""
     plant, rng = batch_plant(flown, name, GOAL[0], 0, count, seed)
-    home = place_in_hover(plant, flown, config.load(RandomizationParams, config.find("start", "hover")), rng)
+    home = place_in_hover(plant, flown, rng)
     camera, goal = KeypointCamera(flown.camera), torch.tensor([GOAL]).expand(count, 3)
     turn = flown.camera.mount.rotation_error_std * rng.standard_normal((count, 3))
     scale = flown.camera.noise.scale_std * rng.standard_normal(count)

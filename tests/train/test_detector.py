@@ -104,7 +104,7 @@ def test_a_throw_flies_on_what_its_eyes_see_alone():
 def test_a_throw_is_refused_where_the_hover_does_not_see(name):
     loaded = load_policy("vision")
     plant, rng = batch_plant(loaded.experiment, "hybrid", 2.0, 0, 2, 0)
-    home = place_in_hover(plant, loaded.experiment, loaded.experiment.task.start, rng)
+    home = place_in_hover(plant, loaded.experiment, rng)
     pilots = Policies([loaded], np.tile([2.0, 0.0, 0.0], (2, 1)), eyes=Blind({0: name}))
     flight = Flight(plant, pilots, home_w=home)
     flight.run([hover(0.5), throw(0.2)])

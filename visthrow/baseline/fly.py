@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.params import GRAVITY, RandomizationParams
-from visthrow import config
+from sim.params import GRAVITY
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline.mpc import MPC, MPCParams, SolverError
 from visthrow.baseline.pendulum import Pendulum
@@ -21,7 +20,7 @@ from visthrow.baseline.plan import Plan, landing_point
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.task import Experiment
-from visthrow.task.measurement import Throws
+from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, Smoothness, hover, throw
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
@@ -68,7 +67,7 @@ def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
     What varies between throws: position and velocity of the payload, direction and rate of the cable, attitude. The
     vehicle's mass, the cable's length and the battery, which vary in training too, are the model's own here.
     """
-    start, rng = config.load(RandomizationParams, config.find("start", "hover")), np.random.default_rng(seed)
+    start, rng = pilots_hover(), np.random.default_rng(seed)
 
     def drawn(spread) -> np.ndarray:
         return np.asarray(spread) * rng.uniform(-1.0, 1.0, (count, 3))
@@ -183,12 +182,12 @@ def look_ahead(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: flo
 
 def _started(name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str) -> tuple[Plant, np.ndarray]:
     """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m], shape (3,)."""
-    task, start = experiment.task, config.load(RandomizationParams, config.find("start", "hover"))
+    task, start = experiment.task, pilots_hover()
     if name == "hybrid":
         plant = HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency, start)
         return plant, np.array([0.0, 0.0, start.spawn_height])
     plant, rng = batch_plant(experiment, name, target, batch, count, seed)
-    return plant, place_in_hover(plant, experiment, start, rng)
+    return plant, place_in_hover(plant, experiment, rng)
 
 
 class Controllers(Pilots):

@@ -9,11 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.params import RandomizationParams
+from visthrow import config
+
 TARGETS = (1.5, 2.0, 2.5)
 """Targets along x [m]; the last lies outside the training distribution."""
 
 LANDED = 0.95
 """Share of throws that must land before their mean error says anything of a policy."""
+
+
+def pilots_hover() -> RandomizationParams:
+    """How starts vary in a pilot's hover, ``configs/start/hover.toml``."""
+    return config.load(RandomizationParams, config.find("start", "hover"))
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.params import RandomizationParams
-from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers, progress
 from visthrow.task import Experiment, plant_of
-from visthrow.task.measurement import Throws
+from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.throws.flight import Decision, Flight, Policies, Scores, hover, throw
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
@@ -60,8 +58,9 @@ def batch_plant(
     return make_plant(plant_name, experiment, count, int(seeds.generate_state(1)[0])), np.random.default_rng(seeds)
 
 
-def place_in_hover(plant: Plant, experiment: Experiment, start: RandomizationParams, rng: np.random.Generator) -> np.ndarray:
+def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generator) -> np.ndarray:
     """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m], shape (3,)."""
+    start = pilots_hover()
     home = np.array([0.0, 0.0, start.spawn_height])
     spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (plant.count, 3))
     ropes = random_ropes(rng, plant.count, experiment.rope.segments, math.radians(start.cable_angle_deg))
@@ -79,7 +78,7 @@ def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes |
     flown = [loaded[i] for i in job.policies]
     experiment, count = flown[0].experiment, job.count * len(flown)
     plant, rng = batch_plant(experiment, plant_name, job.target, job.batch, count, job.seed)
-    home = place_in_hover(plant, experiment, config.load(RandomizationParams, config.find("start", "hover")), rng)
+    home = place_in_hover(plant, experiment, rng)
     pilots = Policies(flown, np.tile([job.target, 0.0, 0.0], (count, 1)), _goal_velocities(experiment, count, rng), eyes=eyes)
     flight = Flight(plant, pilots, scores := _Scores(pilots), home)
     flight.run([hover(HOVER_TIME), throw()])

@@ -48,7 +48,6 @@ class ThrowEnv(VecEnv):
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
             policy's start to the payload's landing, ``landing_w`` [m], ``clearance`` [m]; each over (E,). Where goals move,
             ``goal_w`` [m] too, where the goal is at impact.
-        totals: running sums of :data:`RESULTS`.
     """
 
     def __init__(self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None):
@@ -175,16 +174,11 @@ class ThrowEnv(VecEnv):
 
     def _start(self, fresh: Tensor) -> None:
         """Start episodes where ``fresh``, bool, shape (E,)."""
-        mask = self._mask(fresh)
+        self._fresh = fresh.to(torch.int32)
         with on_torch_stream(self.device):
-            self.sim.randomize(self.cfg.task.start, mask)
+            self.sim.randomize(self.cfg.task.start, wp.from_torch(self._fresh))
         if self._goal is not None:
             self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
-
-    @property
-    def totals(self) -> dict[str, float]:
-        """Sums over finished episodes since :meth:`clear_totals`."""
-        return dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
 
     def clear_totals(self) -> None:
         """Start the sums again."""
@@ -195,7 +189,7 @@ class ThrowEnv(VecEnv):
 
         ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are means over the released.
         """
-        totals = self.totals
+        totals = dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
         released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
         means = {name: totals[name] / released for name in ("landing_error", "duration")}
         return {"released": totals["released"] / episodes, **means, "episodes": totals["episodes"]}
@@ -230,7 +224,9 @@ class ThrowEnv(VecEnv):
         """
         action = self._apply(actions)
         reward, done = self._judge(action)
-        self._tally(done)
+        hit = self.last["released"].to(torch.float32)
+        rows = torch.stack([done.to(torch.float32), hit, self.last["landing_error"] * hit, self.last["duration"] * hit])
+        self._memory["totals"] += rows.sum(-1, dtype=torch.float64)
         self._start(done)
         self._memory["previous"].copy_(action)
         self._begin(done)
@@ -252,11 +248,6 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf += 1
         return action
 
-    def _mask(self, done: Tensor):
-        """Warp view of a boolean mask."""
-        self._done = done.to(torch.int32)
-        return wp.from_torch(self._done)
-
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step just made."""
         task, state, out, period = self.cfg.task, self.views.state, self.views.out, self.cfg.sim.control_period
@@ -265,7 +256,7 @@ class ThrowEnv(VecEnv):
             task.bounds, state["pos_w"], ob.rotation_from_quat(state["quat_wb"]), out["payload_pos_w"], state["status"], latched, time,
             self.cfg.release.landing_height,
         )  # fmt: skip
-        goal = self._goal_at_impact()
+        goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
         error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
         attached = (
             rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
@@ -285,18 +276,11 @@ class ThrowEnv(VecEnv):
             self.last["goal_w"] = goal
         return p.scale * reward, released | negative
 
-    def _goal_at_impact(self) -> Tensor:
-        """Goal [m], shape (E, 3), where it is when a payload released in the last step lands."""
+    def _goal_in(self, time: Tensor) -> Tensor:
+        """Goal [m], shape (E, 3), where it is in a time [s], shape (E,)."""
         if not self.cfg.task.target.moves:
             return self.views.goal_w
-        out = self.views.out
-        left = out["separation_time"] + out["time_to_impact"] - self.cfg.sim.control_period
-        return self.views.goal_w + self._memory["goal_vel"] * left[:, None]
-
-    def _tally(self, done: Tensor) -> None:
-        hit = self.last["released"].to(torch.float32)
-        rows = torch.stack([done.to(torch.float32), hit, self.last["landing_error"] * hit, self.last["duration"] * hit])
-        self._memory["totals"] += rows.sum(-1, dtype=torch.float64)
+        return self.views.goal_w + self._memory["goal_vel"] * time[:, None]
 
     def _begin(self, fresh: Tensor) -> None:
         """Draw what holds for an episode where one begins."""
@@ -351,7 +335,7 @@ class ThrowEnv(VecEnv):
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
         attached = state["attached"].to(torch.float32)
         pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
-        late_goal = self._late_goal()
+        late_goal = self._goal_in(-memory["pose_age"])
         seen = torch.cat([pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], late_goal, pose[:, ob.VEHICLE :])], dim=-1)
         measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
         valid = None
@@ -397,12 +381,6 @@ class ThrowEnv(VecEnv):
         )  # fmt: skip
         parts += [value for name, value in known if name in named and value is not None]
         return torch.cat(parts, dim=-1) if len(parts) > 1 else actor
-
-    def _late_goal(self) -> Tensor:
-        """Goal [m], shape (E, 3), where it was when what is measured now was measured."""
-        if not self.cfg.task.target.moves:
-            return self.views.goal_w
-        return self.views.goal_w - self._memory["goal_vel"] * self._memory["pose_age"][:, None]
 
     def _see(self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints as the detector reports them: errors of mount and focal length, latency, noise, drop-out, held images."""

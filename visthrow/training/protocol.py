@@ -7,18 +7,15 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from sim.params import RandomizationParams
-from visthrow import config
 from visthrow.task import Experiment
-from visthrow.task.measurement import Throws
+from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.training.env import ThrowEnv
 
 
 def hover_start(experiment: Experiment) -> Experiment:
     """The experiment with its episodes started from hover; cables and payloads vary as in the experiment."""
-    start = config.load(RandomizationParams, config.find("start", "hover"))
     kept = ("tether_variants", "tether_spread", "payload_variants", "payload_spread", "drag_spread")
-    start = dataclasses.replace(start, **{name: getattr(experiment.task.start, name) for name in kept})
+    start = dataclasses.replace(pilots_hover(), **{name: getattr(experiment.task.start, name) for name in kept})
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
 
 

@@ -174,7 +174,7 @@ def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment
     pytest.importorskip("mujoco")
     flown, _ = _started("reference-realistic", experiment, 2.0, 0, 3, 5, "cpu")
     plant, rng = batch_plant(experiment, "reference-realistic", 2.0, 0, 3, 5)
-    place_in_hover(plant, experiment, protocol.hover_start(experiment).task.start, rng)
+    place_in_hover(plant, experiment, rng)
     command = np.tile([2.67, 0.0, 0.3, 0.0], (3, 1))
     for _ in range(3):  # winds and build errors show once it flies
         flown.step(command)

@@ -86,9 +86,9 @@ def vision_section(thrown: ResultSet) -> Section:
             (vision, state), runs = pair
             gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
             paper = _paper(target)
-            beside = "-" if paper is None else f"{paper[0]:+.3f}, {paper[1]:+.3f}"
+            beside = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
             rows.append((SHORT[plant], f"{target:.1f}", runs, gap.text(sign=True), _said(gap), faster.text(sign=True), beside))
-            marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else _paper_gap(target)))
+            marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0]))
     parts = [Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
                   "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
                   "met the same vehicles, starts and winds.")]  # fmt: skip
@@ -120,16 +120,13 @@ def _groups(thrown: ResultSet, plant: str, target: float) -> tuple[tuple[list[Re
     return ([shipped[0]], [shipped[1]]), "shipped"
 
 
-def _paper(target: float) -> tuple[float, float] | None:
+def _paper(target: float) -> tuple[st.Interval, float] | None:
+    """The paper's differences: errors [m] with a normal interval from its deviations, ten throws each, and durations [s]."""
     vision, state = PAPER.get(("vision", target)), PAPER.get(("state", target))
-    return None if vision is None or state is None else (vision[0] - state[0], vision[2] - state[2])
-
-
-def _paper_gap(target: float) -> st.Interval:
-    """The paper's difference of errors [m] with a normal interval from its deviations, ten throws each."""
-    (vision, vision_std), (state, state_std) = (PAPER[(name, target)][:2] for name in ("vision", "state"))
-    half = 1.96 * math.hypot(vision_std, state_std) / math.sqrt(10.0)
-    return st.Interval(vision - state, vision - state - half, vision - state + half, "throws")
+    if vision is None or state is None:
+        return None
+    gap, half = vision[0] - state[0], 1.96 * math.hypot(vision[1], state[1]) / math.sqrt(10.0)
+    return st.Interval(gap, gap - half, gap + half, "throws"), vision[2] - state[2]
 
 
 def _said(gap: st.Interval) -> str:

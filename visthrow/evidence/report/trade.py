@@ -123,7 +123,7 @@ def front_section(thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Seq
         drawn = []
         for compensation, bounds in kinds:
             found = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
-            label = _label(plant, compensation, bounds)
+            label = f"TO+MPC, bounds on {bounds}" + ("" if plant == thrower.OWN else f", {thrower.MADE_UP[compensation]}")
             if not found:
                 if (plant, bounds) != ("reference-realistic", BOUNDS[1]):
                     missing.append(f"{title}, {label}")
@@ -135,7 +135,11 @@ def front_section(thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Seq
             sums.append(_policy_sum(title, name, result))
         stars = [(f"{name} policy", st.mean(r.of("duration")), st.mean(r.of("error"))) for name, r in policies]
         crosses = _paper_points() if plant == thrower.OWN else ()
-        fronts = tuple((kinds.index(kind), _drawn(*kind), points_of(found)) for kind, found in drawn)
+        late = {"delay": ", release lag not made up for"}
+        fronts = tuple(
+            (kinds.index((made_up, bounds)), f"TO+MPC, bounds on {bounds}{late.get(made_up, '')}", points_of(found))
+            for (made_up, bounds), found in drawn
+        )
         panels.append(figures.Trade(heading, fronts, tuple(stars), crosses))
     lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting counts where all its throws "
@@ -161,15 +165,6 @@ def front_section(thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Seq
 def _swept(found: Sequence[Result]) -> list[Result]:
     """Throws of the sweep: those by target are more."""
     return [r for r in found if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
-
-
-def _label(plant: str, compensation: str, bounds: str) -> str:
-    made_up = "" if plant == thrower.OWN else f", {thrower.MADE_UP[compensation]}"
-    return f"TO+MPC, bounds on {bounds}{made_up}"
-
-
-def _drawn(compensation: str, bounds: str) -> str:
-    return f"TO+MPC, bounds on {bounds}" + (", release lag not made up for" if compensation == "delay" else "")
 
 
 def points_of(found: Sequence[Result]) -> np.ndarray:
