@@ -37,7 +37,7 @@ STAGES = ("home", "before", "after")
 def adapted(experiment: Experiment, policy: Policy, args: argparse.Namespace) -> tuple[Policy, dict[str, float]]:
     """The policy after a training in full, or what the seconds allow of it; its seconds, building left out, and its iterations."""
     trainer, spent = Trainer(fitted(experiment, policy), args.device, args.seed), 0.0
-    trainer.take_up(policy)
+    trainer.algorithm.take_up(policy)
     while trainer.iteration < trainer.algorithm.iterations and spent < args.seconds:
         begin = time.perf_counter()
         trainer.step()

@@ -106,7 +106,7 @@ def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled, number):
 def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, capsys):
     policy, start = Policy.load(whole / "policy.npz"), ["--from", str(whole / "policy.npz")]
     trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 2)
-    trainer.take_up(policy)
+    trainer.algorithm.take_up(policy)
     taken = trainer.algorithm.export(policy.contract, {})
     for name, value in vars(policy.estimator).items():
         torch.testing.assert_close(getattr(taken.estimator, name), value, rtol=0, atol=AGREES)

@@ -193,9 +193,7 @@ def _started(name: str, experiment: Experiment, target: float, batch: int, count
 class Controllers(Pilots):
     """MPC of E vehicles as the pilots of a flight: tracks a plan, and trips the latch at its time.
 
-    Attributes:
-        latch: period of the throw in which the latch trips. most: periods that a throw may take.
-        times: that all steps of the controllers took [s].
+    Attributes: ``latch``, the period of the throw in which the latch trips, ``most`` periods of a throw, ``times`` of all steps [s].
     """
 
     def __init__(self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int) -> None:
@@ -282,17 +280,11 @@ def fly_plant(
     plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0, batch: int = 0,
     device: str = "cpu",
 ) -> Flown:  # fmt: skip
-    """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`.
+    """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`, the delays made up for.
 
     The throws are those that learnt policies meet with the same count and seed: in the training simulator the same vehicles,
     ropes and starts as :func:`visthrow.training.protocol.throw`, on a reference plant the same vehicles, winds and starts as
-    :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller.
-
-    Args:
-        plan, plant_name, experiment: whose plant, bounds and delays they are.
-        delays: that the controller makes up for; ``Delays()`` for none.
-        count: throws, flown as one batch, whose number on a reference plant is ``batch``.
-        seed, device: of everything random, and of the training simulator.
+    batch ``batch`` of :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller.
     """
     plant, home = _started(plant_name, experiment, plan.target, batch, count, seed, device)
     pilots = Controllers(plan, experiment, plant.period, delays, count)

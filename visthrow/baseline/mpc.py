@@ -125,9 +125,8 @@ class MPC:
             raise ValueError(f"reference of shapes {target.shape}, {effort.shape}; expected ({n + 1}, 16), ({n}, 4)")
         if self._states is None:
             self._states, self._inputs = target.copy(), effort.copy()
-        state = state.copy()
-        state[QUAT] *= np.sign(state[QUAT] @ self._states[0, QUAT]) or 1.0
-        target = _same_side(target, self._states)
+        state, *target = _same_side(np.vstack([state, target]), np.vstack([self._states[:1], self._states]))
+        target = np.array(target)
         moved, by_state, by_input = pm.linearise(self.model, self._states[:n], self._inputs, self.params.period)
         self._fill(by_state, by_input)
         free = moved - np.einsum("kij,kj->ki", by_state, self._states[:n]) - np.einsum("kij,kj->ki", by_input, self._inputs)

@@ -10,6 +10,7 @@ workspace (the paper, Sec. IV-A; bounds and penalties' weights are ours). Two mo
 vector and its turning: without them short plans flip the vehicle in ways that no quadrotor follows.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -326,21 +327,17 @@ def _thrust(model: Pendulum, chain: np.ndarray, up: np.ndarray) -> tuple[np.ndar
 
 
 def _unit(*chain: np.ndarray) -> list[np.ndarray]:
-    """Unit vector of the first and its derivatives, from a vector and its derivatives, shape (T, D) each; up to the third."""
+    """Unit vector of the first and its derivatives, from a vector and its derivatives, shape (T, D) each."""
 
     def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return (a * b).sum(1, keepdims=True)
 
-    vector = chain[0]
-    norm = np.sqrt(dot(vector, vector))
-    out = [vector / norm]
-    if len(chain) > 1:
-        n1 = dot(out[0], chain[1])
-        out.append((chain[1] - n1 * out[0]) / norm)
-    if len(chain) > 2:
-        n2 = dot(out[1], chain[1]) + dot(out[0], chain[2])
-        out.append((chain[2] - 2.0 * n1 * out[1] - n2 * out[0]) / norm)
-    if len(chain) > 3:
-        n3 = dot(out[2], chain[1]) + 2.0 * dot(out[1], chain[2]) + dot(out[0], chain[3])
-        out.append((chain[3] - 3.0 * n2 * out[1] - 3.0 * n1 * out[2] - n3 * out[0]) / norm)
+    norm = [np.sqrt(dot(chain[0], chain[0]))]  # and its derivatives
+    out = [chain[0] / norm[0]]
+    for k in range(1, len(chain)):
+        norm.append(sum(math.comb(k - 1, i) * dot(out[k - 1 - i], chain[i + 1]) for i in range(k)))
+        rest = chain[k]
+        for j in (*range(k - 1, 0, -1), k):
+            rest = rest - math.comb(k, j) * norm[j] * out[k - j]
+        out.append(rest / norm[0])
     return out

@@ -55,6 +55,6 @@ def _add_show(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what was asked."""
-    from visthrow.view.camera import calibration, show
+    from visthrow.view.camera import actions
 
-    return {"calibrate": calibration.calibrate, "check": calibration.check, "show": show.show}[args.action](args)
+    return {"calibrate": actions.calibrate, "check": actions.check, "show": actions.show}[args.action](args)

@@ -18,9 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow config vehicle paper --set body.mass=0.25\n"
     )
     parser.add_argument("kind", metavar="KIND", help=f"what to configure: {', '.join(_kind_names())}")
-    parser.add_argument(
-        "name", metavar="NAME", nargs="?", help="a shipped name or a TOML file; without it, list the names"
-    )
+    parser.add_argument("name", metavar="NAME", nargs="?", help="a shipped name or a TOML file; without it, list the names")
     add_common(parser, device=False, json=True)
 
 

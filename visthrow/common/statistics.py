@@ -84,10 +84,14 @@ def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Inte
 
 def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` minus mean of ``b``, independent throws."""
+    return _of_both(np.subtract, a, b, seed, draws)
+
+
+def _of_both(function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int, draws: int) -> Interval:
     first, second = _checked(a), _checked(b)
     rng = np.random.default_rng(seed)
-    samples = _resampled(first, rng, draws) - _resampled(second, rng, draws)
-    return _interval(float(_mean(first) - _mean(second)), samples, max(len(first), len(second)))
+    samples = function(_resampled(first, rng, draws), _resampled(second, rng, draws))
+    return _interval(function(_mean(first), _mean(second)), samples, max(len(first), len(second)))
 
 
 def paired(a: np.ndarray, b: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
@@ -104,10 +108,7 @@ def paired(a: np.ndarray, b: np.ndarray, seed: int = 0, draws: int = DRAWS) -> I
 
 def ratio(a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` over mean of ``b``, independent throws; both positive."""
-    first, second = _checked(a), _checked(b)
-    rng = np.random.default_rng(seed)
-    samples = _resampled(first, rng, draws) / _resampled(second, rng, draws)
-    return _interval(float(_mean(first) / _mean(second)), samples, max(len(first), len(second)))
+    return _of_both(np.divide, a, b, seed, draws)
 
 
 def correlation(x: np.ndarray, y: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:

@@ -85,7 +85,6 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
 def _solve(task: tuple) -> Calibration | None:
     """The calibration of one hover; None where it shows too little."""
     hovered, camera, contract = task
-    torch.set_num_threads(1)
     try:
         return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract)
     except CalibrationError:

@@ -72,12 +72,10 @@ class Policies(Pilots):
         self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False,
         eyes: "Eyes | None" = None,
     ) -> None:  # fmt: skip
-        """Begin with policies that were trained for one plant.
+        """Begin with policies that were trained for one plant; goals as of `Pilots`.
 
-        Args:
-            loaded, goal_w, goal_vel_w: see `Pilots`.
-            draws: state policies too have a camera, to be drawn.
-            eyes: whose rendered pictures keypoints come from; None: they are what measured poses project to.
+        ``draws``: state policies too have a camera, to be drawn. ``eyes``: whose rendered pictures keypoints come from; None: they
+        are what measured poses project to.
         """
         self.eyes, self._waited, self._lost = eyes, 0, {}
         share = len(goal_w) // len(loaded)
@@ -149,13 +147,9 @@ class Flight:
     """
 
     def __init__(self, plant: Plant, pilots: Pilots, recorder: Recorder | None = None, home_w: np.ndarray | None = None) -> None:
-        """Take over a plant.
+        """Take over a plant at its start; each period is told to the recorder.
 
-        Args:
-            plant: at its start.
-            pilots: who throws.
-            recorder: told of each period.
-            home_w: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the vehicles are.
+        ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the vehicles are.
         """
         count = plant.count
         self.plant, self.pilots, self.recorder = plant, pilots, recorder or Recorder()

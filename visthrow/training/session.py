@@ -69,10 +69,13 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
     if args.resume:
         trainer.load(folder / CHECKPOINT)
     elif policy is not None:
-        trainer.take_up(policy)
+        trainer.algorithm.take_up(policy)
     last = args.iterations or trainer.algorithm.iterations
     if ranks.lead:
-        told = {"seed": seed, "processes": ranks.world} | ({"from": _origin(args.start, policy)} if policy is not None else {})
+        told: dict[str, Any] = {"seed": seed, "processes": ranks.world}
+        if policy is not None:
+            made = {k: policy.made_by[k] for k in ("commit", "command", "seed") if k in policy.made_by}
+            told["from"] = {"policy": Path(args.start).name, **made}
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
     why = _loop(args, trainer, folder, last, viewer)
     if ranks.lead:
@@ -128,11 +131,6 @@ def _resumed(args: Options) -> tuple:
     if args.seed not in (None, seed):
         raise CheckpointError(f"{folder}: a run of another seed, {seed}; resume without --seed")
     return experiment, None, folder, seed
-
-
-def _origin(name: str, policy) -> dict:
-    """What the provenance says of the policy that a run starts from."""
-    return {"policy": Path(name).name, **{k: policy.made_by[k] for k in ("commit", "command", "seed") if k in policy.made_by}}
 
 
 class StopRequest:

@@ -60,7 +60,7 @@ class Algorithm(Protocol):
         """The policy as a file's content."""
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
+        """Start from a policy that :func:`fitted` found to fit: its weights, and its normaliser, which hardly moves from there."""
 
     def state_dict(self) -> dict:
         """Tensors and numbers that the next iteration depends on, besides torch's generators."""
@@ -134,10 +134,6 @@ class Trainer:
         for part, spent in times.items():
             self.seconds[part] += spent
         return figures | {f"{part}_s": spent for part, spent in times.items()} | {"iteration": self.iteration}
-
-    def take_up(self, policy: Policy) -> None:
-        """Start from a policy that :func:`fitted` found to fit."""
-        self.algorithm.take_up(policy)
 
     def throw(self, target: float, count: int | None = None, seed: int = 12345) -> Throws:
         """Throws from hover with the current policy, :data:`EVALUATED` if not said; see :mod:`visthrow.training.protocol`."""

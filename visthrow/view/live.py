@@ -18,11 +18,7 @@ WEB_PORT, DATA_PORT = 9090, 9876
 
 @contextmanager
 def served(web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[str]:
-    """Serve the viewer and say where; gives the address that streams connect to with ``connect_grpc``.
-
-    Raises:
-        DeviceError: a port is taken.
-    """
+    """Serve the viewer and say where; gives the address that streams connect to. DeviceError where a port is taken."""
     command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST, "--port", str(data_port)]
     command += ["--web-viewer-port", str(web_port), "--server-memory-limit", "500MB"]
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
@@ -39,11 +35,7 @@ def served(web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[str
 
 @contextmanager
 def web_viewer(layout: Any, web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
-    """Serve the viewer with one recording; gives the stream that it shows.
-
-    Raises:
-        DeviceError: a port is taken.
-    """
+    """Serve the viewer with one recording; gives the stream that it shows."""
     import rerun as rr
 
     with served(web_port, data_port) as data:

@@ -95,10 +95,7 @@ def colour_code(hexadecimal: str, alpha: int = 255) -> list[int]:
     return [*(int(hexadecimal[i : i + 2], 16) for i in (1, 3, 5)), alpha]
 
 
-TRAILS = (
-    ("payload_pos_w", "world/trail/ball", style.PAYLOAD),
-    ("pos_w", "world/trail/vehicle", style.QUIET),
-)
+TRAILS = (("payload_pos_w", "world/trail/ball", style.PAYLOAD), ("pos_w", "world/trail/vehicle", style.QUIET))
 """Channel, entity and colour of the lines that grow during a throw."""
 
 

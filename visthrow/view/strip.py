@@ -173,9 +173,7 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     pixels = lens.denormalize(points[0].double()).numpy()
     for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
         right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
-        axis.annotate(
-            name, (right, middle), xytext=(7, 0), textcoords="offset points", color="white", va="center", fontsize=9
-        )  # fmt: skip
+        axis.annotate(name, (right, middle), xytext=(7, 0), textcoords="offset points", color="white", va="center", fontsize=9)
     quarter = float(lens.radius_from_angle(torch.tensor(np.pi / 2))) * lens.params.fy
     axis.annotate(
         "90° off the axis", (lens.params.cx, lens.params.cy + quarter), xytext=(0, 4), textcoords="offset points",

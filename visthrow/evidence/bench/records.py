@@ -27,10 +27,6 @@ class Table:
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 
-    def markdown(self) -> str:
-        """Text of the table, columns aligned."""
-        return f"**{self.title}**\n\n{aligned(self.header, self.rows)}"
-
 
 @dataclass(frozen=True)
 class Report:
@@ -78,7 +74,7 @@ def record_path(name: str) -> Path:
 
 def body(record: dict[str, Any]) -> str:
     """Title, tables and notes of a record as Markdown."""
-    tables = [Table(t["title"], tuple(t["header"]), tuple(map(tuple, t["rows"]))).markdown() for t in record["tables"]]
+    tables = [f"**{table['title']}**\n\n{aligned(table['header'], table['rows'])}" for table in record["tables"]]
     return "\n\n".join([f"### {record['title']}", *tables, "\n".join(f"- {note}" for note in record["notes"])]).rstrip()
 
 

@@ -20,19 +20,12 @@ ANY = object()
 
 @dataclass(frozen=True)
 class ResultSet:
-    """Results, training runs and findings.
+    """Results, training runs and findings."""
 
-    Attributes:
-        results: sets of throws, batches joined.
-        runs: training runs as the records hold them.
-        findings: section -> text that somebody wrote beside the data.
-        note: on the number of throws, where these are few.
-    """
-
-    results: tuple[Result, ...]
-    runs: tuple[dict[str, Any], ...] = ()
-    findings: dict[str, str] = field(default_factory=dict)
-    note: str = ""
+    results: tuple[Result, ...]  # sets of throws, batches joined
+    runs: tuple[dict[str, Any], ...] = ()  # as the records hold them
+    findings: dict[str, str] = field(default_factory=dict)  # section -> text that somebody wrote beside the data
+    note: str = ""  # on the number of throws, where these are few
 
     def policies(
         self, plant: str, target: float, *, layout: str | None = None, variant: str | None = None, policy: str | None = None,

@@ -46,22 +46,16 @@ class Job:
 
 @dataclass
 class Cluster:
-    """Submits tasks.
-
-    Attributes:
-        executor: "slurm", or "local" for processes of this machine.
-        minutes: length of a piece; what is not done then is submitted again.
-        options: of submitit's executor, for instance ``slurm_partition``.
-    """
+    """Submits tasks."""
 
     list_name: str
     out: Path
-    executor: str
+    executor: str  # "slurm", or "local" for processes of this machine
     gpus: int
     jobs: int
-    minutes: float
+    minutes: float  # length of a piece; what is not done then is submitted again
     changes: tuple[str, ...] = ()
-    options: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)  # of submitit's executor, for instance ``slurm_partition``
 
     def __post_init__(self) -> None:
         import submitit
@@ -85,9 +79,7 @@ class Cluster:
         return Job(job, task.name, self._lost)
 
 
-def do(
-    list_name: str, out: str, changes: tuple[str, ...], folder: str, ids: tuple[str, ...], device: str, minutes: float
-) -> int:
+def do(list_name: str, out: str, changes: tuple[str, ...], folder: str, ids: tuple[str, ...], device: str, minutes: float) -> int:
     """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
     from visthrow.evidence.sweep.units import load_list
     from visthrow.evidence.sweep.work import work

@@ -47,9 +47,6 @@ def collect(work: Work, out: Path, records: Path) -> list[Path]:
     """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already; returns their paths.
 
     Of two results for the same question, older and newer weights or config, the one that is here counts.
-
-    Raises:
-        StorageError: a record that cannot be read or written.
     """
     training, throws = records / "training" / f"{work.name}.json", records / "throws" / f"{work.name}.json"
     runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {

@@ -58,14 +58,14 @@ class Source:
         """Whether the policy is there, with what the training says of it."""
         return not self.config or (self.folder(out) / SUMMARY).is_file()
 
-    def experiment(self, changes: tuple[str, ...] = ()) -> Experiment:
+    def experiment(self) -> Experiment:
         """What it is trained in."""
-        return _experiment(self.config, self.changes + changes)
+        return _experiment(self.config, self.changes)
 
     @property
     def flown(self) -> tuple[str, ...]:
         """Changes of the config that its policy is flown with."""
-        return self.changes + self.experiment().flown
+        return self.changes + self.experiment().flown if self.config else ()
 
 
 @dataclass(frozen=True)
@@ -99,22 +99,20 @@ class ThrowUnit:
 
     def experiments(self, out: Path) -> tuple[dict, dict]:
         """The policy's own config and the one it is flown in, without the learning parameters."""
-        if self.source.config:
-            own = config.to_dict(self.source.experiment(self.source.flown))
-        else:
-            own = _shipped_config(self.source.policy(out))
-        flown_in = self.flown_in(own["task"]["observation"]["layout"])
-        if flown_in is not None:
-            flown = config.to_dict(_experiment(flown_in, self.params.changes))
-        elif self.source.config:
-            flown = config.to_dict(self.source.experiment(self.source.flown + self.params.changes))
-        else:
-            flown = _shipped_config(self.source.policy(out), self.params.changes)
-        return {k: v for k, v in own.items() if k != "ppo"}, {k: v for k, v in flown.items() if k != "ppo"}
+        source = self.source
 
-    def flown_in(self, layout: str) -> str | None:
-        """Config of ``configs/train`` to fly in; None for the policy's own."""
-        return FULL[layout] if self.params.fly_in == "full" else None
+        def stated(name: str, changes: tuple[str, ...]) -> dict[str, Any]:
+            found = config.to_dict(_experiment(name, changes)) if name else _shipped_config(source.policy(out), changes)
+            return {key: value for key, value in found.items() if key != "ppo"}
+
+        own = stated(source.config, source.flown)
+        return own, stated(*self.flown_in(own["task"]["observation"]["layout"]))
+
+    def flown_in(self, layout: str) -> tuple[str, tuple[str, ...]]:
+        """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its changes."""
+        if self.params.fly_in == "full":
+            return FULL[layout], self.params.changes
+        return self.source.config, self.source.flown + self.params.changes
 
     def done(self, out: Path) -> bool:
         """Whether the result is there."""

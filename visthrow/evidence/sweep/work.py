@@ -136,8 +136,6 @@ def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
 
 def load(unit: ThrowUnit, out: Path) -> Loaded:
     """The policy with the experiment that it is to fly in; MismatchError where the list does not allow what differs."""
-    source, changes = unit.source, unit.params.changes
-    flown_in = unit.flown_in(unit.experiments(out)[0]["task"]["observation"]["layout"])
-    if flown_in is None and source.config:  # the list's config: that of the file may have fields of another version
-        flown_in, changes = source.config, source.flown + changes
-    return load_policy(source.policy(out), flown_in, changes, unit.params.allow)
+    layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
+    name, changes = unit.flown_in(layout)  # a training's from the list: that of its file may have fields of another version
+    return load_policy(unit.source.policy(out), name or None, changes, unit.params.allow)

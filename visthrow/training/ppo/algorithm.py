@@ -5,8 +5,6 @@ import io
 
 import torch
 from rsl_rl.algorithms import PPO
-from tensordict import TensorDict
-from torch import Tensor
 
 from sim.torch_bridge import captured
 from visthrow.common.errors import ConfigError
@@ -97,10 +95,6 @@ class PPOTraining:
         if first and iteration in (0, first):
             self.alg.set_rate(WARM_UP_RATE if iteration == 0 else self.experiment.ppo.learning_rate)
         self.alg.actor_learns.fill_(float(iteration >= first))
-
-    def act(self, obs: Tensor) -> Tensor:
-        """Deterministic actions, shape (E, 5), of the current policy for the actor's observations, shape (E, D)."""
-        return self.alg.actor(TensorDict({"actor": obs}, batch_size=[len(obs)], device=obs.device))
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         return Policy.from_actor_state(self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by)
