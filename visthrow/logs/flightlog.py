@@ -96,6 +96,11 @@ class Channel:
         columns = self.values.reshape(len(self.time), -1).T
         return np.array([np.interp(time, self.time, column) for column in columns]).reshape(self.values.shape[1:])
 
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return times [s] and values of the valid samples, float64, shapes (N,) and (N, components)."""
+        values = self.values[np.asarray(self.valid)].astype(float)
+        return self.time[np.asarray(self.valid)], values.reshape(len(values), int(np.prod(values.shape[1:])))
+
     def hold(self, time: np.ndarray) -> np.ndarray:
         """Return the last valid sample at or before each time (the first one where there is none yet).
 

@@ -12,7 +12,7 @@ import numpy as np
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
 from visthrow.logs.check import relations
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 RATE = 50.0
 """Rate of the grid on which logs are first laid over one another [Hz]."""
@@ -73,30 +73,26 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
 def _turning(log: FlightLog) -> Signal | None:
     """Body rates over ``_SPAN``: by gyro, else by attitude."""
     if "rate_b" not in log:
-        return relations.rates_of(*_valid(log["quat_wb"]), _SPAN) if "quat_wb" in log else None
-    time, rate = _valid(log["rate_b"])
+        return relations.rates_of(*log["quat_wb"].samples(), _SPAN) if "quat_wb" in log else None
+    time, rate = log["rate_b"].samples()
     inside = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)] if len(time) else time
     return (inside, relations.mean_over(time, rate, inside, _SPAN)) if len(inside) else None
 
 
 def _velocity(log: FlightLog) -> Signal | None:
     if "vel_w" in log:
-        return _valid(log["vel_w"])
-    return relations.derivative(*_valid(log["pos_w"])) if "pos_w" in log else None
+        return log["vel_w"].samples()
+    return relations.derivative(*log["pos_w"].samples()) if "pos_w" in log else None
 
 
 def _force(log: FlightLog) -> Signal | None:
     """Size of the specific force: the accelerometer's axes turn in the world."""
     if "acc_b" in log:
-        return _sized(*_valid(log["acc_b"]))
+        return _sized(*log["acc_b"].samples())
     if "pos_w" not in log:
         return None
-    time, acc = relations.derivative(*relations.derivative(*_valid(log["pos_w"])))
+    time, acc = relations.derivative(*relations.derivative(*log["pos_w"].samples()))
     return _sized(time, acc + [0.0, 0.0, GRAVITY])
-
-
-def _valid(channel: Channel) -> Signal:
-    return channel.time[channel.valid], channel.values[channel.valid].astype(float)
 
 
 def _sized(time: np.ndarray, values: np.ndarray) -> Signal:

@@ -86,11 +86,16 @@ def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
     return Row("answers", question.name, "ok", "can be answered")
 
 
+def _first(log: FlightLog, names: tuple[str, ...], fewest: int = 20) -> tuple[str, np.ndarray, np.ndarray] | None:
+    """Name and samples of the first of several channels that holds more than so many."""
+    name = next((n for n in names if n in log and np.sum(log[n].valid) > fewest), None)
+    return None if name is None else (name, *log[name].samples())
+
+
 def excitation(log: FlightLog) -> dict[str, float]:
     """Figures of what a log excites; what no channel tells is left out."""
-    figures: dict[str, float] = {}
     spans = [float(np.ptp(channel.time)) for channel in log.channels.values() if len(channel.time) > 1]
-    figures["seconds"] = max(spans, default=0.0)
+    figures = {"seconds": max(spans, default=0.0)}
     flown = _flown(log, figures)
     _motion(log, figures, flown)
     _thrust(log, figures, flown)
@@ -101,67 +106,56 @@ def excitation(log: FlightLog) -> dict[str, float]:
 
 def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
     """First and last time in the air, by height or by thrust."""
-    name = next((n for n in POSITIONS if n in log and len(log[n].time) > 20), None)
-    if name is None:
+    found = _first(log, POSITIONS)
+    if found is None:
         return -np.inf, np.inf
-    channel = log[name]
-    height = channel.values[channel.valid][:, 2] - np.percentile(channel.values[channel.valid][:, 2], 1)
-    time = channel.time[channel.valid]
-    up = height > 0.15 * np.max(height) if np.max(height) > 0.3 else np.ones(len(height), bool)
-    figures["seconds_flown"] = float(np.sum(up) * np.median(np.diff(time)))
-    figures["height_range_m"] = float(np.ptp(channel.values[channel.valid][:, 2]))
-    low = up & (channel.values[channel.valid][:, 2] < 0.3)
-    figures["seconds_low"] = float(np.sum(low) * np.median(np.diff(time)))
+    _, time, pos = found
+    above, period = pos[:, 2] - np.percentile(pos[:, 2], 1), np.median(np.diff(time))
+    up = above > 0.15 * np.max(above) if np.max(above) > 0.3 else np.ones(len(above), bool)
+    figures["seconds_flown"] = float(np.sum(up) * period)
+    figures["height_range_m"] = float(np.ptp(pos[:, 2]))
+    figures["seconds_low"] = float(np.sum(up & (pos[:, 2] < 0.3)) * period)
     return (float(time[up][0]), float(time[up][-1])) if np.any(up) else (-np.inf, np.inf)
 
 
 def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    name = next((n for n in POSITIONS if n in log and np.sum(log[n].valid) > 50), None)
-    if name is not None:
-        channel = log[name]
-        time, vel = relations.derivative(channel.time[channel.valid], channel.values[channel.valid].astype(float), 0.1)
-        inside = (time >= flown[0]) & (time <= flown[1])
-        speed = np.linalg.norm(vel[inside], axis=1)
+    if found := _first(log, POSITIONS, 50):
+        time, vel = relations.derivative(*found[1:], 0.1)
+        speed = np.linalg.norm(vel[(time >= flown[0]) & (time <= flown[1])], axis=1)
         if len(speed):
             figures["speed_p95_m_s"] = float(np.percentile(speed, 95))
             figures["seconds_hover"] = float(np.sum(speed < 0.15) * np.median(np.diff(time)))
-    name = next((n for n in ATTITUDES if n in log and len(log[n].time) > 20), None)
-    if name is not None:
-        x, y, z, w = log[name].values[log[name].valid].astype(float).T
+    if found := _first(log, ATTITUDES):
+        x, y, z, w = found[2].T
         yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
         figures["yaw_range_deg"] = float(np.degrees(np.percentile(yaw, 98) - np.percentile(yaw, 2)))
-    if "rate_b" in log and len(log["rate_b"].time) > 20:
-        figures["rate_p95_rad_s"] = float(np.percentile(np.linalg.norm(log["rate_b"].values, axis=1), 95))
+    if found := _first(log, ("rate_b",)):
+        figures["rate_p95_rad_s"] = float(np.percentile(np.linalg.norm(found[2], axis=1), 95))
 
 
 def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    name = next((n for n in THRUSTS if n in log and len(log[n].time) > 20), None)
-    if name is not None:
-        channel = log[name]
-        inside = channel.valid & (channel.time >= flown[0]) & (channel.time <= flown[1])
-        values = channel.values[inside].astype(float).reshape(int(np.sum(inside)), int(np.prod(channel.values.shape[1:])))
+    if found := _first(log, THRUSTS):
+        name, time, values = found
+        values = values[(time >= flown[0]) & (time <= flown[1])]
         thrust = values[:, 0] if name in ("command", "thrust_command") else np.mean(values, axis=1)
         thrust = thrust**2 if name == "motor_speed" else thrust
         if len(thrust):
             low, middle, high = np.percentile(thrust, [5, 50, 95])
             figures["thrust_range"] = float((high - low) / max(middle, 1e-9))
-    if "battery_voltage" in log:
-        volts = log["battery_voltage"].values[log["battery_voltage"].valid]
-        if len(volts):
-            figures["voltage_range"] = float(np.percentile(volts, 95) - np.percentile(volts, 5))
+    if found := _first(log, ("battery_voltage",), 0):
+        figures["voltage_range"] = float(np.percentile(found[2], 95) - np.percentile(found[2], 5))
 
 
 def _payload(log: FlightLog, figures: dict) -> None:
-    if "payload_pos_w" not in log or np.sum(log["payload_pos_w"].valid) < 50:
+    found = _first(log, ("payload_pos_w",), 49)
+    if found is None:
         return
-    payload = log["payload_pos_w"]
-    time, pos = payload.time[payload.valid], payload.values[payload.valid].astype(float)
+    _, time, pos = found
     _, vel = relations.derivative(time, pos, 0.1)
     if len(vel):
         figures["payload_speed_p95_m_s"] = float(np.percentile(np.linalg.norm(vel, axis=1), 95))
-    if "pos_w" in log and np.sum(log["pos_w"].valid) > 50:
-        vehicle = log["pos_w"]
-        gap = pos - relations.on_grid(vehicle.time[vehicle.valid], vehicle.values[vehicle.valid].astype(float), time)
+    if vehicle := _first(log, ("pos_w",), 50):
+        gap = pos - relations.on_grid(*vehicle[1:], time)
         angle = np.degrees(np.arctan2(np.linalg.norm(gap[:, :2], axis=1), -gap[:, 2]))
         figures["swing_deg"] = float(np.percentile(angle, 95))
     if "release_command" in log:
@@ -170,18 +164,14 @@ def _payload(log: FlightLog, figures: dict) -> None:
 
 
 def _standing(log: FlightLog, figures: dict) -> None:
-    name = next((n for n in POSITIONS if n in log and np.sum(log[n].valid) > 20), None)
-    thrust = next((n for n in ("motor_command", "pwm", "throttle", "motor_speed") if n in log), None)
-    idle = False
-    if thrust is not None and len(log[thrust].time):
-        values = log[thrust].values.astype(float)
-        top = float(np.percentile(values, 95))
-        idle = top < (IDLE_SPEED if thrust == "motor_speed" else IDLE_SHARE)
-    if "throttle" in log and np.ptp(log["throttle"].values) == 0.0:
-        idle = True
-    if name is not None:
-        pos = log[name].values[log[name].valid].astype(float)
-        if float(np.max(np.percentile(pos, 98, axis=0) - np.percentile(pos, 2, axis=0))) < STILL and (idle or thrust is None):
+    place, thrust = _first(log, POSITIONS), _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 0)
+    idle = "throttle" in log and np.ptp(log["throttle"].values) == 0.0
+    if thrust is not None:
+        name, _, values = thrust
+        idle |= float(np.percentile(values, 95)) < (IDLE_SPEED if name == "motor_speed" else IDLE_SHARE)
+    if place is not None:
+        width = np.max(np.percentile(place[2], 98, axis=0) - np.percentile(place[2], 2, axis=0))
+        if width < STILL and (idle or thrust is None):
             figures["still"] = 1.0
     elif idle:
         figures["idle"] = 1.0

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from visthrow.diagnose.check import excitation, signals
 from visthrow.logs.check import physics, relations, thrust
 from visthrow.logs.check.rows import NOTHING, Known, Row, Verdict, worst
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 _ALIKE = 0.2
 """Logs that share a larger part of their samples are copies of one another."""
@@ -95,13 +95,11 @@ def _until_landing(log: FlightLog) -> FlightLog:
     """Without the payload's samples after its landing: what lies on the floor stands still."""
     if "landing" not in log or not len(log["landing"].time):
         return log
-    end = float(log["landing"].time[0])
     channels = dict(log.channels)
-    for name in ("payload_pos_w", "payload_vel_w", "cable_points_w"):
-        if name in channels:
-            c = channels[name]
-            keep = c.time <= end
-            channels[name] = Channel(c.time[keep], c.values[keep], c.unit, c.frame, c.valid[keep])
+    for name in channels.keys() & {"payload_pos_w", "payload_vel_w", "cable_points_w"}:
+        c = channels[name]
+        keep = c.time <= log["landing"].time[0]
+        channels[name] = replace(c, time=c.time[keep], values=c.values[keep], valid=c.valid[keep])
     return FlightLog(channels, log.meta)
 
 
@@ -164,15 +162,14 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
     found: dict[int, list[Row]] = {}
     named = [i for i, log in enumerate(logs) if "payload_pos_w" in log and np.sum(log["payload_pos_w"].valid) > 100]
     for first, second in combinations(named[:_MOST_PAIRED], 2):
-        both = (logs[i]["payload_pos_w"] for i in (first, second))
-        (time_a, a), (time_b, b) = ((c.time[c.valid], c.values[c.valid]) for c in both)
+        (time_a, a), (time_b, b) = (logs[i]["payload_pos_w"].samples() for i in (first, second))
         if max(np.max(np.std(a, axis=0)), np.max(np.std(b, axis=0))) < physics.MOVES:
             continue
-        relation = relations.relate(time_a, a.astype(float), time_b, b.astype(float))
+        relation = relations.relate(time_a, a, time_b, b)
         if relation is None or relation.correlation < 0.99:
             continue
         inside = (time_a > time_b[0] - relation.delay) & (time_a < time_b[-1] - relation.delay)
-        apart = a[inside] - relations.on_grid(time_b, b.astype(float), time_a[inside] + relation.delay)
+        apart = a[inside] - relations.on_grid(time_b, b, time_a[inside] + relation.delay)
         off = float(np.sqrt(np.mean(apart**2))) if np.any(inside) else np.inf
         if off < _ONE_PAYLOAD:
             late, sd = 1e3 * relation.delay, 1e3 * relation.delay_sd

@@ -355,7 +355,7 @@ class _Chooser:
                 continue
             found, times = None, 1.0
             if attitude is not None and len(attitude.time) > 100:
-                at, derived = relations.rates_of(attitude.time[attitude.valid], attitude.values[attitude.valid])
+                at, derived = relations.rates_of(*attitude.samples())
                 good = np.all(np.isfinite(group.values), axis=1)
                 found = relations.relate(at, derived, self.time[good], group.values[good], reach=0.2)
                 times = float(np.sqrt(np.mean(np.var(group.values[good], axis=0)) / max(np.mean(np.var(derived, axis=0)), 1e-12)))
@@ -435,7 +435,7 @@ def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | Non
         return None
     mass, gap = thrust.mass_of(log), None
     if "payload_pos_w" in log:
-        (time, pos), (time_p, pos_p) = physics.valid(log["pos_w"]), physics.valid(log["payload_pos_w"])
+        (time, pos), (time_p, pos_p) = log["pos_w"].samples(), log["payload_pos_w"].samples()
         gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))
     name, _, total = applied
     motors = 1 if name in ("thrust_command", "throttle") else 4

@@ -125,7 +125,7 @@ class BallModel(NumericModel):
 
 def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
     channel = log[CHANNEL]
-    time, pos = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    time, pos = channel.samples()
     if len(time) < 40:
         return []
     sigma = sigma_of(channel, 1e-5)

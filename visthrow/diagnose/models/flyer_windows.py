@@ -9,7 +9,6 @@ from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
 from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
-from visthrow.logs.check.physics import valid
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -131,8 +130,8 @@ def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np
 def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
     """Means of the held commands over fine steps, from one window before the start to its end, shape (fine steps, motors)."""
     edges = start - params.window + params.step / FINE * np.arange(2 * FINE * round(params.window / params.step) + 1)
-    time, values = channel.time[channel.valid], channel.values[channel.valid].astype(float)
-    values = values.reshape(len(time), -1)[:, : 1 if params.input == "command" else None]
+    time, values = channel.samples()
+    values = values[:, : 1 if params.input == "command" else None]
     ends = np.concatenate([[min(time[0], edges[0])], time[1:], [max(time[-1], edges[-1]) + 1.0]])
     whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)])
     return np.diff(on_grid(ends, whole, edges), axis=0) / (params.step / FINE)
@@ -140,7 +139,7 @@ def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
 
 def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
     """Rotations at the half steps, shape (half steps, 3, 3)."""
-    time, quat = valid(channel)
+    time, quat = channel.samples()
     near = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
     return attitude_at(time[near], quat[near], times).as_matrix()
 
@@ -156,7 +155,7 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
     """
     if "acc_b" not in log or not np.any(log["acc_b"].valid):
         return np.zeros((len(times), 3))
-    time, force = valid(log["acc_b"])
+    time, force = log["acc_b"].samples()
     share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1], step)
@@ -170,8 +169,8 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
 
 def _offset(log: FlightLog, attitude: str) -> np.ndarray:
     """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape (3,)."""
-    time, rate = rates_of(*valid(log[attitude]))
-    return np.median(mean_over(*valid(log["rate_b"]), time, 0.06) - rate, axis=0)
+    time, rate = rates_of(*log[attitude].samples())
+    return np.median(mean_over(*log["rate_b"].samples(), time, 0.06) - rate, axis=0)
 
 
 def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
+from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"
@@ -125,8 +126,7 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
     vehicle, attitude, payload = log["pos_w"], log["quat_wb"], log["payload_pos_w"]
     good = vehicle.valid & attitude.valid & payload.valid if len(vehicle.time) == len(payload.time) else vehicle.valid
     time = vehicle.time[good]
-    pos = np.column_stack([np.interp(time, payload.time[payload.valid], c) for c in payload.values[payload.valid].T])
-    gap = pos + np.array([0.0, 0.0, params.marker_z]) - vehicle.values[good]
+    gap = on_grid(*payload.samples(), time) + np.array([0.0, 0.0, params.marker_z]) - vehicle.values[good]
     rot = matrix_of_quat(attitude.values[good])
     angles = log["gimbal"].values[good] if "gimbal" in log else np.zeros((len(time), 2))
     gimbal = Rotation.from_euler("XY", angles).as_matrix()

@@ -114,7 +114,8 @@ class PendulumModel(NumericModel):
 
 def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretch]:
     channel = log[CHANNEL]
-    time, angle = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    time, angle = channel.samples()
+    angle = angle[:, 0]
     if len(time) < FEWEST:
         return []
     if np.median(np.abs(angle - params.hanging)) > FARTHEST:

@@ -120,10 +120,9 @@ def _latent(start: float, end: float) -> dict[str, np.ndarray]:
 
 def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
     position, command = log[params.position], log[params.command]
-    time_v, vel = derivative(position.time[position.valid], position.values[position.valid].astype(float), 0.2)
+    time_v, vel = derivative(*position.samples(), 0.2)
     if params.velocity in log:
-        channel = log[params.velocity]
-        time_v, vel = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+        time_v, vel = log[params.velocity].samples()
     found = []
     for start in np.arange(command.time[0], command.time[-1] - params.slowest_window, params.slowest_window):
         end = start + params.slowest_window

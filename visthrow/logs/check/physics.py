@@ -9,7 +9,7 @@ from visthrow.common.constants import GRAVITY
 from visthrow.logs.axes import EVERY, MATRICES, OURS, is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, Known, Row
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import FlightLog
 
 MOVES = 0.05
 """Below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared."""
@@ -30,11 +30,6 @@ _LONGER, _OTHER_CABLE = 0.05, 0.25  # of the model's length: markers sit off the
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 _SEEN = 0.5  # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
-
-
-def valid(channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-    values = channel.values.astype(float)
-    return channel.time[channel.valid], values[channel.valid].reshape(int(np.sum(channel.valid)), int(np.prod(values.shape[1:])))
 
 
 def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
@@ -68,7 +63,7 @@ def _plausible(log: FlightLog) -> Iterator[Row]:
     for name, channel in log.channels.items():
         if channel.unit != "m" or channel.values.shape[1:] != (3,) or np.sum(channel.valid) < 50 or "setpoint" in name:
             continue
-        time, pos = valid(channel)
+        time, pos = channel.samples()
         period = float(np.median(np.diff(time)))
         if not _PERIOD[0] <= period <= _PERIOD[1]:
             text = f"a sample every {period:.3g} s, expected {_PERIOD[0]:g} to {_PERIOD[1]:g}: is the unit of time wrong?"
@@ -89,43 +84,39 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
     """Commands, voltages and angles of a size that only another unit gives them."""
     for name in ("quat_wb", "est_quat_wb", "mocap_quat_wb"):
         if name in log and np.sum(log[name].valid) > 50:
-            up = Rotation.from_quat(valid(log[name])[1]).apply([0.0, 0.0, 1.0])[:, 2]
+            up = Rotation.from_quat(log[name].samples()[1]).apply([0.0, 0.0, 1.0])[:, 2]
             tilt = float(np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0)))))
             if tilt > _STEEPEST:
                 text = f"half of the time tilted by more than {tilt:.0f} deg: degrees taken for radians, axes, or quaternion order?"
                 yield Row("units", name, "bad", text, {"median_tilt_deg": tilt})
     for name in _SHARES:
         if name in log and log[name].unit == "1" and np.any(log[name].valid):
-            high = float(np.percentile(np.abs(valid(log[name])[1]), 95))
+            high = float(np.percentile(np.abs(log[name].samples()[1]), 95))
             if high > _LARGEST_SHARE:
                 text = f"95 % of the values reach {high:.3g}: no shares of the full command"
                 yield Row("units", name, "bad", text, {"p95": high})
     for name in ("battery_voltage", "supply_voltage"):
         if name in log and np.any(log[name].valid):
-            middle = float(np.median(valid(log[name])[1]))
+            middle = float(np.median(log[name].samples()[1]))
             if middle > _VOLTS[1] or 0.0 < middle < _VOLTS[0]:
                 yield Row("units", name, "bad", f"{middle:.3g} V: no such pack; another unit?", {"median_v": middle})
 
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
-    (time_p, p), (time_v, v) = valid(log[pos]), valid(log[vel])
+    (time_p, p), (time_v, v) = log[pos].samples(), log[vel].samples()
     if not (usable(time_p, p, 0.02) and usable(time_v, v, 0.0)):
         return []
-    time_d, derived = relations.derivative(time_p, p)
-    return _compared(relations.relate(time_d, derived, time_v, v), f"d({pos})/dt", vel)
+    return _compared(relations.relate(*relations.derivative(time_p, p), time_v, v), f"d({pos})/dt", vel)
 
 
 def _rates(log: FlightLog, quat: str) -> list[Row]:
     if "rate_b" not in log:
         return []
-    (time_q, q), (time_w, w) = valid(log[quat]), valid(log["rate_b"])
-    if len(time_q) < 50 or len(time_w) < 50:
+    measured = log["rate_b"].samples()
+    derived = relations.rates_of(*log[quat].samples())
+    if not (usable(*derived, 0.0) and usable(*measured, 0.0) and (usable(*derived, MOVES) or usable(*measured, MOVES))):
         return []
-    time_d, derived = relations.rates_of(time_q, q)
-    moving = usable(time_d, derived, MOVES) or usable(time_w, w, MOVES)
-    if not (moving and usable(time_d, derived, 0.0) and usable(time_w, w, 0.0)):
-        return []
-    return _compared(relations.relate(time_d, derived, time_w, w), f"rate of {quat}", "rate_b")
+    return _compared(relations.relate(*derived, *measured), f"rate of {quat}", "rate_b")
 
 
 def _compared(found: relations.Relation | None, first: str, second: str) -> list[Row]:
@@ -133,14 +124,12 @@ def _compared(found: relations.Relation | None, first: str, second: str) -> list
     if found is None:
         return []
     both = f"{first}, {second}"
-    figures = {"correlation": found.correlation, "delay_s": found.delay, "delay_sd_s": found.delay_sd, "scale": found.scale}
+    figures = _figures(found)
     if _apart(found):
         text = f"hardly go together in any axes (correlation {found.axes_correlation:.2f}): not the same flight, or noise"
         return [Row("frames", both, "bad", text, figures)]
-    if found.nats > _NATS and found.axes_correlation > found.correlation + CLEARLY:
-        text = f"go together as ({found.axes}), {found.nats:.0f} nats better: {_kind(found.axes)} "
-        text += f"(correlation {found.axes_correlation:.2f}, not {found.correlation:.2f})"
-        return [Row("frames", both, "bad", text, figures | {"axes": found.axes, "nats": found.nats})]
+    if _turned(found):
+        return [Row("frames", both, "bad", f"go together {_better(found)}", figures | {"axes": found.axes, "nats": found.nats})]
     rows = [Row("frames", both, "ok", f"go together as they are, correlation {found.correlation:.2f}", figures)]
     if not 0.67 < found.scale < 1.5:
         hint = relations.unit_hint(found.scale) or "no unit explains it"
@@ -148,6 +137,20 @@ def _compared(found: relations.Relation | None, first: str, second: str) -> list
         text = f"the second is {found.scale:.4g} times the first: {'noise dilutes it' if weak else hint}"
         rows.append(Row("units", both, "warn" if weak else "bad", text, figures))
     return [*rows, _late(found, both, figures)]
+
+
+def _figures(found: relations.Relation) -> dict[str, float]:
+    return {"correlation": found.correlation, "delay_s": found.delay, "delay_sd_s": found.delay_sd, "scale": found.scale}
+
+
+def _turned(found: relations.Relation) -> bool:
+    return found.nats > _NATS and found.axes_correlation > found.correlation + CLEARLY
+
+
+def _better(found: relations.Relation) -> str:
+    """Words about an exchange of axes that beats those as they are."""
+    text = f"as ({found.axes}), {found.nats:.0f} nats better: {_kind(found.axes)} "
+    return text + f"(correlation {found.axes_correlation:.2f}, not {found.correlation:.2f})"
 
 
 def _kind(axes: str) -> str:
@@ -173,14 +176,14 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     """The mean force on the body, turned to the world, must hold the vehicle up."""
     if "acc_b" not in log:
         return []
-    (time_q, q), (time_a, acc) = valid(log[quat]), valid(log["acc_b"])
+    (time_q, q), (time_a, acc) = log[quat].samples(), log["acc_b"].samples()
     if len(time_q) < 50 or len(time_a) < 50:
         return []
     at = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
     mean_w = np.mean(Rotation.from_quat(q).apply(acc[at]), axis=0)
     extra = np.zeros(3)
     if pos in log and len(log[pos].time) > 50:
-        time_p, p = valid(log[pos])
+        time_p, p = log[pos].samples()
         _, v = relations.derivative(time_p, p)
         extra = (v[-1] - v[0]) / float(np.ptp(time_p)) if len(v) else extra
     mean_w = mean_w - extra
@@ -206,7 +209,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     """
     if path not in log or ("acc_b" not in log and "payload_pos_w" in log and "attached" not in log):
         return []
-    (time_p, p), (time_q, q) = valid(log[path]), valid(log[quat])
+    (time_p, p), (time_q, q) = log[path].samples(), log[quat].samples()
     if len(time_p) < 50 or len(time_q) < 50:
         return []
     time, acc = accelerations(time_p, p, log[path].unit)
@@ -214,7 +217,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         return []
     turn = relations.attitude_at(time_q, q, time)
     if "acc_b" in log:
-        time_a, force_b = valid(log["acc_b"])
+        time_a, force_b = log["acc_b"].samples()
         if len(time_a) < 50:
             return []
         pushed = relations.attitude_at(time_q, q, time_a).apply(force_b) - [0.0, 0.0, GRAVITY]
@@ -242,9 +245,7 @@ def _exchanged_body(time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray
     found = relations.relate(at, relations.on_grid(time, expected_b, at), at, felt, reach=_DELAY_BAD)
     if found is None or found.nats < _NATS or found.axes_correlation < _SEEN:
         return None
-    text = f"acc_b fits as ({found.axes}), {found.nats:.0f} nats better: {_kind(found.axes)} "
-    text += f"(correlation {found.axes_correlation:.2f}, not {found.correlation:.2f})"
-    return Row("frames", both, "bad", text, {"axes": found.axes, "of": "acc_b", "nats": found.nats})
+    return Row("frames", both, "bad", f"acc_b fits {_better(found)}", {"axes": found.axes, "of": "acc_b", "nats": found.nats})
 
 
 def accelerations(time: np.ndarray, path: np.ndarray, unit: str) -> tuple[np.ndarray, np.ndarray]:
@@ -307,7 +308,7 @@ def _still_gravity(log: FlightLog) -> list[Row]:
     """Without an attitude: the size of the force, in its median."""
     if "acc_b" not in log or any(f"{prefix}quat_wb" in log for prefix in _PREFIXES):
         return []
-    _, acc = valid(log["acc_b"])
+    _, acc = log["acc_b"].samples()
     if len(acc) < 20:
         return []
     size = float(np.median(np.linalg.norm(acc, axis=1)))
@@ -318,45 +319,30 @@ def _still_gravity(log: FlightLog) -> list[Row]:
     return [Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)]
 
 
-def _body_rates(log: FlightLog) -> tuple[str, np.ndarray, np.ndarray] | None:
-    """Measured rates, or those of the measured attitude."""
-    if "rate_b" in log:
-        return ("rate_b", *valid(log["rate_b"]))
-    if "quat_wb" in log and len(valid(log["quat_wb"])[0]) > 50:
-        return ("rate of quat_wb", *relations.rates_of(*valid(log["quat_wb"])))
-    return None
-
-
 def _commands(log: FlightLog) -> list[Row]:
+    """Whether the measured rates, or those of the measured attitude, follow what was commanded."""
+    if "rate_b" in log:
+        turning, rates = "rate_b", log["rate_b"].samples()
+    elif "quat_wb" in log:
+        turning, rates = "rate of quat_wb", relations.rates_of(*log["quat_wb"].samples())
+    else:
+        return []
     rows: list[Row] = []
-    pairs = []
-    rates = _body_rates(log)
-    if rates is None:
-        return rows
-    turning, time_w, rate = rates
-    if "command" in log:
-        time, command = valid(log["command"])
-        pairs.append(("command", time, command[:, 1:]))
-    if "rate_setpoint_b" in log:
-        pairs.append(("rate_setpoint_b", *valid(log["rate_setpoint_b"])))
-    for name, time, wanted in pairs:
-        if not (usable(time, wanted, MOVES) and usable(time_w, rate, MOVES)):
-            continue
-        found = relations.relate(time, wanted, time_w, rate)
-        if found is None:
-            continue
-        rows += _followed(found, f"{name}, {turning}", float(np.max(np.std(rate, axis=0))))
+    for name in (name for name in ("command", "rate_setpoint_b") if name in log and usable(*rates, MOVES)):
+        time, wanted = log[name].samples()
+        wanted = wanted[:, -3:]  # a command's first is thrust
+        if usable(time, wanted, MOVES) and (found := relations.relate(time, wanted, *rates)) is not None:
+            rows += _followed(found, f"{name}, {turning}", float(np.max(np.std(rates[1], axis=0))))
     return rows
 
 
 def _followed(found: relations.Relation, both: str, spread: float) -> list[Row]:
-    figures = {"correlation": found.correlation, "delay_s": found.delay, "delay_sd_s": found.delay_sd, "scale": found.scale}
+    figures = _figures(found)
     if _apart(found):
         text = f"the rates do not follow the commands (best correlation {found.axes_correlation:.2f}): not the same flight?"
         return [Row("frames", both, "bad" if spread > _LIVELY else "warn", text, figures)]
-    if found.nats > _NATS and found.axes_correlation > found.correlation + CLEARLY:
-        text = f"the rates follow the commands as ({found.axes}), {found.nats:.0f} nats better: {_kind(found.axes)} "
-        text += f"(correlation {found.axes_correlation:.2f}, not {found.correlation:.2f})"
+    if _turned(found):
+        text = f"the rates follow the commands {_better(found)}"
         return [Row("frames", both, "bad", text, figures | {"axes": found.axes, "nats": found.nats})]
     late = found.delay < -0.005
     hint = relations.unit_hint(found.scale)
@@ -370,7 +356,7 @@ def _followed(found: relations.Relation, both: str, spread: float) -> list[Row]:
 def _cable(log: FlightLog, known: Known) -> list[Row]:
     if "pos_w" not in log or "payload_pos_w" not in log:
         return []
-    (time_q, q), (time_p, p) = valid(log["pos_w"]), valid(log["payload_pos_w"])
+    (time_q, q), (time_p, p) = log["pos_w"].samples(), log["payload_pos_w"].samples()
     if len(time_q) < 20 or len(time_p) < 20:
         return []
     inside = (time_p > time_q[0]) & (time_p < time_q[-1])
@@ -428,7 +414,7 @@ def _same(log: FlightLog) -> list[Row]:
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         if first not in log or second not in log:
             continue
-        (time_a, a), (time_b, b) = valid(log[first]), valid(log[second])
+        (time_a, a), (time_b, b) = log[first].samples(), log[second].samples()
         if not (usable(time_a, a, MOVES) and usable(time_b, b, MOVES)):
             continue
         rows += _compared(relations.relate(time_a, a, time_b, b), first, second)
@@ -437,8 +423,9 @@ def _same(log: FlightLog) -> list[Row]:
     return rows
 
 
-def _drift(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, both: str, piece: float = 5.0) -> list[Row]:
-    delays = []
+def _drift(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, both: str) -> list[Row]:
+    """Whether the delay is the same from piece to piece of 5 s."""
+    delays, piece = [], 5.0
     for start in np.arange(time_a[0], time_a[-1] - piece, piece):
         near_a = (time_a >= start) & (time_a < start + piece)
         near_b = (time_b >= start - 1.0) & (time_b < start + piece + 1.0)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visthrow.common.rotations import continuous
-from visthrow.logs.axes import EVERY, MATRICES, is_mirror
+from visthrow.logs.axes import EVERY, MATRICES
 
 REACH = 0.4
 """Largest delay looked for [s]."""
@@ -35,7 +35,6 @@ class Relation:
     axes: str  # best exchange of axes: what x, y, z of the second are in the first
     axes_correlation: float  # with that exchange
     axes_delay: float  # of the second behind the first with that exchange [s]
-    mirror: bool  # whether that exchange is a mirror image
     nats: float  # by which that exchange beats the axes as they are, the choice among 48 paid for
 
 
@@ -80,28 +79,18 @@ def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray,
     own = np.trace(cross) / scale_of
     at = int(np.argmax(own))
     offset, curve = peak(own, at)
-    names, best, best_at = _best_axes(cross / scale_of) if a.shape[1] == 3 else _best_sign(own)
+    exchanges, matrices = (EVERY, MATRICES) if a.shape[1] == 3 else (("x", "-x"), np.array([[[1.0]], [[-1.0]]]))
+    scores = np.einsum("kij,jil->kl", matrices, cross / scale_of)
+    k, best_at = np.unravel_index(np.argmax(scores), scores.shape)
+    best = float(scores[k, best_at])
     effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
     sd = period * np.sqrt(max(1.0 - own[at] ** 2, 1e-6) / effective / max(curve, 1e-9))
     plain, turned = (min(max(c, 0.0), 0.999) for c in (own[at], best))
     nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EVERY))
     return Relation(
-        (at - steps + offset) * period, float(sd), float(own[at]), float(np.trace(cross[:, :, at])) / power, names, best,
-        (best_at - steps) * period, a.shape[1] == 3 and is_mirror(names), float(nats),
+        (at - steps + offset) * period, float(sd), float(own[at]), float(np.trace(cross[:, :, at])) / power, exchanges[k], best,
+        float(best_at - steps) * period, float(nats),
     )  # fmt: skip
-
-
-def _best_axes(cross: np.ndarray) -> tuple[str, float, int]:
-    """Best of all exchanges of axes: its name, its correlation and at which lag."""
-    scores = np.einsum("kij,jil->kl", MATRICES, cross)
-    k, at = np.unravel_index(np.argmax(scores), scores.shape)
-    return EVERY[k], float(scores[k, at]), int(at)
-
-
-def _best_sign(own: np.ndarray) -> tuple[str, float, int]:
-    """Best sign of a single component."""
-    at = int(np.argmax(np.abs(own)))
-    return ("x" if own[at] > 0.0 else "-x"), float(np.abs(own[at])), at
 
 
 def _centred(values: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from visthrow.logs.check import relations
-from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, usable, valid
+from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, usable
 from visthrow.logs.check.rows import NOTHING, Known, Row
 from visthrow.logs.flightlog import FlightLog
 
@@ -45,7 +45,7 @@ def thrust_of(log: FlightLog, known: Known = NOTHING) -> tuple[str, np.ndarray, 
     name = known.thrust_input or next((name for name in INPUTS if name in log), "")
     if name not in log or np.sum(log[name].valid) < 50:
         return None
-    time, values = valid(log[name])
+    time, values = log[name].samples()
     if name == "command":
         values = values[:, :1]
     if known.thrust_map is not None and name == known.thrust_input:
@@ -62,7 +62,7 @@ def mass_of(log: FlightLog, known: Known = NOTHING) -> float | None:
     if not newtons or "acc_b" not in log or np.sum(log["acc_b"].valid) < 50:
         return None
     _, time, thrust = told
-    acc = relations.on_grid(*valid(log["acc_b"]), time)[:, 2]
+    acc = relations.on_grid(*log["acc_b"].samples(), time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
     if "attached" in log and np.any(carries := log["attached"].hold(time) > 0.5):  # without its payload it is another mass
         flies &= carries
@@ -103,14 +103,15 @@ def _force(log: FlightLog, known: Known) -> list[Row]:
 def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Times [s] and specific force along body z [m/s^2], shape (N, 1), by the accelerometer or by the path."""
     if felt == "acc_b":
-        return (valid(log["acc_b"])[0], valid(log["acc_b"])[1][:, 2:3]) if "acc_b" in log else None
+        time, force_b = log["acc_b"].samples() if "acc_b" in log else (np.empty(0), np.empty((0, 3)))
+        return time, force_b[:, 2:3]
     path = next((n for n in ("vel_w", "pos_w") if n in log), None)
     if path is None or "quat_wb" not in log:
         return None
-    time, acc = accelerations(*valid(log[path]), log[path].unit)
-    if len(time) < 50 or len(valid(log["quat_wb"])[0]) < 50:
+    time, acc = accelerations(*log[path].samples(), log[path].unit)
+    if len(time) < 50 or len(log["quat_wb"].samples()[0]) < 50:
         return None
-    turn = relations.attitude_at(*valid(log["quat_wb"]), time)
+    turn = relations.attitude_at(*log["quat_wb"].samples(), time)
     return time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY])[:, 2:3]
 
 
@@ -158,7 +159,7 @@ def _rotors(log: FlightLog) -> list[Row]:
     for name in ROTORS:
         if name not in log or log[name].values.shape[1:] != (4,):
             continue
-        _, values = valid(log[name])
+        _, values = log[name].samples()
         total = np.mean(values, axis=1)
         flies = total > 0.5 * np.percentile(total, 90)
         if len(values) < 50 or np.percentile(total, 90) <= (IDLE_SPEED if name == "motor_speed" else IDLE_SHARE):
@@ -184,7 +185,7 @@ def _turning(log: FlightLog) -> list[Row]:
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), None)
     if name is None or "rate_b" not in log or log[name].values.shape[1:] != (4,):
         return []
-    (time_m, motors), (time_w, rate) = valid(log[name]), valid(log["rate_b"])
+    (time_m, motors), (time_w, rate) = log[name].samples(), log["rate_b"].samples()
     if not usable(time_w, rate, MOVES) or len(time_m) < 50:
         return []
     time_d, turning = relations.derivative(time_w, rate, 0.03)

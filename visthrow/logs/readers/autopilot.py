@@ -4,7 +4,7 @@ All of them are north-east-down and forward-right-down; ours become x north, y w
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,22 +19,12 @@ NED = "x,-y,-z"
 """Our axes in the autopilot's, world and body alike."""
 
 
-@dataclass(frozen=True)
-class Tap:
-    """Fields of one kind of message that make a channel; of taps to one channel the first that is there is used."""
-
-    message: str
-    fields: tuple[str, ...]
-    channel: str
-    unit: str
-    kind: str = "vector"
-    flip: bool = True  # from forward-right-down or north-east-down
-    frame: str = ""
-    scale: float = 1.0
-
-
-def _t(message: str, fields: str, channel: str, unit: str, **more) -> Tap:
-    return Tap(message, tuple(fields.split()), channel, unit, **more)
+def _t(message: str, fields: str, channel: str, unit: str, kind: str = "vector", **more) -> tuple[str, ChannelMap]:
+    """Fields of one kind of message that make a channel; of those to one channel the first that is there is used."""
+    columns, turned = tuple(fields.split()), kind != "vector"
+    axes = NED if turned or len(columns) == 3 else ""
+    order = "wxyz" if kind == "quaternion" else "xyzw"
+    return message, ChannelMap(channel, columns, unit, kind, order, axes=axes, body_axes=NED if turned else "", **more)
 
 
 ULOG = (
@@ -47,11 +37,11 @@ ULOG = (
     _t("vehicle_visual_odometry", "position[0] position[1] position[2]", "mocap_pos_w", "m", frame="world"),
     _t("vehicle_visual_odometry", "q[0] q[1] q[2] q[3]", "mocap_quat_wb", "1", kind="quaternion", frame="world"),
     _t("vehicle_rates_setpoint", "roll pitch yaw", "rate_setpoint_b", "rad/s", frame="body"),
-    _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", flip=False, scale=-1.0),
-    _t("battery_status", "voltage_v", "battery_voltage", "V", flip=False),
-    _t("battery_status", "current_a", "current", "A", flip=False),
-    _t("actuator_motors", "control[2] control[0] control[1] control[3]", "motor_command", "1", flip=False),
-    _t("actuator_outputs", "output[2] output[0] output[1] output[3]", "motor_output", "1", flip=False),
+    _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", scale=-1.0),
+    _t("battery_status", "voltage_v", "battery_voltage", "V"),
+    _t("battery_status", "current_a", "current", "A"),
+    _t("actuator_motors", "control[2] control[0] control[1] control[3]", "motor_command", "1"),
+    _t("actuator_outputs", "output[2] output[0] output[1] output[3]", "motor_output", "1"),
 )
 """PX4's quad X: motors front right, rear left, front left, rear right."""
 
@@ -65,10 +55,10 @@ DATAFLASH = (
     _t("IMU", "AccX AccY AccZ", "acc_b", "m/s^2", frame="body"),
     _t("VISP", "PX PY PZ", "mocap_pos_w", "m", frame="world"),
     _t("RATE", "RDes PDes YDes", "rate_setpoint_b", "deg/s", frame="body"),
-    _t("BAT", "Volt", "battery_voltage", "V", flip=False),
-    _t("BAT", "Curr", "current", "A", flip=False),
-    _t("RCOU", "C3 C1 C2 C4", "motor_output", "1", flip=False),
-    _t("CTUN", "ThO", "throttle", "1", flip=False),
+    _t("BAT", "Volt", "battery_voltage", "V"),
+    _t("BAT", "Curr", "current", "A"),
+    _t("RCOU", "C3 C1 C2 C4", "motor_output", "1"),
+    _t("CTUN", "ThO", "throttle", "1"),
 )
 """ArduPilot's quad X: motors front right, rear left, front left, rear right."""
 
@@ -84,9 +74,9 @@ TELEMETRY = (
     _t("VISION_POSITION_ESTIMATE", "x y z", "mocap_pos_w", "m", frame="world"),
     _t("ATT_POS_MOCAP", "x y z", "mocap_pos_w", "m", frame="world"),
     _t("ATTITUDE_TARGET", "body_roll_rate body_pitch_rate body_yaw_rate", "rate_setpoint_b", "rad/s", frame="body"),
-    _t("ATTITUDE_TARGET", "thrust", "throttle", "1", flip=False),
-    _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV", flip=False),
-    _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1", flip=False),
+    _t("ATTITUDE_TARGET", "thrust", "throttle", "1"),
+    _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV"),
+    _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1"),
 )
 
 SWEEP, SWEEP_AXES = ("SIDS", "SIDD"), 7
@@ -107,23 +97,27 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
         LogError: It cannot be read, or holds nothing of a vehicle's motion.
     """
     reader, taps = READERS[Path(path).suffix.lower()]
-    found = reader(path, {tap.message for tap in taps} | set(SWEEP))
+    found = reader(path, {message for message, _ in taps} | set(SWEEP))
     channels, notes = {}, {}
-    for tap in taps:
-        fields = found.first(tap.message)
-        if fields is None or tap.channel in channels or not all(field in fields for field in tap.fields):
+    for message, entry in taps:
+        fields = found.first(message)
+        if fields is None or entry.name in channels or not all(column in fields for column in entry.columns):
             continue
-        flip = NED if tap.flip and (len(tap.fields) == 3 or tap.kind != "vector") else ""
-        entry = ChannelMap(
-            tap.channel, tap.fields, tap.unit, kind=tap.kind, order="wxyz" if tap.kind == "quaternion" else "xyzw",
-            axes=flip, body_axes=flip if tap.kind != "vector" else "", frame=tap.frame, scale=tap.scale,
-        )  # fmt: skip
         with np.errstate(invalid="ignore"):  # damaged floats
-            values = np.column_stack([fields[field] for field in tap.fields]).astype(float)
-        channels[tap.channel], noted = make_channel(np.asarray(fields["time"], float), values, entry, str(path))
-        notes[tap.channel] = noted | {"clock": "autopilot", "message": tap.message}
+            values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
+        channels[entry.name], noted = make_channel(np.asarray(fields["time"], float), values, entry, str(path))
+        notes[entry.name] = noted | {"clock": "autopilot", "message": message}
     _add_sweep(channels, notes, found)
-    return _from_zero(channels, found, {"ingest": notes})
+    starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
+    if not starts:
+        known = ", ".join(sorted({message for message, _ in taps}))
+        raise LogError(f"{path}: no message of a vehicle's motion in it; known: {known}")
+    start = min(starts)  # time counts from the first sample
+    if not math.isfinite(start):
+        raise LogError(f"{path}: stamps are not finite")
+    channels = {name: replace(channel, time=channel.time - start) for name, channel in channels.items()}
+    meta = {"source": str(path), "start": start, "kind": found.kind, "ingest": notes, **found.meta}
+    return FlightLog(channels, meta)
 
 
 def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:
@@ -138,18 +132,5 @@ def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:
     added = np.interp(rates.time, time, size, left=0.0, right=0.0) * (1.0 if axis == 0 else -1.0)
     values = rates.values.copy()
     values[:, axis] += added
-    channels["rate_setpoint_b"] = type(rates)(rates.time, values, rates.unit, rates.frame, rates.valid)
+    channels["rate_setpoint_b"] = replace(rates, values=values)
     notes["rate_setpoint_b"] |= {"sweep": f"SIDD about axis {axis}, {time[0]:.1f} to {time[-1]:.1f} s"}
-
-
-def _from_zero(channels: dict, found: Messages, meta: dict) -> FlightLog:
-    """Count time from the first sample."""
-    if not any(len(channel.time) for channel in channels.values()):
-        known = ", ".join(sorted({tap.message for tap in READERS[found.path.suffix.lower()][1]}))
-        raise LogError(f"{found.path}: no message of a vehicle's motion in it; known: {known}")
-    start = min(float(channel.time[0]) for channel in channels.values() if len(channel.time))
-    if not math.isfinite(start):
-        raise LogError(f"{found.path}: stamps are not finite")
-    for name, channel in channels.items():
-        channels[name] = type(channel)(channel.time - start, channel.values, channel.unit, channel.frame, channel.valid)
-    return FlightLog(channels, {"source": str(found.path), "start": start, "kind": found.kind, **meta, **found.meta})

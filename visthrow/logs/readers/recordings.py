@@ -26,30 +26,28 @@ _CARD = 0xBC
 _CARD_TYPES = set("BbHhIiQqfdeL?")
 
 
-def read_recording(path: str | Path) -> Table:
-    """Read all columns of numbers.
-
-    Args:
-        path: One of :data:`READERS`, or a file of the Crazyflie's card.
+def read_recording(path: Path) -> Table:
+    """Read all columns of numbers from a file of one of :data:`READERS`, or of the Crazyflie's card.
 
     Raises:
         LogError: A package is missing, or the file cannot be read or holds no numbers.
     """
-    path = Path(path)
-    reader = READERS.get(path.suffix.lower(), _card)
+    reader, what = READERS.get(path.suffix.lower(), (_card, "a recording"))
     try:
         table = reader(path)
     except LogError:
         raise
     except Exception as error:  # readers of others raise what comes
-        raise LogError(f"{path}: cannot be read: {error!r}; expected {_EXPECTED.get(path.suffix.lower(), 'a recording')}") from error
+        raise LogError(f"{path}: cannot be read: {error!r}; expected {what}") from error
     if not table:
         raise LogError(f"{path}: no columns of numbers in it")
     return table
 
 
 def is_card(path: Path) -> bool:
-    """Tell whether a file without a known ending is of a Crazyflie's card."""
+    """Tell whether a file without a known ending is of a Crazyflie's card; LogError where there is none."""
+    if not path.is_file():
+        raise LogError(f"{path}: no such file")
     with path.open("rb") as file:
         head = file.read(5)
     return len(head) == 5 and head[0] == _CARD and struct.unpack("<H", head[1:3])[0] in (1, 2)
@@ -130,7 +128,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
         values = np.asarray(value)
         if values.dtype.names:
             table |= _flat({field: values[field] for field in values.dtype.names}, f"{prefix}{name}.")
-        elif values.dtype.kind in "bif" or values.dtype.kind == "u":
+        elif values.dtype.kind in "biuf":
             values = values.squeeze()
             values = values.T if values.ndim == 2 and values.shape[0] < values.shape[1] else values
             if values.ndim == 1 and len(values) > 1:
@@ -208,11 +206,8 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
                 yield from _numbers(getattr(value, key), f"{name}.{key}" if name else key)
 
 
-READERS: dict[str, Callable[[Path], Table]] = {
-    ".mat": _matlab, ".h5": _hdf5, ".hdf5": _hdf5, ".bag": _bag, ".db3": _bag, ".mcap": _mcap,
+READERS: dict[str, tuple[Callable[[Path], Table], str]] = {
+    ".mat": (_matlab, "a MATLAB file"), ".h5": (_hdf5, "an HDF5 file"), ".hdf5": (_hdf5, "an HDF5 file"),
+    ".bag": (_bag, "a ROS 1 bag"), ".db3": (_bag, "a ROS 2 bag"), ".mcap": (_mcap, "an MCAP file"),
 }  # fmt: skip
-"""Ending -> reader."""
-_EXPECTED = {
-    ".mat": "a MATLAB file", ".h5": "an HDF5 file", ".hdf5": "an HDF5 file", ".bag": "a ROS 1 bag", ".db3": "a ROS 2 bag",
-    ".mcap": "an MCAP file",
-}  # fmt: skip
+"""Ending -> reader, and what it expects."""

@@ -26,6 +26,7 @@ _LARGEST = 1e100
 """No number of a flight is as large, in whatever unit; its square is still a number."""
 _SNIFFED = 65536  # characters in which separators are looked for
 _COMMA = re.compile(r"\d,\d")
+_WORDS = {"True": 1.0, "False": 0.0}
 _LIST = re.compile(r"[\[(].*[\])]")
 _PARTS = re.compile(r"[,;\s]+")
 _OPENERS = {".gz": gzip.decompress, ".xz": lzma.decompress}
@@ -110,7 +111,7 @@ def _column(cells: tuple[str, ...], comma: bool = False) -> np.ndarray:
     except ValueError:
         pass
     try:
-        return np.array([float(cell) if cell.strip() else math.nan for cell in cells])
+        return np.array([float(_WORDS.get(cell, cell)) if cell.strip() else math.nan for cell in cells])
     except ValueError:
         return np.array(cells)
 
@@ -233,20 +234,14 @@ def make_channel(time: np.ndarray, values: np.ndarray, entry: ChannelMap, source
     """
     spec = STANDARD_CHANNELS.get(entry.name)
     unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
-    notes = {"rows": len(time)}
-    stamped = np.isfinite(time)
-    notes["unstamped"] = int(np.sum(~stamped))
-    time, values = time[stamped], values[stamped]
-    ahead = np.ones(len(time), dtype=bool)
-    if len(time):
-        highest = np.maximum.accumulate(time)
-        ahead[1:] = time[1:] > highest[:-1]
-        notes["repeated"] = int(np.sum(np.diff(time) == 0.0))
-        notes["backwards"] = int(np.sum(np.diff(time) < 0.0))
-    time, values = time[ahead], values[ahead]
-    said = ~np.all(np.isnan(values), axis=1)  # a row of blanks is of another channel: no sample
-    notes["blank"] = int(np.sum(~said))
-    time, values = time[said], values[said]
+    rows = np.flatnonzero(np.isfinite(time))
+    steps = np.diff(time[rows])
+    notes = {"rows": len(time), "unstamped": len(time) - len(rows), "repeated": int(np.sum(steps == 0.0)),
+             "backwards": int(np.sum(steps < 0.0))}  # fmt: skip
+    rows = rows[np.diff(np.maximum.accumulate(time[rows]), prepend=-np.inf) > 0.0]
+    blank = np.all(np.isnan(values[rows]), axis=1)  # a row of blanks is of another channel: no sample
+    notes["blank"] = int(np.sum(blank))
+    time, values = time[rows[~blank]], values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
     if entry.held and len(values):
         fresh = np.ones(len(values), dtype=bool)
@@ -296,53 +291,40 @@ def is_export(table: Table) -> bool:
     return "time [s]" in table and all(_EXPORTED.fullmatch(name) for name in table if name != "time [s]")
 
 
-def log_of_export(table: Table, source: str) -> FlightLog:
-    """Read back a table that :func:`visthrow.logs.export.export` wrote.
+def log_of_export(table: Table, path: Path) -> FlightLog:
+    """Read back a table that :func:`visthrow.logs.export.export` wrote; parquet carries the metadata.
 
     Raises:
         LogError: Columns of one channel do not fit together.
     """
-    found: dict[str, dict] = {}
+    time, found, channels = _numbers(table, "time [s]", str(path)), {}, {}
     for column in table:
         match = _EXPORTED.fullmatch(column)
-        if match and column != "time [s]":
-            index = tuple(int(part) for part in match["index"].split(",")) if match["index"] else ()
-            entry = found.setdefault(match["name"], {"unit": match["unit"], "frame": match["frame"] or "none", "at": {}})
-            entry["at"][index] = _as_numbers(table, column, source)
-    channels, time = {}, _numbers(table, "time [s]", source)
-    for name, entry in found.items():
-        if name in STANDARD_CHANNELS:  # its unit may hold a comma
-            entry["unit"], entry["frame"] = STANDARD_CHANNELS[name].unit, STANDARD_CHANNELS[name].frame
-        shape = tuple(np.max(list(entry["at"]), axis=0) + 1) if () not in entry["at"] else ()
-        if len(entry["at"]) != math.prod(shape):
-            raise LogError(f"{source}: channel '{name}' has {len(entry['at'])} columns; expected {math.prod(shape)}")
-        values = np.full((len(time), *shape), np.nan)
-        for index, cells in entry["at"].items():
-            values[(slice(None), *index)] = cells
-        there = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)  # not where it is NaN
-        try:
-            channels[name] = Channel(time[there], values[there], entry["unit"], entry["frame"])
-        except LogError as error:
-            raise LogError(f"{source}: channel '{name}': {error}") from error
+        if column != "time [s]":
+            index = tuple(map(int, match["index"].split(","))) if match["index"] else ()
+            place = match["unit"], match["frame"] or "none"
+            found.setdefault(match["name"], (place, {}))[1][index] = _numbers(table, column, str(path))
     try:
-        return FlightLog(channels, {"source": source})
+        for name, (place, cells) in found.items():
+            spec = STANDARD_CHANNELS.get(name)
+            unit, frame = place if spec is None else (spec.unit, spec.frame)  # a standard unit may hold a comma
+            shape = tuple(np.max(list(cells), axis=0) + 1) if () not in cells else ()
+            if len(cells) != math.prod(shape):
+                raise LogError(f"channel '{name}' has {len(cells)} columns; expected {math.prod(shape)}")
+            values = np.full((len(time), *shape), np.nan)
+            for index, column in cells.items():
+                values[(slice(None), *index)] = column
+            there = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)  # not where it is NaN
+            channels[name] = Channel(time[there], values[there], unit, frame)
+        return FlightLog(channels, {"source": str(path), **_metadata(path)})
     except LogError as error:
-        raise LogError(f"{source}: {error}") from error
+        raise LogError(f"{path}: {error}") from error
 
 
-def _as_numbers(table: Table, column: str, source: str) -> np.ndarray:
-    cells = table[column]
-    if cells.dtype.kind in "fiub":
-        return cells.astype(float)
-    words = {"True": 1.0, "False": 0.0, "": math.nan}
-    wrong = [cell for cell in cells.tolist() if cell not in words and not _is_number(cell)]
-    if wrong:
-        raise LogError(f"{source}: column '{column}' holds text such as '{wrong[0]}'; expected numbers, True or False")
-    return np.array([words[cell] if cell in words else float(cell) for cell in cells.tolist()])
-
-
-def metadata_of(path: str | Path) -> dict:
-    """Return the metadata that our own parquet export carries, or nothing."""
+def _metadata(path: Path) -> dict:
+    """Metadata of our own parquet export, or nothing."""
+    if path.suffix != ".parquet":
+        return {}
     import pyarrow.parquet as pq
 
     stored = (pq.read_schema(path).metadata or {}).get(b"visthrow")

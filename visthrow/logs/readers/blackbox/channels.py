@@ -34,7 +34,8 @@ def logs_of_blackbox(path: str | Path) -> list[FlightLog]:
         LogError: As :func:`read_blackbox`.
     """
     logs = read_blackbox(path)
-    return [_flight(_table(log), log.header, _raw_meta(log, path, i)) for i, log in enumerate(logs, start=1)]
+    tables = [dict(zip(log.names, log.main.T.astype(np.float64))) for log in logs]
+    return [_flight(table, log.header, _raw_meta(log, path, i)) for i, (log, table) in enumerate(zip(logs, tables), start=1)]
 
 
 def is_decoded(table: Table) -> bool:
@@ -67,10 +68,6 @@ def _decoded_factor(name: str, unit: str, path: str | Path) -> float:
     if unit not in known:
         raise LogError(f"{path}: column '{name}' is in '{unit}'; known: {', '.join(known)}")
     return known[unit]
-
-
-def _table(log: BlackboxLog) -> Table:
-    return {name: log.main[:, i].astype(np.float64) for i, name in enumerate(log.names)}
 
 
 def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:

@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 
 SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = 0, 1, 3, 6, 7, 8, 9, 10
-ENCODINGS = (SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE)
 _GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
 """Encoding -> largest number of fields packed together."""
 
@@ -82,35 +81,20 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
     return [r.signed() if tag >> i & 1 else 0 for i in range(count)]
 
 
-def _tagged_bytes(r: Reader, lead: int) -> list[int]:
-    return [r.little((lead >> shift & 3) + 1) for shift in (0, 2, 4)]
+def _three(one: tuple, two: tuple) -> Callable[["Reader", int], list[int]]:
+    """Three fields by the two highest bits: within a byte, one or two more (where each field's bits end, and how many), or byte by byte."""
+    places = (((4, 2), (2, 2), (0, 2)), one, two)
 
+    def decode(r: Reader, count: int) -> list[int]:
+        bits = r.byte()
+        selector = bits >> 6
+        if selector == 3:
+            return [r.little((bits >> shift & 3) + 1) for shift in (0, 2, 4)]
+        for _ in range(selector):
+            bits = bits << 8 | r.byte()
+        return [extend(bits >> shift, width) for shift, width in places[selector]]
 
-def _tag2_3s32(r: Reader, count: int) -> list[int]:
-    lead = r.byte()
-    selector = lead >> 6
-    if selector == 0:
-        return [extend(lead >> shift, 2) for shift in (4, 2, 0)]
-    if selector == 1:
-        second = r.byte()
-        return [extend(lead, 4), extend(second >> 4, 4), extend(second, 4)]
-    if selector == 2:
-        return [extend(lead, 6), extend(r.byte(), 6), extend(r.byte(), 6)]
-    return _tagged_bytes(r, lead)
-
-
-def _tag2_3svariable(r: Reader, count: int) -> list[int]:
-    lead = r.byte()
-    selector = lead >> 6
-    if selector == 0:
-        return [extend(lead >> shift, 2) for shift in (4, 2, 0)]
-    if selector == 1:  # 5, 5 and 4 bits
-        bits = lead << 8 | r.byte()
-        return [extend(bits >> 9, 5), extend(bits >> 4, 5), extend(bits, 4)]
-    if selector == 2:  # 8, 7 and 7 bits
-        bits = lead << 16 | r.byte() << 8 | r.byte()
-        return [extend(bits >> 14, 8), extend(bits >> 7, 7), extend(bits, 7)]
-    return _tagged_bytes(r, lead)
+    return decode
 
 
 def _tag8_4s16(r: Reader, count: int) -> list[int]:
@@ -127,15 +111,15 @@ def _tag8_4s16(r: Reader, count: int) -> list[int]:
     return values
 
 
-_DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
+DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
     SIGNED_VB: lambda r, n: [r.signed()],
     UNSIGNED_VB: lambda r, n: [r.unsigned()],
     NEG_14BIT: lambda r, n: [-extend(r.unsigned(), 14)],
     NULL: lambda r, n: [0],
     TAG8_8SVB: _tag8_8svb,
-    TAG2_3S32: _tag2_3s32,
+    TAG2_3S32: _three(((8, 4), (4, 4), (0, 4)), ((16, 6), (8, 6), (0, 6))),
     TAG8_4S16: _tag8_4s16,
-    TAG2_3SVARIABLE: _tag2_3svariable,
+    TAG2_3SVARIABLE: _three(((9, 5), (4, 5), (0, 4)), ((14, 8), (7, 7), (0, 7))),
 }
 
 
@@ -160,6 +144,6 @@ def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Callable[[Read
                 count += 1
         elif code in _GROUP:
             count = min(_GROUP[code], len(encodings) - i)
-        groups.append((_DECODERS[code], i, count))
+        groups.append((DECODERS[code], i, count))
         i += count
     return groups

@@ -7,21 +7,18 @@ Source: Betaflight, "Blackbox logging internals"; frame checks as in Betaflight'
 """
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.logs.readers.blackbox.codec import ENCODINGS, Corrupt, EndOfLog, Reader, extend, plan
+from visthrow.logs.readers.blackbox.codec import DECODERS, Corrupt, EndOfLog, Reader, extend, plan
 
 MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock"
-MAIN, FRAMES, EVENT = b"IP", b"IPSGHE", ord("E")
-(
-    ZERO, PREVIOUS, STRAIGHT_LINE, AVERAGE_2, MINTHROTTLE, MOTOR_0, INC, HOME_COORD, P1500, VBATREF, LAST_MAIN_TIME, MINMOTOR,
-) = range(12)  # fmt: skip
-HOME_COORD_1 = 256
+FRAMES = b"IPSGHE"
+ZERO, PREVIOUS, STRAIGHT_LINE, AVERAGE_2, MINTHROTTLE, MOTOR_0, INC, _, P1500, VBATREF, LAST_MAIN_TIME, MINMOTOR = range(12)
+"""Predictors; those of GPS frames, which are skipped, do not matter."""
 _LONGEST_FRAME = 256  # bytes
 _LONGEST_GAP_US = 10_000_000
 _MOST_ITERATIONS = 5000 * 10
@@ -47,10 +44,6 @@ class BlackboxLog:
     header: dict[str, str]
     names: list[str]  # of the columns of ``main``
     main: np.ndarray  # shape (T, fields), int64
-    slow_names: list[str] = field(default_factory=list)
-    slow: list[list[int]] = field(default_factory=list)
-    gps_names: list[str] = field(default_factory=list)
-    gps: list[list[int]] = field(default_factory=list)
     events: list[tuple[str, tuple[float, ...]]] = field(default_factory=list)
     frames: dict[str, int] = field(default_factory=dict)  # kind -> number decoded
     corrupt: int = 0  # stretches of bytes that could not be decoded
@@ -60,9 +53,6 @@ class BlackboxLog:
     def column(self, name: str) -> np.ndarray:
         """One field of all main frames, shape (T,)."""
         return self.main[:, self.names.index(name)]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.names
 
 
 def read_blackbox(path: str | Path) -> list[BlackboxLog]:
@@ -104,7 +94,6 @@ class _Decoder:
         self.motor0 = None
         self._prepare()
         self.history: list[list[int]] = []  # last frames, newest first; empty: not valid
-        self.home: list[int] | None = None
         self.last_time = self.last_iteration = None
 
     def _read_header(self, data: bytes) -> int:
@@ -137,9 +126,9 @@ class _Decoder:
             sizes = {len(of.names), len(of.predictor), len(of.encoding)}
             if len(sizes) > 1:
                 raise LogError(f"definition of {kind} frames contradicts itself: {sorted(sizes)} fields")
-            unknown = [code for code in of.encoding if code not in ENCODINGS]
+            unknown = [code for code in of.encoding if code not in DECODERS]
             if unknown:
-                raise LogError(f"{kind} frames use encoding {unknown[0]}; known: {ENCODINGS}")
+                raise LogError(f"{kind} frames use encoding {unknown[0]}; known: {', '.join(map(str, DECODERS))}")
         self.plans = {kind: plan(of.encoding, [p == INC for p in of.predictor]) for kind, of in self.fields.items()}
         names = self.fields["I"].names
         self.at_time = names.index("time") if "time" in names else None
@@ -157,9 +146,6 @@ class _Decoder:
     def decode(self) -> BlackboxLog:
         rows: list[list[int]] = []
         log = BlackboxLog(self.header, self.fields["I"].names, np.empty((0, 0)))
-        log.slow_names = self.fields.get("S", Fields()).names
-        log.gps_names = self.fields.get("G", Fields()).names
-        good = {"I": rows.append, "P": rows.append, "S": log.slow.append, "G": log.gps.append, "H": self._set_home}
         reader, lost = self.reader, False
         while reader.pos < reader.end and not log.complete:
             start, kind = reader.pos, chr(reader.data[reader.pos])
@@ -178,13 +164,10 @@ class _Decoder:
                 log.dropped += 1
                 continue
             log.frames[kind] = log.frames.get(kind, 0) + 1
-            if kind != "E":
-                good[kind](frame)
+            if kind in "IP":
+                rows.append(frame)
         log.main = np.array(rows, dtype=np.int64).reshape(len(rows), len(log.names))
         return log
-
-    def _set_home(self, frame: list[int]) -> None:
-        self.home = frame
 
     def _frame(self, kind: str, log: BlackboxLog) -> list[int] | None:
         """Values of the next frame; empty: not to be used; None: no frame."""
@@ -203,19 +186,19 @@ class _Decoder:
         if kind not in self.plans:
             return None
         base = self.history if kind == "P" else []
-        usable = kind != "P" or bool(base)
         values = self._values(kind, base)
         ended = reader.pos >= reader.end or reader.data[reader.pos] in FRAMES
         if not ended or reader.pos - start > _LONGEST_FRAME:
             return None
         if kind in "IP":
-            if not usable:
-                return []
-            if not self._continuous(values, kind):
+            if (kind == "P" and not base) or not self._continuous(values, kind):
                 self.history = []
                 return []
             self.history = [values, values] if kind == "I" else [values, self.history[0]]
-            self._remember(values)
+            if self.at_time is not None:
+                self.last_time = values[self.at_time]
+            if self.at_iteration is not None:
+                self.last_iteration = values[self.at_iteration]
         return values
 
     def _values(self, kind: str, base: list[list[int]]) -> list[int]:
@@ -223,15 +206,10 @@ class _Decoder:
         values = [0] * len(of.names)
         for decoder, first, count in self.plans[kind]:
             values[first : first + count] = decoder(reader, count)[:count]
-        homes = 0
         for i, predictor in enumerate(of.predictor):
             if predictor == ZERO:
                 continue
-            if predictor in (HOME_COORD, HOME_COORD_1):
-                values[i] += self.home[min(homes, len(self.home) - 1)] if self.home else 0
-                homes += 1
-            else:
-                values[i] = self._predicted(predictor, i, values, base)
+            values[i] = self._predicted(predictor, i, values, base)
             unsigned = of.signed and i < len(of.signed) and not of.signed[i]
             values[i] = values[i] & 0xFFFFFFFF if unsigned else extend(values[i], 32)
         return values
@@ -260,37 +238,23 @@ class _Decoder:
         """Iterations since the last main frame that are left out on purpose."""
         if self.last_iteration is None:
             return 0
-        count = 0
-        while count < self.interval and not self._kept(self.last_iteration + 1 + count):
-            count += 1
-        return count
-
-    def _kept(self, iteration: int) -> bool:
-        return (iteration % self.interval + self.p_num - 1) % self.p_denom < self.p_num
+        following = range(self.last_iteration + 1, self.last_iteration + 1 + self.interval)
+        kept = ((i % self.interval + self.p_num - 1) % self.p_denom < self.p_num for i in following)
+        return next((count for count, keep in enumerate(kept) if keep), self.interval)
 
     def _continuous(self, values: list[int], kind: str) -> bool:
+        """Whether time and iteration go on; one I frame that jumps is refused, and the next one believed wherever it stands."""
+        steps = []
         if self.at_time is not None and self.last_time is not None:
             passed = values[self.at_time] - self.last_time
-            if passed < -(1 << 31):  # the 32-bit clock turned over
-                passed += 1 << 32
-            if not 0 <= passed <= _LONGEST_GAP_US:
-                return kind == "I" and self._jump()
+            steps.append((passed + (1 << 32) if passed < -(1 << 31) else passed, _LONGEST_GAP_US))  # the 32-bit clock turned over
         if self.at_iteration is not None and self.last_iteration is not None:
-            passed = values[self.at_iteration] - self.last_iteration
-            if not 0 <= passed <= _MOST_ITERATIONS:
-                return kind == "I" and self._jump()
-        return True
-
-    def _jump(self) -> bool:
-        """Refuse one I frame that jumps; believe the next one, wherever it stands."""
-        self.last_time = self.last_iteration = None
+            steps.append((values[self.at_iteration] - self.last_iteration, _MOST_ITERATIONS))
+        if all(0 <= passed <= most for passed, most in steps):
+            return True
+        if kind == "I":
+            self.last_time = self.last_iteration = None
         return False
-
-    def _remember(self, values: list[int]) -> None:
-        if self.at_time is not None:
-            self.last_time = values[self.at_time]
-        if self.at_iteration is not None:
-            self.last_iteration = values[self.at_iteration]
 
 
 def _event(reader: Reader) -> tuple[str, tuple[float, ...]] | None:
@@ -304,8 +268,7 @@ def _event(reader: Reader) -> tuple[str, tuple[float, ...]] | None:
     if kind == 13:
         function = reader.byte()
         return _EVENTS[kind], (function & 127, reader.float32() if function & 128 else reader.signed())
-    read: Callable[[], int] = reader.unsigned
-    return _EVENTS[kind], tuple(read() for _ in range(2 if kind in (14, 30) else 1))
+    return _EVENTS[kind], tuple(reader.unsigned() for _ in range(2 if kind in (14, 30) else 1))
 
 
 def _numbers(text: str, key: str) -> list[int]:
