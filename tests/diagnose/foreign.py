@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_effects import effects_of
-from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
+from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams, effects_of
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 

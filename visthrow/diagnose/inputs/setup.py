@@ -1,31 +1,25 @@
 """A diagnosis setup: how logs are read, which simulation they are held against, and its parameters."""
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from visthrow.common.errors import ConfigError
-from visthrow.diagnose.models.ball import BallParams
-from visthrow.diagnose.models.flyer_params import FlyerParams
-from visthrow.diagnose.models.gimbal import GimbalParams
+from visthrow.diagnose.models.ball import BallModel, BallParams
+from visthrow.diagnose.models.flyer import FlyerModel, FlyerParams
+from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.interface import Model
-from visthrow.diagnose.models.pendulum import PendulumParams
-from visthrow.diagnose.models.stand import StandParams
-from visthrow.diagnose.models.trim import TrimParams
+from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
+from visthrow.diagnose.models.stand import StandModel, StandParams
+from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.logs.check.rows import Known
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
 MODELS = {
-    "ball": "visthrow.diagnose.models.ball:BallModel",
-    "pendulum": "visthrow.diagnose.models.pendulum:PendulumModel",
-    "stand": "visthrow.diagnose.models.stand:StandModel",
-    "gimbal": "visthrow.diagnose.models.gimbal:GimbalModel",
-    "flyer": "visthrow.diagnose.models.flyer:FlyerModel",
-    "trim": "visthrow.diagnose.models.trim:TrimModel",
-}
-"""Table of a setup -> ``module:class`` of the model that it parametrises."""
+    "ball": BallModel, "pendulum": PendulumModel, "stand": StandModel, "gimbal": GimbalModel, "flyer": FlyerModel, "trim": TrimModel,
+}  # fmt: skip
+"""Table of a setup -> the model that it parametrises."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +59,7 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
     if not setup.named():
         raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
     name = setup.named()[0]
-    module, attribute = MODELS[name].split(":")
-    model = getattr(importlib.import_module(module), attribute)(logs, getattr(setup, name))
+    model = MODELS[name](logs, getattr(setup, name))
     model.extend(setup.effects)
     return model
 
@@ -94,9 +87,8 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
     """
     flyer = load(name).flyer if name is not None else None
     if flyer is not None:
-        cable = flyer.cable
-        mass = flyer.mass + (cable.mass if cable is not None else 0.0)
-        return Known(cable.length if cable is not None else 0.0, mass, flyer.input, flyer.thrust_map)
+        length = flyer.cable.length if flyer.cable is not None else 0.0
+        return Known(length, flyer.total_mass, flyer.input, flyer.thrust_map)
     if plant is None:
         return Known()
     from visthrow import config

@@ -12,10 +12,10 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
 from visthrow.common.rotations import cross
-from visthrow.diagnose.models.flyer_effects import effects_of
-from visthrow.diagnose.models.flyer_params import FlyerParams
+from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams, effects_of
 from visthrow.diagnose.models.flyer_windows import FINE, spare, stretches_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force, triangles
+from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
 SHORTEST = 1e-3
@@ -45,20 +45,14 @@ class FlyerModel(NumericModel):
         inputs = [params.attitude, params.input, *there]
         super().__init__(effects_of(params, self.has_voltage), channels, stretches, inputs)
         self.steps = round(params.window / params.step)
-        self._names = {effect.name: i for i, effect in enumerate(self.effects)}
-        self._rot = np.array([s.data["rot"] for s in stretches])  # (S, half steps, 3, 3), some before the start
-        self._told = params.thrust(np.array([s.data["input"] for s in stretches]))  # [N], (S, fine steps, motors)
-        self._volts = np.array([s.data["volts"] for s in stretches])  # (S,)
-        self._since = np.array([s.data["since"] for s in stretches])  # [s], shape (S,)
+        # see flyer_windows; the stretch is the first axis
+        self._rot, told, self._volts, self._since, self._lean, self._direction = (
+            np.array([s.data[name] for s in stretches]) for name in ("rot", "input", "volts", "since", "lean", "direction")
+        )
+        self._told = params.thrust(told)  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
-        self._lean = np.array([s.data["lean"] for s in stretches])  # (S, half steps, 3)
-        self._direction = np.array([s.data["direction"] for s in stretches])  # (S, 3)
         self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
         self._rate_at = 12 if params.cable is not None else 6
-
-    def _theta(self, lanes: Lanes, name: str) -> np.ndarray:
-        """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
-        return lanes.theta[:, self._names[name]] if name in self._names else np.zeros(len(lanes.owner))
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
         """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): of held commands through a lag.
@@ -66,7 +60,7 @@ class FlyerModel(NumericModel):
         In the middle of a step stands what makes Simpson's rule, and so the integration, give the step's own mean: commands switch there.
         """
         p, fine = self.params, self.params.step / FINE
-        delay, tau = p.command_delay + self._theta(lanes, "cmd_delay"), p.motor_time_constant + self._theta(lanes, "motor_tau")
+        delay, tau = p.command_delay + self.of(lanes, "cmd_delay"), p.motor_time_constant + self.of(lanes, "motor_tau")
         tau = np.maximum(tau, SHORTEST)
         at = (p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay) / fine  # tables begin one window early
         left = np.clip(at.astype(int), 0, self._told.shape[1] - 1)
@@ -91,9 +85,10 @@ class FlyerModel(NumericModel):
         body rates; behind it, the thrust of each motor.
         """
         p, forces = self.params, latent_force(lanes.latent, self.steps, self._blocks)
-        thrust, hover, curve = self._thrusts(lanes), self._hover(), self._theta(lanes, "thrust_curve")[:, None]
+        thrust, curve = self._thrusts(lanes), self.of(lanes, "thrust_curve")[:, None]
+        hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
         since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
-        faded = 1.0 + self._theta(lanes, "thrust_fade") * since
+        faded = 1.0 + self.of(lanes, "thrust_fade") * since
         real = thrust * self._scale(lanes) * (1.0 + curve * (thrust / hover - 1.0)) * faded[..., None]
         dynamics = _Dynamics(self, lanes)
         path = integrate(lambda half, state: dynamics(half, state, real[half], forces[half]), dynamics.start(lanes), self.steps,
@@ -122,27 +117,22 @@ class FlyerModel(NumericModel):
                     "cable_dir_w": at_knots[:, :3], "tension": at_knots[:, 3], "mount_b": np.zeros((len(time), 3))}  # fmt: skip
         return out
 
-    def _hover(self) -> float:
-        """Thrust of one input channel in hover [N]."""
-        load = self.params.mass + (self.params.cable.mass if self.params.cable is not None else 0.0)
-        return load * self.params.gravity / self._told.shape[2]
-
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
         p = self.params
         volts = (self._volts[lanes.owner] - p.reference_voltage) if self.has_voltage else np.zeros(len(lanes.owner))
-        sag = p.voltage_coefficient + self._theta(lanes, "battery_sag")
-        scale = (1.0 + self._theta(lanes, "thrust_gain")) * (1.0 + sag * volts)
+        sag = p.voltage_coefficient + self.of(lanes, "battery_sag")
+        scale = (1.0 + self.of(lanes, "thrust_gain")) * (1.0 + sag * volts)
         motors = self._told.shape[2]
         if motors == 1 or p.torque is None:
             return np.repeat(scale[:, None], motors, 1)
-        own = np.stack([self._theta(lanes, f"motor_{name}") for name in ("fl", "fr", "rl", "rr")], 1)
+        own = np.stack([self.of(lanes, f"motor_{name}") for name in MOTORS], 1)
         return scale[:, None] * (1.0 + own)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         p, start = self.params, stretch.data["start"]
-        delays = {0: self._theta(lanes, "pose_delay"), 1: self._theta(lanes, "payload_delay"), 2: np.zeros(len(path))}
+        delays = {0: self.of(lanes, "pose_delay"), 1: self.of(lanes, "payload_delay"), 2: np.zeros(len(path))}
         out = np.empty((len(path), len(stretch.time)))
         for channel, name in enumerate(self.channels):
             own = stretch.channel == channel
@@ -152,22 +142,21 @@ class FlyerModel(NumericModel):
             if name == "rate_b":
                 at = self._rate_at
                 grid = start + p.step * np.arange(path.shape[1])
-                lane = [np.column_stack([np.interp(time, grid, x[:, at + i]) for i in range(3)]) for x in path]
-                out[:, own] = np.array(lane).reshape(len(path), -1)
+                out[:, own] = np.array([on_grid(grid, x[:, at : at + 3], time) for x in path]).reshape(len(path), -1)
                 continue
             late = time[None] - delays[channel][:, None]
             value, rate = path[..., 0:3], path[..., 3:6]
             if name == "payload_pos_w":
                 value, rate = value + path[..., 6:9], rate + path[..., 9:12]
             pos = hermite(late, start, p.step, value, rate)
-            if channel == 0 and "marker_z" in self._names:
+            if channel == 0 and "marker_z" in self.numbers:
                 pos = pos + self._marker(lanes, stretch, time)
             out[:, own] = pos.reshape(len(path), -1)
         return out
 
     def _marker(self, lanes: Lanes, stretch: Stretch, time: np.ndarray) -> np.ndarray:
         """Shift of the measured point by the marker's lever, shape (B, N, 3)."""
-        lever = np.stack([self._theta(lanes, f"marker_{axis}") for axis in "xyz"], 1)
+        lever = np.stack([self.of(lanes, f"marker_{axis}") for axis in "xyz"], 1)
         at = np.clip(((time - stretch.data["start"]) / (0.5 * self.params.step)).round().astype(int), 0, 2 * self.steps)
         return np.einsum("nij,bj->bni", stretch.data["rot"][at + self._spare], lever)
 
@@ -179,7 +168,7 @@ class _Dynamics:
         p = model.params
 
         def get(name: str) -> np.ndarray:
-            return model._theta(lanes, name)
+            return model.of(lanes, name)
 
         mass = (p.mass + get("mass_quad"))[:, None]
         self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
@@ -262,12 +251,9 @@ class _Dynamics:
         """Angular acceleration from the motors' thrusts and the offset of the centre of mass."""
         of = self.p.torque
         front_left, front_right, rear_left, rear_right = thrust.T
-        torque = np.stack(
-            [
-                of.arm_y * (front_left + rear_left - front_right - rear_right) - self.com[:, 1] * total[:, 0],
-                of.arm_x * (rear_left + rear_right - front_left - front_right) + self.com[:, 0] * total[:, 0],
-                of.torque_ratio * thrust @ np.array(of.spin),
-            ],
-            1,
-        )
+        torque = np.stack([
+            of.arm_y * (front_left + rear_left - front_right - rear_right) - self.com[:, 1] * total[:, 0],
+            of.arm_x * (rear_left + rear_right - front_left - front_right) + self.com[:, 0] * total[:, 0],
+            of.torque_ratio * thrust @ np.array(of.spin),
+        ], 1)  # fmt: skip
         return (torque - cross(rate, self.inertia * rate) + latent) / self.inertia

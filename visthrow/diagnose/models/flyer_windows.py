@@ -7,15 +7,13 @@ from scipy.signal import lfilter
 
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
-from visthrow.diagnose.models.flyer_params import FlyerParams
+from visthrow.diagnose.models.flyer_params import MOST_LATE, FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
 FINE = 16
 """Entries of the commands' table in a step of the integration: between them, commands switch at their own times."""
-MOST_LATE = 0.15
-"""By which attitudes may be late or early [s]."""
 KNOTS = 8
 """Of the latent forces over a window."""
 _GUESS = 0.25
@@ -53,7 +51,7 @@ def _holds(log: FlightLog, name: str) -> bool:
 
 def _expect_thrust(found: Sequence[Stretch], params: FlyerParams) -> None:
     """Refuse commands of another unit: they carry neither the vehicle nor anything like it."""
-    weight = params.gravity * (params.mass + (params.cable.mass if params.cable is not None else 0.0))
+    weight = params.gravity * params.total_mass
     told = np.concatenate([s.data["input"] for s in found])
     ratio = float(np.median(params.thrust(told).sum(axis=1))) / weight
     if ratio > _MOST_THRUST:
@@ -64,24 +62,18 @@ def _expect_thrust(found: Sequence[Stretch], params: FlyerParams) -> None:
 
 
 def _windows(log: FlightLog, number: int, params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:
-    sigma = {name: sigma_of(log[name], _least(name)) for name in channels}
-    position, attitude, told = log[params.position], log[params.attitude], log[params.input]
-    first = max(c.time[0] for c in (position, attitude, told))
-    last = min(c.time[-1] for c in (position, attitude, told))
+    sigma = {name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels}  # no less is believed
+    driven = [log[name] for name in (params.position, params.attitude, params.input)]
+    first, last = max(c.time[0] for c in driven), min(c.time[-1] for c in driven)
     found = []
     starts = np.arange(first + params.window, last - params.window, params.window)
     starts = starts[:: max(1, len(starts) // (4 * params.most_windows))]  # hours are thinned before they are cut
     for start in starts:
-        if all(_covered(c, start, start + params.window) for c in (position, attitude, told)):
+        if all(_covered(c, start, start + params.window) for c in driven):
             stretch = _window(log, number, params, channels, sigma, float(start))
             if stretch is not None:
                 found.append(stretch)
     return found
-
-
-def _least(name: str) -> float:
-    """Noise below which none is believed [m] or [rad/s]."""
-    return 2e-3 if name == "rate_b" else 1e-4
 
 
 def _covered(channel: Channel, start: float, end: float) -> bool:
@@ -91,10 +83,11 @@ def _covered(channel: Channel, start: float, end: float) -> bool:
 
 def _window(log, number: int, params: FlyerParams, channels, sigma, start: float) -> Stretch | None:
     end = start + params.window
-    rows = [_samples(log[name], start, end, params.every) for name in channels]
-    if any(len(time) < 5 for time, _ in rows[:1]):
-        return None
-    if np.min(rows[0][1][:, 2]) < params.lowest:
+    rows = []
+    for channel in (log[name] for name in channels):
+        inside = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[:: params.every]
+        rows.append((channel.time[inside], channel.values[inside].astype(float)))
+    if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
         return None
     inputs = _inputs(log[params.input], params, start)
     thrust = params.thrust(inputs).sum(axis=1)
@@ -120,11 +113,6 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
 def spare(step: float) -> int:
     """Half steps of attitudes before a window and behind it, for what may be late."""
     return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
-
-
-def _samples(channel: Channel, start: float, end: float, every: int) -> tuple[np.ndarray, np.ndarray]:
-    inside = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[::every]
-    return channel.time[inside], channel.values[inside].astype(float)
 
 
 def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:

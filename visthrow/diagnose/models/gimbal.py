@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
@@ -77,8 +78,6 @@ class GimbalModel(NumericModel):
         Raises:
             LogError: None of them has poses of both bodies and the marker, or the marker is seen elsewhere than the payload.
         """
-        from scipy.spatial.transform import Rotation
-
         self.params = params
         self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
         stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params, self.camera)]
@@ -86,43 +85,25 @@ class GimbalModel(NumericModel):
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
-        names = [effect.name for effect in self.effects]
-        get = {name: lanes.theta[:, i] for i, name in enumerate(names)}
-        tilt = np.stack([get[f"camera_tilt_{a}"] for a in "xyz"], 1)
-        lever = np.stack([get[f"camera_lever_{a}"] for a in "xyz"], 1)
-        turn = np.stack([get[f"marker_rot_{a}"] for a in "xyz"], 1)
-        table, data = stretch.data["table"], stretch.data
-        time = stretch.time.reshape(-1, 3)[:, 0]
-        late = time[None] - get["camera_delay"][:, None]
-        gap = _looked_up(late, data["table_time"], table["gap"])  # payload from vehicle
-        axes = _looked_up(late, data["table_time"], table["rot"].reshape(-1, 9))
+        tilt, lever, turn = (np.stack([self.of(lanes, f"{what}_{a}") for a in "xyz"], 1)
+                             for what in ("camera_tilt", "camera_lever", "marker_rot"))  # fmt: skip
+        time, table = stretch.time.reshape(-1, 3)[:, 0], stretch.data["table"]
+        late = time[None] - self.of(lanes, "camera_delay")[:, None]
+        gap, axes, level = (on_grid(stretch.data["table_time"], table[name], late) for name in ("gap", "rot", "gimbal"))
         body = np.einsum("bnji,bnj->bni", axes.reshape(*late.shape, 3, 3), gap)
         body = body + cross(turn[:, None], body)
-        level = _looked_up(late, data["table_time"], table["gimbal"].reshape(-1, 9))
         seen = np.einsum("bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b))
         seen = seen - np.array([self.params.camera_offset, 0.0, 0.0])
         point = np.einsum("ij,bnj->bni", self.camera, seen)
         point = point + cross(tilt[:, None], point) - lever[:, None]
-        point = point + _wander(lanes.latent, stretch.latent_time, time)
-        scale = np.stack([1 + get["focal_scale"], 1 + get["focal_scale"], 1 + get["range_scale"]], 1)
+        weights = triangles(time, np.unique(stretch.latent_time))  # what gimbal and detection err by, slowly
+        point = point + np.einsum("bak,nk->bna", lanes.latent.reshape(len(late), 3, -1), weights)
+        scale = 1.0 + np.stack([self.of(lanes, f"{name}_scale") for name in ("focal", "focal", "range")], 1)
         return (point * scale[:, None]).reshape(len(lanes.owner), -1)
 
 
-def _looked_up(time: np.ndarray, table_time: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Columns of a table at times, linear between its rows, shape (B, N, columns)."""
-    return np.stack([np.interp(time, table_time, column) for column in table.T], -1)
-
-
-def _wander(latent: np.ndarray, knots: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """What gimbal and detection err by, slowly [m], shape (B, N, 3)."""
-    weights = triangles(time, np.unique(knots))
-    return np.einsum("bak,nk->bna", latent.reshape(len(latent), 3, -1), weights)
-
-
 def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body."""
-    from scipy.spatial.transform import Rotation
-
+    """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body, matrices as rows of 9."""
     vehicle, attitude, payload = log["pos_w"], log["quat_wb"], log["payload_pos_w"]
     good = vehicle.valid & attitude.valid & payload.valid if len(vehicle.time) == len(payload.time) else vehicle.valid
     time = vehicle.time[good]
@@ -134,7 +115,7 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
         yaw = np.arctan2(rot[:, 1, 0], rot[:, 0, 0])
         level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
         gimbal = np.swapaxes(rot, 1, 2) @ level @ gimbal
-    return time, {"gap": gap, "rot": rot, "gimbal": gimbal}
+    return time, {"gap": gap, "rot": rot.reshape(-1, 9), "gimbal": gimbal.reshape(-1, 9)}
 
 
 def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) -> list[Stretch]:

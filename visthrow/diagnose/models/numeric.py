@@ -83,6 +83,7 @@ class NumericModel(ABC):
             raise LogError(f"no stretch of these logs shows {', '.join(channels)} in a way that this model explains")
         given = set(inputs) - set(channels)
         self.effects = tuple(replace(e, channels=tuple(c for c in e.channels if c not in given)) for e in effects)
+        self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self.channels, self.stretches = tuple(channels), list(stretches)
         self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] | None = None
@@ -120,11 +121,14 @@ class NumericModel(ABC):
         Raises:
             LogError: An effect that the model does not know.
         """
-        names = [effect.name for effect in self.effects]
         for name in theta:
-            if name not in names:
-                raise LogError(f"no effect '{name}'; {suggest(name, names)}")
-        return self._base + np.array([float(theta.get(name, 0.0)) for name in names])
+            if name not in self.numbers:
+                raise LogError(f"no effect '{name}'; {suggest(name, self.numbers)}")
+        return self._base + np.array([float(theta.get(name, 0.0)) for name in self.numbers])
+
+    def of(self, lanes: Lanes, name: str) -> np.ndarray:
+        """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
+        return lanes.theta[:, self.numbers[name]] if name in self.numbers else np.zeros(len(lanes.owner))
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visthrow.diagnose.models.flyer_params import MOTORS
 from visthrow.diagnose.models.interface import Effect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
-
-MOTORS = ("fl", "fr", "rl", "rr")
-WORDS = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}
 
 
 @dataclass(frozen=True)
@@ -44,16 +42,12 @@ class TrimParams:
 def effects(params: TrimParams) -> list[Effect]:
     """Catalogue of the balance."""
     seen, arm, usual = (params.command, params.position), params.arm, params.motor_spread
-    found = [
-        Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.15,
-               usual, seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in WORDS.items()
-    ]  # fmt: skip
-    found += [
-        Effect(f"added_{key}", f"a weight near the {words} motor", "m + theta at the rotor", "kg", "rigid body",
-               (0.0, 0.3 * params.mass), 0.05 * params.mass, 0.25 * usual * params.mass, seen, "a scale", (f"motor_{key}",),
-               ("weigh the vehicle",)) for key, words in WORDS.items()
-    ]  # fmt: skip
-    found += [
+    return [
+        *(Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.15,
+                 usual, seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in MOTORS.items()),
+        *(Effect(f"added_{key}", f"a weight near the {words} motor", "m + theta at the rotor", "kg", "rigid body",
+                 (0.0, 0.3 * params.mass), 0.05 * params.mass, 0.25 * usual * params.mass, seen, "a scale", (f"motor_{key}",),
+                 ("weigh the vehicle",)) for key, words in MOTORS.items()),
         Effect("mass_quad", "the vehicle's mass", "m + theta", "kg", "rigid body", (-0.3 * params.mass, 0.5 * params.mass),
                0.05 * params.mass, 0.5 * usual * params.mass, seen, "a scale", ("thrust_gain",), ("weigh the vehicle",)),
         Effect("thrust_gain", "all motors' thrust", "f (1 + theta)", "1", "thrust map", (-0.6, 0.6), 0.1, 0.5 * usual, seen,
@@ -66,7 +60,6 @@ def effects(params: TrimParams) -> list[Effect]:
         Effect("yaw_trim", "one turning sense's drag torque", "torque_z += theta kappa T / 4", "1", "thrust map", (-0.7, 0.7), 0.1,
                usual, seen, "propeller wear", ("motor_fl", "motor_fr", "motor_rl", "motor_rr"), ("yaw doublets",)),
     ]  # fmt: skip
-    return found
 
 
 class TrimModel(NumericModel):
@@ -135,22 +128,17 @@ def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
         if np.min(position.values[near][:, 2]) < params.lowest or speed > params.fastest:
             continue
         climb = (vel[moving][-5:, 2].mean() - vel[moving][:5, 2].mean()) / params.slowest_window
-        volts = _volts(log, start, end)
+        volts = params.reference_voltage
+        if "battery_voltage" in log:
+            time, told = log["battery_voltage"].samples()
+            told = told[(time >= start) & (time < end)]
+            volts = float(np.mean(told)) if len(told) else volts
         mean = np.mean(command.values[inside].astype(float), axis=0)
         found.append(
             Stretch(
                 number, "hover", np.full(4, start), np.zeros(4, dtype=int), mean, np.full(4, params.spread),
                 np.zeros(0), np.zeros(0),
-                {"volts": params.reference_voltage if volts is None else volts, "lift": 1.0 + climb / params.gravity},
-                **_latent(start, end),
+                {"volts": volts, "lift": 1.0 + climb / params.gravity}, **_latent(start, end),
             )
         )  # fmt: skip
     return found
-
-
-def _volts(log: FlightLog, start: float, end: float) -> float | None:
-    if "battery_voltage" not in log:
-        return None
-    channel = log["battery_voltage"]
-    inside = channel.valid & (channel.time >= start) & (channel.time < end)
-    return float(np.mean(channel.values[inside])) if np.any(inside) else None

@@ -39,8 +39,8 @@ class Relation:
 
 
 def on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Interpolate linearly; columns one by one."""
-    return np.column_stack([np.interp(grid, time, column) for column in values.T])
+    """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N), shape (..., N, C)."""
+    return np.stack([np.interp(grid, time, column) for column in values.T], -1)
 
 
 def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, reach: float = REACH) -> Relation | None:
