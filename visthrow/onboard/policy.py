@@ -155,9 +155,9 @@ class Policy:
 
     def to(self, device: str | torch.device) -> "Policy":
         """Return the policy with its tensors on another device."""
-        layers = {name: tuple(tensor.to(device) for tensor in getattr(self, name)) for name in ("weights", "biases")}
+        moved: dict[str, Any] = {name: tuple(tensor.to(device) for tensor in getattr(self, name)) for name in ("weights", "biases")}
         parts = {name: getattr(self, name) for name in ("mean", "std", "estimator")}
-        return replace(self, **layers, **{name: part.to(device) for name, part in parts.items() if part is not None})
+        return replace(self, **moved, **{name: part.to(device) for name, part in parts.items() if part is not None})
 
     def require(
         self, contract_now: Mapping[str, Any], sections: Collection[str] | None = None, allow: Collection[str] = ()
