@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.control.calibrating import Solver
-from hil.control.loop import Lander
-from hil.control.loop import fly as fly_loop
+from hil.control.loop import Lander, Loop
 from hil.control.realtime import keep, prepare
 from hil.control.recording.latency import Stages
 from hil.control.recording.record import Recorder, pack
@@ -83,10 +82,9 @@ def fly(args: argparse.Namespace) -> int:
     viewer, stages = start_viewer(folder) if args.view else None, Stages()
     eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
     solver = None if runner.calibrating is None else Solver(params.camera, policy.contract, params.calibration.spreads)
-    summary = fly_loop(
-        runner, source, clock, Lander(operator, runner.calibrating) if calibrates else operator, recorder,
-        args.seconds or float("inf"), console.decision, stages, eyes, solver,
-    )  # fmt: skip
+    operator = Lander(operator, runner.calibrating) if calibrates else operator
+    loop = Loop(runner, source, clock, operator, recorder, console.decision, stages, eyes, solver)
+    summary = loop.fly(args.seconds or float("inf"))
     summary["speed"] = args.speed
     summary["autopilot"] = autopilot_record(backend, link)
     summary["links"] = [one.roster.summary() for one in source.links]

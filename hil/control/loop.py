@@ -58,52 +58,19 @@ class AutoOperator:
         return OperatorInput(arm=state == State.READY)
 
 
-def fly(
-    runner: Runner, source: Source, clock: Clock, operator: Operator, recorder: Recorder | None = None,
-    most: float = float("inf"), tell: Callable[[Decision], None] | None = None, stages: Stages | None = None,
-    eyes: Eyes | None = None, solver: Solver | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds; returns `Loop.summary`.
-
-    A vehicle that is ours is never left without a word: where the time is over in flight, or something raises, the run is aborted and
-    goes on until it has ended. A second Ctrl-C ends it at once, after one more request to land.
-
-    Args:
-        runner: with its back-end. source: of poses. clock: of the ticks. operator: who arms. recorder: of the run's folder, if any.
-        tell: called with the first decision of each state, and of each reason why it does not go on.
-        stages: filled with the times of each stage. eyes: a camera, where keypoints are a detector's. solver: of its calibration.
-    """
-    loop = Loop(runner, source, clock, operator, recorder, tell, stages or Stages(), eyes, solver)
-    begin, backend = clock.now(), runner.backend
-    with collected():
-        while runner.machine.state is not State.DONE and not source.ended:
-            over = clock.now() - begin >= most
-            if over and (backend.name == DryRun.name or not runner.in_flight):
-                break
-            try:
-                loop.turn(over)
-            except KeyboardInterrupt as error:
-                runner.fail(clock.now(), error)
-                break
-            except Exception as error:  # of what stands around the runner: it ends in abort all the same
-                runner.fail(clock.now(), error)
-                clock.sleep_until(clock.now() + runner.pilot.period)
-    return loop.summary()
-
-
 @dataclass
 class Loop:
-    """The turns of a run: wait for the tick, take poses in, tick, record; see :func:`fly` for its parts."""
+    """The turns of a run: wait for the tick, take poses in, tick, record."""
 
-    runner: Runner
-    source: Source
-    clock: Clock
-    operator: Operator
-    recorder: Recorder | None = None
-    tell: Callable[[Decision], None] | None = None
-    stages: Stages = field(default_factory=Stages)
-    eyes: Eyes | None = None
-    solver: Solver | None = None
+    runner: Runner  # with its back-end
+    source: Source  # of poses
+    clock: Clock  # of the ticks
+    operator: Operator  # who arms
+    recorder: Recorder | None = None  # of the run's folder
+    tell: Callable[[Decision], None] | None = None  # called with the first decision of each state, and of each reason why it does not go on
+    stages: Stages = field(default_factory=Stages)  # filled with the times of each stage
+    eyes: Eyes | None = None  # a camera, where keypoints are a detector's
+    solver: Solver | None = None  # of its calibration
     ours: int = 0  # ticks that were missed because one of ours took too long
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
@@ -114,6 +81,28 @@ class Loop:
 
     def __post_init__(self) -> None:
         self.ticker = Ticker(self.clock, self.runner.pilot.period)
+
+    def fly(self, most: float = math.inf) -> dict[str, Any]:
+        """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds; returns the summary.
+
+        A vehicle that is ours is never left without a word: where the time is over in flight, or something raises, the run is aborted and
+        goes on until it has ended. A second Ctrl-C ends it at once, after one more request to land.
+        """
+        runner, clock, begin = self.runner, self.clock, self.clock.now()
+        with collected():
+            while runner.machine.state is not State.DONE and not self.source.ended:
+                over = clock.now() - begin >= most
+                if over and (runner.backend.name == DryRun.name or not runner.in_flight):
+                    break
+                try:
+                    self.turn(over)
+                except KeyboardInterrupt as error:
+                    runner.fail(clock.now(), error)
+                    break
+                except Exception as error:  # of what stands around the runner: it ends in abort all the same
+                    runner.fail(clock.now(), error)
+                    clock.sleep_until(clock.now() + runner.pilot.period)
+        return self.summary()
 
     def turn(self, over: bool) -> None:
         """Do one tick; ``over``: the run's time is, and what flies is to come down."""

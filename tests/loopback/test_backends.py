@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.check import AutopilotCheck
-from hil.control.loop import AutoOperator, fly
+from hil.control.loop import AutoOperator, Loop
 from hil.control.states import OperatorInput
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
@@ -302,7 +302,7 @@ def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     """
     plant, overrides = LevelPlant(lag=mechanism), (*QUICK, f"{kind}.mechanism_lag={mechanism}")
     runner, source, clock, fake = peers(plant, kind=kind, loaded=AT_ONCE, overrides=overrides)
-    summary = fly(runner, source, clock, AutoOperator(), None, 3.5)
+    summary = Loop(runner, source, clock, AutoOperator()).fly(3.5)
     latch = summary["latch_times"][0] + runner.params.delay.command
     assert abs(fake.report()["separation_time"] - latch - 0.11) <= SEPARATION
     assert (summary["latches"], fake.witness.breaches) == (1, [])
@@ -338,7 +338,7 @@ def test_two_throws_with_the_autopilots_own_hold_between_them():
             return OperatorInput(arm=state == "ready")
 
     runner, source, clock, fake = peers(plant, kind="ardupilot", loaded=AT_ONCE, overrides=(*QUICK, "throws=2"))
-    summary = fly(runner, source, clock, HangOn(), None, 9.0)
+    summary = Loop(runner, source, clock, HangOn()).fly(9.0)
     assert (summary["latches"], fake.witness.releases, fake.witness.breaches) == (2, 2, [])
     assert [text for _, text in fake.events] == ["mode 17", "mode 4", "mode 17", "mode 9"]
 
@@ -453,7 +453,7 @@ def test_a_mode_is_seen_soon_though_the_heartbeat_is_slow(kind):
 def test_idle_says_at_once_why_it_waits():
     runner, source, clock, _ = peers(LevelPlant(), loaded=AT_ONCE, overrides=("states.idle=1.0",), armed=False)
     told = []
-    fly(runner, source, clock, AutoOperator(), None, 5.0, told.append)
+    Loop(runner, source, clock, AutoOperator(), None, told.append).fly(5.0)
     waits = {d.waits: d.time for d in told if d.state == "idle"}
     assert waits["autopilot not ready (disarmed)"] < 0.2
     assert len(told) <= 8, "and not at every tick"

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from hil.control.loop import fly
+from hil.control.loop import Loop
 from hil.terminal import ENDING, Terminal
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
@@ -53,7 +53,7 @@ class Told:
         self.runner.tick, source.poll = ticked, polled
         try:
             most = OVER if way == "time over" else float("inf")
-            self.summary = fly(self.runner, source, self.clock, operator, None, most, self.tell)
+            self.summary = Loop(self.runner, source, self.clock, operator, None, self.tell).fly(most)
         finally:
             for number, handler in self.saved.items():
                 signal.signal(number, handler)

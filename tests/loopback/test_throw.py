@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from hil.control.loop import AutoOperator, fly
+from hil.control.loop import AutoOperator, Loop
 from hil.control.recording.playback import replay
 from hil.control.recording.record import Recorder
 from hil.control.runner import Runner
@@ -111,7 +111,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
         [*command, "--seconds", "20", "--after", "0.2", "--out", str(tmp_path / "fake.json")], stdout=subprocess.DEVNULL
     )
     try:
-        summary = fly(runner, source, clock, AutoOperator(), recorder)
+        summary = Loop(runner, source, clock, AutoOperator(), recorder).fly()
         assert fake.wait(30) == 0
     finally:
         fake.kill()

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from hil.check import AutopilotCheck, hover_of_run
-from hil.control.loop import fly
+from hil.control.loop import Loop
 from hil.control.recording.record import CONFIG, TICKS, Recorder
 from hil.control.runner import Runner
 from hil.control.states import OperatorInput
@@ -38,7 +38,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hover") / "run"
     runner, source, clock, _ = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)
     recorder = Recorder(folder, runner.params)
-    summary = fly(runner, source, clock, Nobody(), recorder, 4.0)
+    summary = Loop(runner, source, clock, Nobody(), recorder).fly(4.0)
     summary["autopilot"] = autopilot_record(runner.backend, source._link)
     recorder.close(summary)
     return folder
