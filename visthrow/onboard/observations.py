@@ -13,7 +13,7 @@ pushes the payload's part into the history and assembles the actor's input. With
     position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal corners 8
     | payload keypoints, now and H steps back 8 (1 + H) | attached 1 | validity of goal and payload keypoints 8
 
-With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.located`). Either one, where goals move, has the
+With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.goal_motion`). Either one, where goals move, has the
 fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
 
 A policy for many vehicles has besides what ``response`` earlier steps were like, velocity 3 | body rates 3 | previous action 4 each,
@@ -42,7 +42,7 @@ SETUPS = {"none": 0, "told": 4, "exact": 24}
 """Widths of a vehicle's set-up, by what ``setup`` says."""
 
 LOCATED = 6
-"""Width of where keypoints lie (:mod:`visthrow.onboard.located`)."""
+"""Width of where keypoints lie (:mod:`visthrow.onboard.goal_motion`)."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.located import fitted_goal
 from visthrow.onboard.policy import Policy
 from visthrow.onboard.traced import Traced
 
@@ -248,7 +247,7 @@ class Pilot:
         sums: tuple[Tensor, ...] = ()
         velocity = places = None
         if fitted:
-            new, velocity, places, frame, valid = fitted_goal(self.layout, frame, valid, self.camera, further[0], further[1], fresh)
+            new, velocity, places, frame, valid = goal_motion.fitted_goal(self.layout, frame, valid, self.camera, *further[:2], fresh)
             sums = (new,)
         answers = tuple(push(held, ob.answer(frame, previous), fresh) for held in answers)
         earlier = answers[0][:, 1:] if answers else None

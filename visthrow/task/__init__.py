@@ -46,7 +46,7 @@ class ObservationParams(Bounded):
     latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
     latency_jitter: NotNegative = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
     goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
-    located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.located
+    located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.goal_motion
     response: int = 0  # earlier steps of which the actor is given velocity, body rates and action: how this vehicle answers
     setup: Literal["none", "told", "exact"] = "none"  # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
 

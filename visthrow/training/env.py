@@ -21,7 +21,6 @@ from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.located import fitted_goal
 from visthrow.task import Experiment, drawn_plants, plant_of
 from visthrow.task.fleet import members
 from visthrow.training import rewards, terminations
@@ -348,7 +347,7 @@ class ThrowEnv(VecEnv):
         time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
         goal_vel = places = answers = None
         if self.layout.fits:
-            fitted = fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
+            fitted = goal_motion.fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
             memory["goal_fit"].copy_(fitted.sums)
             _, goal_vel, places, measured, valid = fitted
         if self.layout.response:

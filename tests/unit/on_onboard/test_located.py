@@ -9,7 +9,7 @@ from camera.mount import rotation_from_vector
 from visthrow import config
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.located import fitted_goal, middle
+from visthrow.onboard.goal_motion import fitted_goal, middle
 from visthrow.task import Experiment
 
 EXACT = 2e-3
