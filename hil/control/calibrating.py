@@ -18,27 +18,18 @@ from hil.poses.pose import Vector
 from hil.poses.track import BodyState
 from visthrow.common.errors import VisthrowError
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.onboard.calibration import (
-    STILL,
-    SWAY,
-    SWAY_FREQUENCY,
-    SWAY_RATE,
-    Calibration,
-    Hovered,
-    Spreads,
-    calibrate,
-    sway,
-)
+from visthrow.onboard import calibration
+from visthrow.onboard.calibration import Calibration, Hovered, Spreads
 
 
 @dataclass(frozen=True)
 class CalibrationParams(Bounded):
     """How to calibrate, and which findings a throw may begin with."""
 
-    still: Positive = STILL  # of hover before the sway [s]
-    sway: Positive = SWAY  # [s]
-    rate: Positive = SWAY_RATE  # amplitude of the sway's body rates [rad/s]
-    frequency: Positive = SWAY_FREQUENCY  # of the sway [Hz]
+    still: Positive = calibration.STILL  # of hover before the sway [s]
+    sway: Positive = calibration.SWAY  # [s]
+    rate: Positive = calibration.SWAY_RATE  # amplitude of the sway's body rates [rad/s]
+    frequency: Positive = calibration.SWAY_FREQUENCY  # of the sway [Hz]
     most_tilt_deg: Positive = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
     most_scale: Positive = 0.06  # of the focal length off the nominal one, which is corrected for [-]
     most_latency: Positive = 0.06  # of the keypoints, which is made up for [s]
@@ -55,7 +46,7 @@ def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spr
     from camera.keypoints import KeypointCamera
 
     try:
-        return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)
+        return calibration.calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)
     except VisthrowError as error:
         return str(error)
 
@@ -123,7 +114,7 @@ class Calibrating:
         if since >= p.sway:
             self._finish()
             return 0.0, 0.0
-        return sway(since, p.rate, p.frequency)
+        return calibration.sway(since, p.rate, p.frequency)
 
     def note(self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float) -> None:
         """Take down a tick: the vehicle as of the poses, the commanded thrust [N], normalised keypoints of a new frame, shape (8, 2), their

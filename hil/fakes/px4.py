@@ -11,8 +11,16 @@ from typing import Any
 import numpy as np
 
 from hil.fakes.mavlink import FakeMavlink
-from hil.links.backends.autopilot import bytes_to_integer, integer_to_bytes
-from hil.links.backends.px4 import AUTO_LAND, AUTO_LOITER, LAND_OR_HOLD, MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL
+from hil.links.backends.px4 import (
+    AUTO_LAND,
+    AUTO_LOITER,
+    LAND_OR_HOLD,
+    MAIN_AUTO,
+    MAIN_OFFBOARD,
+    MAIN_POSCTL,
+    bytes_to_integer,
+    integer_to_bytes,
+)
 from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 

@@ -195,11 +195,7 @@ class Problem:
         return dict(zip(CONSTANTS, constants.split(list(CONSTANTS.values()), -1)))
 
     def steps(self, x: Tensor, constants: Tensor) -> Tensor:
-        """Residuals of steps k to k + 1 and of what was measured at k, shape (B, N - 1, 20).
-
-        Args:
-            x: unknowns, shape (B, N, 13). constants: shape (B, C).
-        """
+        """Residuals of steps k to k + 1 and of what was measured at k, (B, N - 1, 20), of unknowns, (B, N, 13), and constants, (B, C)."""
         c, s, dt = self.split(constants), self.spreads, self.dt[:, None]
         pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
         rot = self.base @ rotation_from_vector(turn)
@@ -234,11 +230,8 @@ class Problem:
         return j, (when - self.time[j]) / self.dt[j]
 
     def sightings(self, x: Tensor, constants: Tensor, j: Tensor) -> Tensor:
-        """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5); zero where they were not seen.
-
-        Args:
-            x, constants: as of `steps`. j: steps that the sightings fall behind, shape (N,); held while differences are taken.
-        """
+        """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5); zero where not seen. Arguments as of
+        `steps`; j: steps that the sightings fall behind, shape (N,), held while differences are taken."""
         c, s = self.split(constants), self.spreads
         dt = self.dt[j][:, None]
         u = ((self.time - self.age - self.time[j]) - c["latency"])[..., None] / dt
@@ -312,12 +305,10 @@ def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Te
 
 
 def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration:
-    """Find the camera's turn and latency and the thrust.
+    """Find the camera's turn and latency and the thrust, with the policy's nominal camera, float64, and contract.
 
     Args:
-        hovered: a hover of some 3 s that ends in a sway.
-        camera: nominal, of the policy, float64.
-        contract: of the policy.
+        hovered: a hover of some 3 s that ends in a sway. camera, contract: see above.
         spreads: of noise and of what is known; left out, those of the training.
 
     Raises:

@@ -21,11 +21,8 @@ from visthrow.common.errors import PolicyError
 
 @dataclass(frozen=True)
 class Estimator:
-    """Weights of the estimate, with D the observation's numbers, N the encoder's, H the memory's and S the estimate's.
-
-    Raises:
-        PolicyError: Shapes that do not fit each other, or a number that is not finite.
-    """
+    """Weights of the estimate, with D the observation's numbers, N the encoder's, H the memory's and S the estimate's; raises `PolicyError`
+    for shapes that do not fit each other, or a number that is not finite."""
 
     mean: Tensor  # (D,), of the observation
     std: Tensor  # (D,), what the observation is divided by

@@ -57,12 +57,7 @@ def fit(sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tens
 
 
 def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
-    """Goal by all steps so far [m], shape (E, 2), world frame; 0 where none has seen it.
-
-    Args:
-        sums: of :func:`fit`. time: of this step [s], shape (E,).
-        velocity: of a goal that moves [m/s], shape (E, 2).
-    """
+    """Goal by all steps so far [m], shape (E, 2), world frame, by its velocity where it moves [m/s]; 0 where none has seen it."""
     total = sums[:, :1].clamp(min=1e-9)
     mean = sums[:, 3:5] / total
     if velocity is None:
@@ -76,10 +71,8 @@ def measured_goal(
     """Goal in the world as one frame shows it.
 
     Args:
-        layout: of the frame.
-        frame: shape (E, layout.frame), with its noise.
-        valid: validity of the keypoints, shape (E, 8); vision only.
-        camera: vision only.
+        layout: of the frame. frame: shape (E, layout.frame), with its noise.
+        valid: validity of the keypoints, shape (E, 8); vision only. camera: vision only.
 
     Returns:
         Position [m], shape (E, 2), world frame, and its inverse variance [1/m^2], shape (E,).
@@ -94,10 +87,7 @@ def measured_goal(
 
 
 def goal_by_corner(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
-    """Goal in the world as each corner of one vision frame shows it.
-
-    Args:
-        layout, frame, valid, camera: see :func:`measured_goal`.
+    """Goal in the world as each corner of one vision frame shows it; arguments as of :func:`measured_goal`.
 
     Returns:
         Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
@@ -121,13 +111,10 @@ def goal_in_frame(layout: Layout, frame: Tensor, valid: Tensor, camera: Keypoint
 
 
 def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor) -> Tensor:
-    """Goal and payload in the world.
+    """Goal and payload in the world; arguments as of :func:`measured_goal`, and of the goal so far.
 
     Args:
-        layout: of the frame.
-        frame: shape (E, layout.frame), with its noise.
-        valid: validity of the keypoints, shape (E, 8).
-        camera: with its nominal mount.
+        layout, frame, valid, camera: see there.
         goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has seen it, bool, shape (E,).
 
     Returns:
@@ -156,12 +143,7 @@ class Fitted(NamedTuple):
 def fitted_goal(
     layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None, sums: Tensor, time: Tensor, fresh: Tensor
 ) -> Fitted:
-    """Take one frame into the goal's fit.
-
-    Args:
-        layout, frame, valid, camera: see :func:`measured_goal`.
-        sums, time, fresh: see :func:`fit`.
-    """
+    """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
     measured = goal_in_frame if layout.located else measured_goal
     sums, velocity = fit(sums, time, *measured(layout, frame, valid, camera), fresh)
     moves = velocity if layout.motion else None
@@ -188,11 +170,7 @@ def predicted(
 
 
 def middle(points: Tensor, valid: Tensor) -> Tensor:
-    """Median of four points' coordinates, shape (E, 4, 2), over those that are valid, shape (E, 4): one wrong point is outvoted.
-
-    Returns:
-        Shape (E, 2); 0 where none is valid.
-    """
+    """Median of four points, shape (E, 4, 2), over those that are valid, shape (E, 4): a wrong one is outvoted; 0 where none is."""
     count = valid.sum(-1, keepdim=True)
     ascending = torch.where(valid.unsqueeze(-1), points, torch.inf).sort(dim=1).values
     low, high = ((count - 1).clamp(min=0) // 2), (count // 2).clamp(max=3)

@@ -4,7 +4,6 @@ Who flies is decided by the pilot. A mode that the runner did not ask for counts
 stops commanding and asks for nothing any more, an abort included.
 """
 
-import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -245,13 +244,3 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _write_parameter(self, name: str, value: float) -> None:
         p, kind = self.params, self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
         self._link.send(mav.MAVLink_param_set_message(p.system, p.component, name.encode(), self._field(value, kind), kind))
-
-
-def bytes_to_integer(value: float) -> float:
-    """Return the integer whose bytes stand in a float field, as PX4 writes them."""
-    return float(struct.unpack("<i", struct.pack("<f", value))[0])
-
-
-def integer_to_bytes(value: float) -> float:
-    """Return the float field whose bytes are those of an integer."""
-    return struct.unpack("<f", struct.pack("<i", int(value)))[0]

@@ -8,17 +8,12 @@ Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_O
 PD_GRIPPER_EN up to 1.16); the output functions (Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration.
 """
 
+import struct
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from hil.links.backends.audit import Rule, bits, equal, within
-from hil.links.backends.autopilot import (
-    SERVO_NEAR,
-    AutopilotParams,
-    MavlinkAutopilot,
-    bytes_to_integer,
-    integer_to_bytes,
-)
+from hil.links.backends.autopilot import SERVO_NEAR, AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND
 from hil.links.pymav import mav
 from visthrow.config.bounds import Bound
@@ -117,3 +112,13 @@ class Px4(MavlinkAutopilot):
             name, why = p.output_parameter.replace("FUNC", open_end), "the output with the mechanism open, which is read back [us]"
             rules.append(Rule(name, f"{p.servo_open_us} (servo_open_us)", why, lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR))
         return rules
+
+
+def bytes_to_integer(value: float) -> float:
+    """Return the integer whose bytes stand in a float field, as PX4 writes them."""
+    return float(struct.unpack("<i", struct.pack("<f", value))[0])
+
+
+def integer_to_bytes(value: float) -> float:
+    """Return the float field whose bytes are those of an integer."""
+    return struct.unpack("<f", struct.pack("<i", int(value)))[0]
