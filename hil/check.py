@@ -116,8 +116,6 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
     return lines
 
 
-
-
 class AutopilotCheck:
     """Listens to an autopilot without commanding it: its parameters, and the share of thrust that it reports while the vehicle hovers."""
 

@@ -36,7 +36,6 @@ class Move:
     turn: bool  # of the attitude, else of the place
     axis: int | None  # of our axes along or about which it goes; None for the way back, which is not judged
 
-
 MOVES = (
     Move("carry it forward, along our x, by half a metre", False, 0),
     Move("carry it to its left, along our y, by half a metre", False, 1),

@@ -124,7 +124,6 @@ UNKNOWN_YAW = math.radians(2.0)  # standard deviation of the camera's yaw above 
 class CalibrationError(VisthrowError):
     """A hover shows too little to calibrate by."""
 
-
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
 
 STILL, SWAY = 1.5, 1.5  # of a hover before the sway, and of the sway [s]

@@ -29,7 +29,6 @@ from visthrow.onboard.traced import Traced
 VIEWS = {"pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "payload_w": 3, "goal_w": 3, "attached": 1}
 """What one step is shown, and the width of each: the columns of one array."""
 
-
 JITTER = 2e-3
 """By which steps may be off their times without being counted as late [s]: the payload moves some millimetres in it."""
 

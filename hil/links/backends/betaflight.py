@@ -337,5 +337,3 @@ def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
     entries = [frame.payload[i : i + 4] for i in range(0, len(frame.payload) - 3, 4)]
     found = [channel + 1 for of, channel, first, last in entries if of == box and first < last]
     return float(preferred if preferred in found else found[0] if found else 0)
-
-

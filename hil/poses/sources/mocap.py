@@ -23,7 +23,6 @@ from visthrow.common.extras import load_extra
 
 MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
-
 PROBE = "import json, os, sys, motioncapture; motioncapture.connect(sys.argv[1], json.loads(sys.argv[2])); os._exit(0)"
 """Connects once, in a process of its own."""
 
