@@ -246,7 +246,8 @@ class Pilot:
         sums: tuple[Tensor, ...] = ()
         velocity = places = None
         if fitted:
-            new, velocity, places, frame, valid = goal_motion.fitted_goal(self.layout, frame, valid, self.camera, *further[:2], fresh)
+            fit_sums, time = further[:2]
+            new, velocity, places, frame, valid = goal_motion.fitted_goal(self.layout, frame, valid, self.camera, fit_sums, time, fresh)
             sums = (new,)
         answers = tuple(push(held, ob.answer(frame, previous), fresh) for held in answers)
         earlier = answers[0][:, 1:] if answers else None
