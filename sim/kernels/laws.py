@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
-from sim.kernels.structs import Types, make_struct
+from sim.kernels.structs import Types, make_struct, types
 from sim.params import LawParams
 
 LOWEST = 0.05  # height below which 1/z is held [m]
@@ -26,45 +26,44 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
     """Warp functions of the scalars, and of the vectors by block; forces in the world frame, torques in the body's."""
     vec3, real = t.vec3, t.real
 
-    @wp.func
-    def up(a: Around):
-        return wp.quat_rotate(a.quat_wb, vec3(real(0.0), real(0.0), real(1.0)))
+    def axis(x: float, y: float, z: float):
+        @wp.func
+        def unit(a: Around):
+            return vec3(real(x), real(y), real(z))
 
-    @wp.func
-    def ahead(a: Around):
-        return wp.quat_rotate(a.quat_wb, vec3(real(1.0), real(0.0), real(0.0)))
+        return unit
 
-    @wp.func
-    def left(a: Around):
-        return wp.quat_rotate(a.quat_wb, vec3(real(0.0), real(1.0), real(0.0)))
+    def turned(vector):
+        @wp.func
+        def world(a: Around):
+            return wp.quat_rotate(a.quat_wb, vector(a))
 
-    @wp.func
-    def vertical(a: Around):
-        return vec3(real(0.0), real(0.0), real(1.0))
+        return world
 
-    @wp.func
-    def body_x(a: Around):
-        return vec3(real(1.0), real(0.0), real(0.0))
+    def turned_back(vector):
+        @wp.func
+        def body(a: Around):
+            return wp.quat_rotate_inv(a.quat_wb, vector(a))
 
-    @wp.func
-    def body_y(a: Around):
-        return vec3(real(0.0), real(1.0), real(0.0))
+        return body
+
+    def crossed(first, second):
+        @wp.func
+        def cross(a: Around):
+            return wp.cross(first(a), second(a))
+
+        return cross
+
+    def size(vector):
+        @wp.func
+        def length(a: Around):
+            return wp.length(vector(a))
+
+        return length
 
     @wp.func
     def vel(a: Around):
         return a.vel_w
-
-    @wp.func
-    def vel_body(a: Around):
-        return wp.quat_rotate_inv(a.quat_wb, a.vel_w)
-
-    @wp.func
-    def along(a: Around):
-        return wp.dot(a.vel_w, up(a))
-
-    @wp.func
-    def across(a: Around):
-        return a.vel_w - along(a) * up(a)
 
     @wp.func
     def rate(a: Around):
@@ -73,6 +72,33 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
     @wp.func
     def cable(a: Around):
         return a.cable_dir_w
+
+    @wp.func
+    def payload_vel(a: Around):
+        return a.payload_vel_w
+
+    @wp.func
+    def thrust(a: Around):
+        return a.thrust
+
+    @wp.func
+    def thrust_rate(a: Around):
+        return a.thrust_rate
+
+    @wp.func
+    def tension(a: Around):
+        return a.tension
+
+    body_x, body_y, vertical = axis(1.0, 0.0, 0.0), axis(0.0, 1.0, 0.0), axis(0.0, 0.0, 1.0)
+    up = turned(vertical)
+
+    @wp.func
+    def along(a: Around):
+        return wp.dot(a.vel_w, up(a))
+
+    @wp.func
+    def across(a: Around):
+        return a.vel_w - along(a) * up(a)
 
     @wp.func
     def swing(a: Around):
@@ -88,36 +114,12 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
         return a.cable_dir_w + under(a) * up(a)
 
     @wp.func
-    def payload_vel(a: Around):
-        return a.payload_vel_w
-
-    @wp.func
-    def thrust(a: Around):
-        return a.thrust
-
-    @wp.func
-    def thrust_rate(a: Around):
-        return a.thrust_rate
-
-    @wp.func
     def abs_thrust_rate(a: Around):
         return wp.abs(a.thrust_rate)
 
     @wp.func
-    def speed(a: Around):
-        return wp.length(a.vel_w)
-
-    @wp.func
-    def speed_across(a: Around):
-        return wp.length(across(a))
-
-    @wp.func
     def speed_across_squared(a: Around):
         return wp.dot(across(a), across(a))
-
-    @wp.func
-    def rate_size(a: Around):
-        return wp.length(a.rate_b)
 
     @wp.func
     def rate_yaw(a: Around):
@@ -128,36 +130,6 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
         return real(1.0) / wp.max(a.pos_w[2], real(LOWEST))
 
     @wp.func
-    def tension(a: Around):
-        return a.tension
-
-    @wp.func
-    def payload_speed(a: Around):
-        return wp.length(a.payload_vel_w)
-
-    @wp.func
-    def swing_speed(a: Around):
-        return wp.length(swing(a))
-
-    def crossed(first, second):
-        @wp.func
-        def cross(a: Around):
-            return wp.cross(first(a), second(a))
-
-        return cross
-
-    def turned_back(vector):
-        @wp.func
-        def back(a: Around):
-            return wp.quat_rotate_inv(a.quat_wb, vector(a))
-
-        return back
-
-    @wp.func
-    def rate_world(a: Around):
-        return wp.quat_rotate(a.quat_wb, a.rate_b)
-
-    @wp.func
     def joint_rate(a: Around):
         reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
         mount_vel = a.vel_w + wp.quat_rotate(a.quat_wb, wp.cross(a.rate_b, a.mount_b))
@@ -165,35 +137,32 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
         return wp.quat_rotate_inv(a.quat_wb, rope_rate) - a.rate_b
 
     @wp.func
-    def joint_speed(a: Around):
-        return wp.length(joint_rate(a))
-
-    @wp.func
     def friction(a: Around):
         return joint_rate(a) / wp.sqrt(wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST))
 
+    vel_body, cable_body, swing_body = turned_back(vel), turned_back(cable), turned_back(swing)
     scalars = {
-        "thrust": thrust, "thrust_rate": thrust_rate, "abs_thrust_rate": abs_thrust_rate, "speed": speed,
-        "speed_across": speed_across, "speed_across_squared": speed_across_squared, "speed_along": along, "rate": rate_size,
-        "rate_yaw": rate_yaw, "inverse_height": inverse_height, "tension": tension, "payload_speed": payload_speed,
-        "swing_speed": swing_speed, "cable_under_rotors": under, "joint_rate": joint_speed,
+        "thrust": thrust, "thrust_rate": thrust_rate, "abs_thrust_rate": abs_thrust_rate, "speed": size(vel),
+        "speed_across": size(across), "speed_across_squared": speed_across_squared, "speed_along": along, "rate": size(rate),
+        "rate_yaw": rate_yaw, "inverse_height": inverse_height, "tension": tension, "payload_speed": size(payload_vel),
+        "swing_speed": size(swing), "cable_under_rotors": under, "joint_rate": size(joint_rate),
     }  # fmt: skip
     vectors = {
         "vehicle force": {
-            "body_z": up, "body_x": ahead, "body_y": left, "world_z": vertical, "vel": vel, "vel_across": across,
-            "axis_cross_vel": crossed(up, vel), "rate_cross_vel": crossed(rate_world, vel), "cable": cable, "swing_vel": swing,
+            "body_z": up, "body_x": turned(body_x), "body_y": turned(body_y), "world_z": vertical, "vel": vel, "vel_across": across,
+            "axis_cross_vel": crossed(up, vel), "rate_cross_vel": crossed(turned(rate), vel), "cable": cable, "swing_vel": swing,
         },
         "vehicle torque": {
             "body_x": body_x, "body_y": body_y, "body_z": vertical, "rate": rate, "axis_cross_rate": crossed(vertical, rate),
             "vel": vel_body, "axis_cross_vel": crossed(vertical, vel_body),
-            "axis_cross_cable": crossed(vertical, turned_back(cable)), "axis_cross_swing": crossed(vertical, turned_back(swing)),
+            "axis_cross_cable": crossed(vertical, cable_body), "axis_cross_swing": crossed(vertical, swing_body),
         },
         "payload force": {
             "payload_vel": payload_vel, "vertical_cross_vel": crossed(vertical, payload_vel), "world_z": vertical, "body_z": up,
             "cable": cable, "swing_vel": swing, "cable_cross_swing": crossed(cable, swing), "vel": vel, "sideways": aside,
         },
         "rope joint": {
-            "joint_rate": joint_rate, "friction": friction, "axis_cross_cable": crossed(vertical, turned_back(cable)),
+            "joint_rate": joint_rate, "friction": friction, "axis_cross_cable": crossed(vertical, cable_body),
         },
     }  # fmt: skip
     return scalars, vectors
@@ -201,8 +170,6 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
 
 def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
     """Scalars, and vectors by block, that a law may name."""
-    from sim.kernels.structs import types
-
     t = types("float64")
     scalars, vectors = _factors(t, make_struct("Around", _around(t)))
     return tuple(scalars), {block: tuple(of) for block, of in vectors.items()}
@@ -234,41 +201,6 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
             )
 
 
-def build_joint(t: Types, Around: type, torque) -> object:
-    """Return ``act(around, air)`` -> air whose pushes hold a torque in the rope's joint and its reactions.
-
-    Args:
-        t: types of the wanted precision.
-        Around: struct of what the factors read.
-        torque: function ``(around, coefficients)`` -> torque on the vehicle [N m, body].
-    """
-    Air = t.Air
-
-    @wp.func
-    def act(a: Around, air: Air):
-        out = air
-        on_vehicle = torque(a, air.laws)
-        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
-        pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), reach) / wp.dot(reach, reach)
-        out.payload_push_w = air.payload_push_w + pair
-        out.push_w = air.push_w - pair
-        out.twist_b = air.twist_b + on_vehicle - wp.cross(a.mount_b, wp.quat_rotate_inv(a.quat_wb, pair))
-        return out
-
-    return act
-
-
-def build_no_joint(t: Types, Around: type) -> object:
-    """Build what stands in the joint's place where a plant has no law of it."""
-    Air = t.Air
-
-    @wp.func
-    def act(a: Around, air: Air):
-        return air
-
-    return act
-
-
 def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity) -> SimpleNamespace:
     """Compose the laws of a plant.
 
@@ -277,21 +209,6 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
         laws' forces besides its own, and ``in_flight(air, vel_w)`` [N] on a payload that has left. Without laws both do nothing.
     """
     vec3, vec4, real, Vehicle, Rope, Air, QuadState = t.vec3, t.vec4, t.real, t.Vehicle, t.Rope, t.Air, t.QuadState
-    if not laws:
-
-        @wp.func
-        def nothing(
-            p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-            stiffness: wp.array(dtype=real), command: vec4, attached: int,
-        ):  # fmt: skip
-            return air
-
-        @wp.func
-        def no_force(air: Air, vel_w: vec3):
-            return vec3()
-
-        return SimpleNamespace(on=nothing, in_flight=no_force)
-
     Around = make_struct("Around", _around(t))
     scalars, vectors = _factors(t, Around)
 
@@ -317,7 +234,19 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
     for i, law in enumerate(laws):
         total[law.block] = plus(total[law.block], law, i)
     force, torque, payload_force, joint = (total[block] for block in BLOCKS)
-    act_in_joint = build_joint(t, Around, joint) if any(law.block == "rope joint" for law in laws) else build_no_joint(t, Around)
+    in_joint = any(law.block == "rope joint" for law in laws)
+
+    @wp.func
+    def act_in_joint(a: Around, air: Air):
+        """The air whose pushes hold the torque in the rope's joint and its reactions besides."""
+        out = air
+        on_vehicle = joint(a, air.laws)
+        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
+        pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), reach) / wp.dot(reach, reach)
+        out.payload_push_w = air.payload_push_w + pair
+        out.push_w = air.push_w - pair
+        out.twist_b = air.twist_b + on_vehicle - wp.cross(a.mount_b, wp.quat_rotate_inv(a.quat_wb, pair))
+        return out
 
     @wp.func
     def on(
@@ -347,8 +276,16 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
         out.twist_b = air.twist_b + torque(a, air.laws)
         if attached != 0:
             out.payload_push_w = air.payload_push_w + payload_force(a, air.laws)
-            out = act_in_joint(a, out)
+            if wp.static(in_joint):
+                out = act_in_joint(a, out)
         return out
+
+    @wp.func
+    def nothing(
+        p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real), command: vec4, attached: int,
+    ):  # fmt: skip
+        return air
 
     @wp.func
     def in_flight(air: Air, vel_w: vec3):
@@ -356,4 +293,4 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
         a.payload_vel_w = vel_w
         return payload_force(a, air.laws)
 
-    return SimpleNamespace(on=on, in_flight=in_flight)
+    return SimpleNamespace(on=on if laws else nothing, in_flight=in_flight)

@@ -6,18 +6,6 @@ import warp as wp
 
 
 @wp.func
-def still_air(air: Any, vel_w: Any):
-    """Velocity through the air [m/s], world frame, of what moves at ``vel_w`` without wind."""
-    return vel_w
-
-
-@wp.func
-def in_wind(air: Any, vel_w: Any):
-    """Velocity through the air [m/s], world frame, of what moves at ``vel_w``."""
-    return vel_w - air.wind_w
-
-
-@wp.func
 def aero_rotor_drag(p: Any, vel_b: Any, rate_b: Any, thrust: Any):
     """Force [N], torque [N m] (both body frame, about the centre of mass) added to the rotors' own.
 

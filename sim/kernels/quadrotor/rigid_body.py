@@ -74,18 +74,6 @@ def blend(a: Any, wa: Any, b: Any, wb: Any):
     return out
 
 
-@wp.func
-def not_pushed(air: Any, quat_wb: Any, force: Any, torque: Any):
-    """Wrench without anything from outside."""
-    return force, torque
-
-
-@wp.func
-def pushed(air: Any, quat_wb: Any, force: Any, torque: Any):
-    """Wrench with what pushes from outside [N], [N m], body frame."""
-    return force + wp.quat_rotate_inv(quat_wb, air.push_w), torque + air.twist_b
-
-
 def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset(), motors: bool = False):
     """Compose the blocks of a vehicle's kinds.
 
@@ -104,11 +92,7 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
     rotor_thrust = thrust.rotor_thrust_scaled if "gain" in extensions else thrust.rotor_thrust
-    by_height = thrust.near_ground if "ground_effect" in extensions else thrust.out_of_ground
-    air_velocity = aero.in_wind if "wind" in extensions else aero.still_air
-    from_outside = pushed if "push" in extensions else not_pushed
-    Vehicle, QuadState, QuadRate, Flow, vec3, vec4 = t.Vehicle, t.QuadState, t.QuadRate, t.Flow, t.vec3, t.vec4
-    Air = t.Air
+    Vehicle, Air, QuadState, QuadRate, Flow, vec3, vec4 = t.Vehicle, t.Air, t.QuadState, t.QuadRate, t.Flow, t.vec3, t.vec4
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
@@ -117,14 +101,19 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
         )
         speed, speed_rate = motor_rate(p, s.motor_speed, target)
-        f = by_height(p, air, s.pos_w[2], rotor_thrust(p, speed, s.voltage))
+        f = rotor_thrust(p, speed, s.voltage)
+        if wp.static("ground_effect" in extensions):
+            f = thrust.near_ground(p, air, s.pos_w[2], f)
         charge_rate, voltage_rate = battery_rate(p, s.charge_used, s.voltage, speed, f)
-        vel_b = wp.quat_rotate_inv(s.quat_wb, air_velocity(air, s.vel_w))
+        through_air = s.vel_w - air.wind_w if wp.static("wind" in extensions) else s.vel_w
+        vel_b = wp.quat_rotate_inv(s.quat_wb, through_air)
         aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)
         force, torque = composer.compose(
             p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque
         )
-        force, torque = from_outside(air, s.quat_wb, force, torque)
+        if wp.static("push" in extensions):
+            force += wp.quat_rotate_inv(s.quat_wb, air.push_w)
+            torque += air.twist_b
         out.force_b = force
         out.torque_b = torque
         out.motor_speed = speed

@@ -38,21 +38,14 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
     ideal = vehicle.battery.kind == "ideal"
 
     @wp.func
-    def settle_sag(p: Vehicle, thrust: real, used: real):
-        voltage = p.battery.reference_voltage
-        for _ in range(4):  # speed and voltage depend on each other weakly: each round gains three digits
-            voltage = hover_voltage(p, used, thrust, hover_speed(p, thrust / real(4.0), voltage))
-        return voltage, used
-
-    @wp.func
-    def settle_ideal(p: Vehicle, thrust: real, used: real):
-        return p.battery.reference_voltage, real(0.0)
-
-    settle = settle_ideal if ideal else settle_sag
-
-    @wp.func
     def start(p: Vehicle, state: State, env: int, thrust: real, used: real):
-        voltage, charge_used = settle(p, thrust, used)
+        voltage = p.battery.reference_voltage
+        charge_used = used
+        if wp.static(ideal):
+            charge_used = real(0.0)
+        else:
+            for _ in range(4):  # speed and voltage depend on each other weakly: each round gains three digits
+                voltage = hover_voltage(p, used, thrust, hover_speed(p, thrust / real(4.0), voltage))
         speed = hover_speed(p, thrust / real(4.0), voltage)
         state.motor_speed[env] = vec4(speed, speed, speed, speed)
         state.integral[env] = vec3()

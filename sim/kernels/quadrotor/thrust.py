@@ -28,12 +28,6 @@ def near_ground(p: Any, air: Any, height: Any, thrust: Any):
 
 
 @wp.func
-def out_of_ground(p: Any, air: Any, height: Any, thrust: Any):
-    """Thrust of each rotor [N], shape (4,), without the ground."""
-    return thrust
-
-
-@wp.func
 def rotor_torque(p: Any, thrust: Any):
     """Magnitude of each rotor's drag torque [N m], shape (4,)."""
     return p.thrust.torque_ratio * thrust

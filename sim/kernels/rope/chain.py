@@ -17,10 +17,14 @@ with ``b_k = B e_k`` and the 2x2 inverse q, ``c_k = sum_j q_kj b_j`` gives ``B Q
 Time integration (ROS2 of Verwer et al., SIAM J. Sci. Comput. 20, 1999, as a W-method): the Jacobian is approximated rod
 by rod by its geometric stiffness K (tension times arm) and its joint damping D, which only adds
 ``gamma h D + gamma^2 h^2 K`` to J; any approximation keeps second order. With k1 the first stage, ``n2 = n + h (u + gamma h
-k1)``, ``u2 = u + h k1`` the predicted state and z the solution of the same recursion there with the right-hand side of
-:func:`second_stage_terms`::
+k1)``, ``u2 = u + h k1`` the predicted state and z the solution of the same recursion there, from ``(I - gh J) k2 = f2 - 2 k1``
+with ``z = k2 + 2 k1`` and gh = gamma h::
 
     u+ = u + h/2 (k1 + z),   n+ = n + h/2 (u + u2 + gamma h (z - k1))
+
+In a rope that gives every rod lengthens with the pull at the mount (equations: :class:`sim.params.RopeParams`). With l the length
+of a rod and l' its growth, its lower end moves at ``l u + l' n`` and is accelerated by ``2 l' u`` besides; what hangs there and the
+rod's own mass take part in it.
 """
 
 from types import SimpleNamespace
@@ -28,10 +32,30 @@ from typing import Any
 
 import warp as wp
 
-from sim.kernels.rope import stretch
-from sim.kernels.rope.algebra import sym_mul, tangent_basis
 from sim.kernels.rope.payload import LOADS
 from sim.kernels.structs import Types
+
+
+@wp.func
+def sym_mul(d: Any, o: Any, v: Any):
+    """Product of the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)`` and a vector."""
+    return type(v)(
+        d[0] * v[0] + o[0] * v[1] + o[1] * v[2],
+        o[0] * v[0] + d[1] * v[1] + o[2] * v[2],
+        o[1] * v[0] + o[2] * v[1] + d[2] * v[2],
+    )
+
+
+@wp.func
+def tangent_basis(n: Any):
+    """Two unit vectors that complete the unit vector n. Source: Duff et al., JCGT 6(1), 2017."""
+    one = type(n[0])(1.0)
+    sign = one
+    if n[2] < n[2] - n[2]:
+        sign = -one
+    a = -one / (sign + n[2])
+    b = n[0] * n[1] * a
+    return type(n)(one + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), type(n)(b, sign + n[1] * n[1] * a, -n[1])
 
 
 @wp.func
@@ -41,58 +65,9 @@ def viscous(n: Any, neighbour_n: Any, neighbour_u: Any):
 
 
 @wp.func
-def first_stage_terms(stiffness: Any, damping: Any, u: Any, k1: Any, gh: Any, h: Any):
-    """Right-hand side that the W-method adds to a rod's moment balance in the first stage: ``-gh K u``, gh = gamma h."""
-    return -gh * stiffness * u
-
-
-@wp.func
-def second_stage_terms(stiffness: Any, damping: Any, u2: Any, k1: Any, gh: Any, h: Any):
-    """Right-hand side that the W-method adds in the second stage, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1``."""
-    two = type(h)(2.0)
-    return gh * stiffness * u2 + two * gh * (stiffness * (two * gh - h) + damping) * k1
-
-
-@wp.func
-def no_load(i: int, last: int, at: Any, arm: Any, load: Any):
-    """Force or moment on rod i where nothing but gravity acts on the rods."""
-    return at
-
-
-@wp.func
-def last_load(i: int, last: int, at: Any, arm: Any, load: Any):
-    """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod alone."""
-    if i == last:
-        return at + arm * load
-    return at
-
-
-@wp.func
-def joint_alike(rope: Any, i: int):
-    """Damping of the upper joint of rod i [N m s]."""
-    return rope.joint_damping
-
-
-@wp.func
-def joint_and_mount(rope: Any, i: int):
-    """Damping of the upper joint of rod i [N m s], with the mount's friction in the uppermost."""
-    if i == 0:
-        return rope.joint_damping + rope.mount_damping
-    return rope.joint_damping
-
-
-@wp.func
-def frictionless_mount(rope: Any, i: int, moment: Any, couple: Any):
-    """Moment on rod i; the mount adds nothing."""
-    return moment
-
-
-@wp.func
-def rubbing_mount(rope: Any, i: int, moment: Any, couple: Any):
-    """Moment on rod i with the mount's friction on the uppermost one; ``couple``: rate of the vehicle against the rod."""
-    if i == 0:
-        return moment + rope.mount_damping * couple
-    return moment
+def growing(rope: Any, u: Any):
+    """Coriolis acceleration ``2 l' u`` of the lower end of a rod that lengthens."""
+    return (type(rope.strain_rate)(2.0) * rope.strain_rate * rope.segment_length) * u
 
 
 def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset()) -> SimpleNamespace:
@@ -108,16 +83,42 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         at the mount, at the state and at the predicted state), ``down_first`` (root to leaf: first stage k1 and predicted
         directions n2), ``down_second`` (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the
         first stage alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear momentum
-        relative to the mount).
+        relative to the mount), ``stretched(natural, now, stiffness, u, h)`` (the rope under its pull, ``now`` what it was h
+        seconds before; with h 0 it is at rest).
     """
     L = segments
     real, vec3, Rope = t.real, t.vec3, t.Rope
     vec2 = wp.types.vector(2, real)
     last = L - 1
-    loaded = last_load if extensions & LOADS else no_load
-    upper_damping = joint_and_mount if "mount_damping" in extensions else joint_alike
-    at_mount = rubbing_mount if "mount_damping" in extensions else frictionless_mount
-    bias = stretch.of(extensions)
+    loaded, rubbing, giving = bool(extensions & LOADS), "mount_damping" in extensions, "compliance" in extensions
+
+    @wp.func
+    def with_load(i: int, at: vec3, arm: real, load: vec3):
+        """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod alone."""
+        if wp.static(loaded):
+            if i == last:
+                return at + arm * load
+        return at
+
+    @wp.func
+    def upper_damping(rope: Rope, i: int):
+        """Damping of the upper joint of rod i [N m s], with the mount's friction in the uppermost."""
+        if wp.static(rubbing):
+            if i == 0:
+                return rope.joint_damping + rope.mount_damping
+        return rope.joint_damping
+
+    @wp.func
+    def centre_share(rope: Rope, i: int):
+        """Part of a rod's lengthening that its centre of mass follows."""
+        if i == last:
+            return rope.stretched_share
+        return real(0.5)
+
+    @wp.func
+    def tip(rope: Rope, acc: vec3, u: vec3):
+        """Acceleration of a rod's lower end."""
+        return acc + growing(rope, u) if wp.static(giving) else acc
 
     @wp.func
     def rod(rope: Rope, i: int):
@@ -133,23 +134,15 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             return real(0.0)
         return rope.last_mass + real(float(L - 2 - i)) * rope.segment_mass
 
-    @wp.func
-    def direction_first(n: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), i: int):
-        return n[i]
+    def build_stage(second: bool):
+        @wp.func
+        def direction(n: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), i: int):
+            return n2[i] if wp.static(second) else n[i]
 
-    @wp.func
-    def direction_second(n: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), i: int):
-        return n2[i]
+        @wp.func
+        def rate(u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real, i: int):
+            return u[i] + h * k1[i] if wp.static(second) else u[i]
 
-    @wp.func
-    def rate_first(u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real, i: int):
-        return u[i]
-
-    @wp.func
-    def rate_second(u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real, i: int):
-        return u[i] + h * k1[i]
-
-    def build_up(direction, rate, terms):
         @wp.func
         def up(
             rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), n2: wp.array(dtype=vec3),
@@ -159,6 +152,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             l = rope.segment_length
             l2 = l * l
             gh = gamma * h
+            two = real(2.0)
             d = vec3()  # apparent mass of what hangs below: diagonal
             o = vec3()  # and off-diagonal (xy, xz, yz)
             b = vec3()
@@ -186,9 +180,20 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 f = m * gravity
                 cm = c * m
                 g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
-                g += terms(stiffness[i], damping, ui, k1[i], gh, h)
-                g = at_mount(rope, i, loaded(i, last, g, rope.payload_arm, load), above)
-                g = bias.moment(rope, i, last, g, ui, d, o, cm)
+                if wp.static(second):
+                    g += gh * stiffness[i] * ui + two * gh * (stiffness[i] * (two * gh - h) + damping) * k1[i]
+                else:
+                    g += -gh * stiffness[i] * ui
+                g = with_load(i, g, rope.payload_arm, load)
+                if wp.static(rubbing):
+                    if i == 0:
+                        g += rope.mount_damping * above
+                if wp.static(giving):
+                    if rope.compliance != real(0.0):  # lanes of a replay differ in it
+                        growth = growing(rope, ui)
+                        share = centre_share(rope, i)
+                        g = g - l * sym_mul(d, o, growth) - (cm * share) * growth
+                        b = b + sym_mul(d, o, growth) + (m * share) * growth
                 e1, e2 = tangent_basis(ni)
                 a_e1 = sym_mul(d, o, e1)
                 a_e2 = sym_mul(d, o, e2)
@@ -208,8 +213,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 g2 = wp.dot(e2, g)
                 h1 = s22 * g1 - s12 * g2
                 h2 = s11 * g2 - s12 * g1
-                b = bias.force(rope, i, last, b, ui, d, o, m)
-                b = b - loaded(i, last, f, real(1.0), load) - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
+                b = b - with_load(i, f, real(1.0), load) - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
                 d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
                 o = o - vec3(
                     b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2]
@@ -223,10 +227,18 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 ui = u_above
             return d, o, b
 
-        return up
+        @wp.func
+        def speed(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+            """Velocity of the payload's centre [m/s], world frame."""
+            vel = mount_vel_w
+            for i in range(L):
+                vel += rope.segment_length * rate(u, k1, h, i)
+            return vel + rope.payload_offset * rate(u, k1, h, L - 1)
 
-    up_first = build_up(direction_first, rate_first, first_stage_terms)
-    up_second = build_up(direction_second, rate_second, second_stage_terms)
+        return up, speed
+
+    up_first, speed_first = build_stage(second=False)
+    up_second, speed_second = build_stage(second=True)
 
     @wp.func
     def acceleration(ni: vec3, ui: vec3, a: vec3, c1: vec3, c2: vec3, hs: vec2):
@@ -251,7 +263,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             k1[i] = k
             n2[i] = wp.normalize(ni + h * (ui + (gamma * h) * k))
             fastest = wp.max(fastest, wp.max(wp.dot(ui, ui), wp.dot(u2, u2)))
-            a = bias.tip(rope, a + rope.segment_length * k, ui)
+            a = tip(rope, a + rope.segment_length * k, ui)
         return fastest
 
     @wp.func
@@ -276,10 +288,13 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             ui = old_u + h * first
             k = acceleration(ni, ui, a, c1[i], c2[i], hs[i])
             f = m * gravity
-            pull = pull + loaded(i, last, f, real(1.0), load) - m * bias.center(rope, i, last, a + c * k, ui)
-            moment = loaded(i, last, c * (f - m * a) - l * pull, rope.payload_arm, load)
+            centre = a + c * k
+            if wp.static(giving):
+                centre += centre_share(rope, i) * growing(rope, ui)
+            pull = pull + with_load(i, f, real(1.0), load) - m * centre
+            moment = with_load(i, c * (f - m * a) - l * pull, rope.payload_arm, load)
             stiffness[i] = wp.max(wp.dot(ni, moment), real(0.0))
-            a = bias.tip(rope, a + l * k, ui)
+            a = tip(rope, a + l * k, ui)
             new_n = wp.normalize(n[i] + half * (old_u + ui + gh * (k - first)))
             new_u = old_u + half * (first + k)
             new_u = new_u - new_n * wp.dot(new_n, new_u)
@@ -304,7 +319,9 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         vel = mount_vel_w
         for i in range(L):
             pos += rope.segment_length * n[i]
-            vel = bias.speed(rope, vel + rope.segment_length * u[i], n[i])
+            vel += rope.segment_length * u[i]
+            if wp.static(giving):
+                vel += (rope.strain_rate * rope.segment_length) * n[i]
         return pos + rope.payload_offset * n[L - 1], vel + rope.payload_offset * u[L - 1]
 
     @wp.func
@@ -322,49 +339,40 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         return mount_vel_w + momentum(rope, u) * (real(1.0) / rope.total_mass)
 
     @wp.func
-    def pull_of_many(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
-        """Force [N] along the rope at the mount, from the geometric stiffness of the first rod (tension times length).
+    def pull(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
+        """Force [N] along the rope at the mount.
 
-        Half of what the first rod itself weighs and swings by is left out.
+        Of many rods from the geometric stiffness of the first (tension times length): half of what that rod itself weighs and swings
+        by is left out. Of a single one what it and the payload weigh, and what keeps them on their circle.
         """
-        return stiffness[0] / rope.segment_length
+        if wp.static(L > 1):
+            return stiffness[0] / rope.segment_length
+        else:
+            return stiffness[0] / rope.last_center + rope.last_mass * rope.last_center * wp.dot(u[0], u[0])
 
     @wp.func
-    def pull_of_one(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
-        """Force [N] along a single rod at the mount: what it and the payload weigh, and what keeps them on their circle."""
-        return stiffness[0] / rope.last_center + rope.last_mass * rope.last_center * wp.dot(u[0], u[0])
+    def stretched(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3), h: real):
+        if wp.static(giving):
+            if natural.compliance != real(0.0):
+                out = natural
+                one = real(1.0)
+                tension = wp.max(pull(now, stiffness, u), real(0.0))
+                out.strain = natural.compliance * tension / (natural.segment_length * real(float(L)))
+                if h > real(0.0):
+                    out.strain_rate = (out.strain - now.strain) / (h * (one + out.strain))
+                out.segment_length = natural.segment_length * (one + out.strain)
+                longer = out.segment_length - natural.segment_length
+                rope_part = natural.segment_mass * natural.segment_length * natural.segment_length / real(3.0)
+                out.segment_inertia = natural.segment_inertia * (one + out.strain) * (one + out.strain)
+                out.payload_arm = natural.payload_arm + longer
+                out.last_center = natural.last_center + natural.stretched_share * longer
+                ball = natural.payload_mass * (out.payload_arm * out.payload_arm - natural.payload_arm * natural.payload_arm)
+                out.last_inertia = natural.last_inertia + rope_part * ((one + out.strain) * (one + out.strain) - one) + ball
+                return out
+        return now
 
-    @wp.func
-    def speed_first(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
-        """Velocity of the payload's centre at the state [m/s], world frame."""
-        vel = mount_vel_w
-        for i in range(L):
-            vel += rope.segment_length * u[i]
-        return vel + rope.payload_offset * u[L - 1]
-
-    @wp.func
-    def speed_second(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
-        """Velocity of the payload's centre at the predicted state [m/s], world frame."""
-        vel = mount_vel_w
-        for i in range(L):
-            vel += rope.segment_length * (u[i] + h * k1[i])
-        return vel + rope.payload_offset * (u[L - 1] + h * k1[L - 1])
-
-    chain = SimpleNamespace(
-        up_first=up_first,
-        up_second=up_second,
-        down_first=down_first,
-        down_second=down_second,
-        fall_back=fall_back,
-        payload=payload,
-        speed_first=speed_first,
-        speed_second=speed_second,
-        momentum=momentum,
-        upper_damping=upper_damping,
-        com_velocity=com_velocity,
-        pull=pull_of_one if L == 1 else pull_of_many,
-        segments=L,
-        vec2=vec2,
-    )
-    chain.stretched = stretch.build_stretch(t, chain, extensions)
-    return chain
+    return SimpleNamespace(
+        up_first=up_first, up_second=up_second, down_first=down_first, down_second=down_second, fall_back=fall_back, payload=payload,
+        speed_first=speed_first, speed_second=speed_second, momentum=momentum, upper_damping=upper_damping,
+        com_velocity=com_velocity, pull=pull, stretched=stretched, segments=L, vec2=vec2,
+    )  # fmt: skip

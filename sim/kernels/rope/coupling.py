@@ -43,48 +43,6 @@ def build_root(t: Types):
     return root
 
 
-def build_load(t: Types, chain: SimpleNamespace, payload: SimpleNamespace, mount_velocity, extensions: frozenset[str]):
-    """Force on the payload in both stages of a step, and the momentum that it brings.
-
-    Returns:
-        Warp functions ``first``, ``second`` (``(rope, air, state, flow, n, u, k1, h)`` -> force [N, world]) and
-        ``impulse(momentum, h, force, force)`` -> momentum [N s] after h of the forces' mean. Without any they do nothing.
-    """
-    vec3, real, Rope, Air, QuadState, Flow = t.vec3, t.real, t.Rope, t.Air, t.QuadState, t.Flow
-    last = chain.segments - 1
-
-    @wp.func
-    def none(
-        rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-        k1: wp.array(dtype=vec3), h: real,
-    ):  # fmt: skip
-        return vec3()
-
-    @wp.func
-    def no_impulse(momentum: vec3, h: real, force1: vec3, force2: vec3):
-        return momentum
-
-    @wp.func
-    def impulse(momentum: vec3, h: real, force1: vec3, force2: vec3):
-        return momentum + (real(0.5) * h) * (force1 + force2)
-
-    if not extensions & LOADS:
-        return none, none, no_impulse
-
-    def build(speed):
-        @wp.func
-        def load(
-            rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3), h: real,
-        ):  # fmt: skip
-            jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
-            return payload.hanging(rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[last], jet)
-
-        return load
-
-    return build(chain.speed_first), build(chain.speed_second), impulse
-
-
 def build_coupled_step(
     t: Types, flow, rate, motor_advance, chain: SimpleNamespace, payload: SimpleNamespace, extensions: frozenset[str]
 ):
@@ -100,10 +58,8 @@ def build_coupled_step(
         momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its centre, world frame).
     """
     vec3, vec4, real = t.vec3, t.vec4, t.real
-    Vehicle, Rope, Air, QuadState = t.Vehicle, t.Rope, t.Air, t.QuadState
-    vec2 = chain.vec2
-    upper_damping = chain.upper_damping
-    L = chain.segments
+    Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow
+    vec2, L, loaded = chain.vec2, chain.segments, bool(extensions & LOADS)
     root = build_root(t)
 
     @wp.func
@@ -114,7 +70,22 @@ def build_coupled_step(
     def payload_state(rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
         return chain.payload(rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u)
 
-    load_first, load_second, add_impulse = build_load(t, chain, payload, mount_velocity, extensions)
+    def build_load(speed):
+        @wp.func
+        def load(
+            rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3), h: real,
+        ):  # fmt: skip
+            """Force on the payload [N], world frame."""
+            if wp.static(loaded):
+                jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
+                return payload.hanging(rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[L - 1], jet)
+            else:
+                return vec3()
+
+        return load
+
+    load_first, load_second = build_load(chain.speed_first), build_load(chain.speed_second)
 
     @wp.func
     def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):
@@ -129,7 +100,7 @@ def build_coupled_step(
     @wp.func
     def damping_torque(rope: Rope, s: QuadState, rate_w: vec3, n: vec3, u: vec3):
         """Couple of the uppermost joint on the vehicle [N m], body frame."""
-        return upper_damping(rope, 0) * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
+        return chain.upper_damping(rope, 0) * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
 
     @wp.func
     def step(
@@ -158,7 +129,9 @@ def build_coupled_step(
         fell_back = fastest * h * h > max_turn * max_turn
         if fell_back:
             chain.fall_back(n, u, h, n2, k1)
-            new_total = add_impulse(total + h * (push1 + weight), h, load1, load1)
+            new_total = total + h * (push1 + weight)
+            if wp.static(loaded):
+                new_total += (half * h) * (load1 + load1)
             s2.vel_w = root_velocity(p, rope, s2, new_total, chain.momentum(rope, u))
             return s2, new_total, fell_back
 
@@ -175,7 +148,8 @@ def build_coupled_step(
         out = advance(s, blend(r1, half, r2, half), h)
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
         new_total = total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
-        new_total = add_impulse(new_total, h, load1, load2)
+        if wp.static(loaded):
+            new_total += (half * h) * (load1 + load2)
         out.vel_w = root_velocity(p, rope, out, new_total, relative)
         return out, new_total, fell_back
 

@@ -1,36 +1,13 @@
 """Forces on the payload besides its weight and the rope. Equations: :class:`sim.params.RopeParams`."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
-from sim.kernels.quadrotor import aero
 from sim.kernels.structs import Types
 
 LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})
 """Extensions that push at the payload."""
-
-
-@wp.func
-def drag_force(rope: Any, air_vel_w: Any):
-    """Drag of the air [N], world frame, on the payload that moves through it at ``air_vel_w`` [m/s]."""
-    return -(rope.payload_drag * wp.length(air_vel_w)) * air_vel_w
-
-
-@wp.func
-def no_spin(rope: Any, force: Any, air_vel_w: Any):
-    """Force on a payload that flies through the air without spin or seam."""
-    return force
-
-
-@wp.func
-def spin_force(rope: Any, force: Any, air_vel_w: Any):
-    """Air's force on the payload [N], world frame, with the side force and the lift of a ball that spins."""
-    zero = air_vel_w[0] - air_vel_w[0]
-    side = type(air_vel_w)(-air_vel_w[1], air_vel_w[0], zero)
-    across = wp.normalize(side)
-    return force + wp.length(air_vel_w) * (rope.payload_side * side + rope.payload_lift * wp.cross(air_vel_w, across))
 
 
 def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
@@ -52,43 +29,40 @@ def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
         direction, ``jet_w`` the force of the rotors on the air [N]) and ``free(rope, air, vel_w)`` [N] in flight.
     """
     Rope, Air, vec3 = t.Rope, t.Air, t.vec3
-    air_velocity = aero.in_wind if "wind" in extensions else aero.still_air
 
     @wp.func
-    def nothing(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
+    def through_air(air: Air, vel_w: vec3):
+        return vel_w - air.wind_w if wp.static("wind" in extensions) else vel_w
+
+    @wp.func
+    def drag(rope: Rope, air: Air, vel_w: vec3):
+        force = vec3()
+        if wp.static("payload_drag" in extensions):
+            air_vel_w = through_air(air, vel_w)
+            force += -(rope.payload_drag * wp.length(air_vel_w)) * air_vel_w
         return force
 
     @wp.func
-    def add_drag(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
-        return force + drag_force(rope, air_velocity(air, vel_w))
-
-    @wp.func
-    def add_friction(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
-        return force - rope.swing_damping * (vel_w - wp.dot(vel_w, along_w) * along_w)
-
-    @wp.func
-    def add_jet(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
-        return force + rope.downwash * jet_w
-
-    @wp.func
-    def add_push(rope: Rope, air: Air, force: vec3, vel_w: vec3, along_w: vec3, jet_w: vec3):
-        return force + air.payload_push_w
-
-    drag = add_drag if "payload_drag" in extensions else nothing
-    friction = add_friction if "swing_damping" in extensions else nothing
-    jet = add_jet if "downwash" in extensions else nothing
-    push = add_push if "push" in extensions else nothing
-    spin = spin_force if "payload_spin" in extensions else no_spin
-
-    @wp.func
     def hanging(rope: Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
-        force = push(rope, air, drag(rope, air, vec3(), vel_w, along_w, jet_w), vel_w, along_w, jet_w)
-        return jet(rope, air, friction(rope, air, force, vel_w, along_w, jet_w), vel_w, along_w, jet_w)
+        force = drag(rope, air, vel_w)
+        if wp.static("push" in extensions):
+            force += air.payload_push_w
+        if wp.static("swing_damping" in extensions):
+            force -= rope.swing_damping * (vel_w - wp.dot(vel_w, along_w) * along_w)
+        if wp.static("downwash" in extensions):
+            force += rope.downwash * jet_w
+        return force
 
     @wp.func
     def free(rope: Rope, air: Air, vel_w: vec3):
-        none = vec3()
-        dragged = spin(rope, drag(rope, air, none, vel_w, none, none), air_velocity(air, vel_w))
-        return push(rope, air, dragged, vel_w, none, none)
+        force = drag(rope, air, vel_w)
+        if wp.static("payload_spin" in extensions):  # side force and lift of a ball that spins
+            air_vel_w = through_air(air, vel_w)
+            side = vec3(-air_vel_w[1], air_vel_w[0], air_vel_w[0] - air_vel_w[0])
+            lift = wp.cross(air_vel_w, wp.normalize(side))
+            force += wp.length(air_vel_w) * (rope.payload_side * side + rope.payload_lift * lift)
+        if wp.static("push" in extensions):
+            force += air.payload_push_w
+        return force
 
     return SimpleNamespace(hanging=hanging, free=free)

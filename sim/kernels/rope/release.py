@@ -17,11 +17,10 @@ FLIGHT_STEPS = 500
 
 
 @wp.func
-def time_to_height(pos_w: Any, vel_w: Any, height: Any, gravity: Any):
-    """Time [s] at which a projectile comes down to ``height`` [m]; 0 where it never reaches it.
+def time_to_height(rope: Any, air: Any, pos_w: Any, vel_w: Any, height: Any, gravity: Any):
+    """Time [s] at which a projectile comes down to ``height`` [m]; 0 where it never reaches it; ``gravity``: magnitude [m/s^2].
 
-    Args:
-        gravity: magnitude [m/s^2].
+    Neither rope nor air counts in this module's functions; under drag they do (:func:`build_ballistic`).
     """
     zero = height - height
     two = type(height)(2.0)
@@ -30,19 +29,19 @@ def time_to_height(pos_w: Any, vel_w: Any, height: Any, gravity: Any):
 
 
 @wp.func
-def projectile(pos_w: Any, vel_w: Any, gravity: Any, time: Any):
+def projectile(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity: Any, time: Any):
     """Position [m] after ``time`` of free flight, world frame, z up."""
     fall = type(time)(0.5) * gravity * time * time
     return pos_w + time * vel_w - type(pos_w)(time - time, time - time, fall)
 
 
 @wp.func
-def clearance(pos_w: Any, vel_w: Any, gravity: Any, time: Any, vehicle_w: Any, samples: int):
+def clearance(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity: Any, time: Any, vehicle_w: Any, samples: int):
     """Least distance [m] of the flight to a point, at ``samples`` equal fractions of ``time`` from 0 to 1."""
     least = wp.length(pos_w - vehicle_w)
     for k in range(1, samples):
         s = time * type(time)(float(k)) / type(time)(float(samples - 1))
-        least = wp.min(least, wp.length(projectile(pos_w, vel_w, gravity, s) - vehicle_w))
+        least = wp.min(least, wp.length(projectile(rope, air, pos_w, vel_w, gravity, s) - vehicle_w))
     return least
 
 
@@ -58,34 +57,21 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
 
     @wp.func
-    def fixed_lag(r: Release, rope: Rope, pull: real, gravity: real):
-        return r.lag
-
-    @wp.func
-    def lag_by_pull(r: Release, rope: Rope, pull: real, gravity: real):
-        return wp.max(r.lag + r.lag_tension * (pull - rope.payload_mass * gravity), real(0.0))
-
-    @wp.func
-    def no_kick(r: Release, vel_w: vec3, along_w: vec3):
-        return vel_w
+    def lag(r: Release, rope: Rope, pull: real, gravity: real):
+        if wp.static("lag_tension" in extensions):
+            return wp.max(r.lag + r.lag_tension * (pull - rope.payload_mass * gravity), real(0.0))
+        else:
+            return r.lag
 
     @wp.func
     def kick(r: Release, vel_w: vec3, along_w: vec3):
-        return vel_w + r.kick_w + r.kick_along * along_w
-
-    @wp.func
-    def no_tail(r: Release, vel_w: vec3, com_vel_w: vec3):
-        return vel_w
+        return vel_w + r.kick_w + r.kick_along * along_w if wp.static("kick" in extensions) else vel_w
 
     @wp.func
     def tail(r: Release, vel_w: vec3, com_vel_w: vec3):
-        return vel_w + r.rope_tail * (com_vel_w - vel_w)
+        return vel_w + r.rope_tail * (com_vel_w - vel_w) if wp.static("rope_tail" in extensions) else vel_w
 
-    return SimpleNamespace(
-        lag=lag_by_pull if "lag_tension" in extensions else fixed_lag,
-        kick=kick if "kick" in extensions else no_kick,
-        tail=tail if "rope_tail" in extensions else no_tail,
-    )
+    return SimpleNamespace(lag=lag, kick=kick, tail=tail)
 
 
 def build_step_in_flight(t: Types, acceleration):
@@ -127,25 +113,9 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
         ``after(rope, air, pos, vel, gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity, time, vehicle_w,
         samples)`` [m], each with the arguments of the functions of the same names in this module.
     """
-    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
-
-    @wp.func
-    def closed_time(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, height: real, gravity: real):
-        return time_to_height(pos_w, vel_w, height, gravity)
-
-    @wp.func
-    def closed_after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):
-        return projectile(pos_w, vel_w, gravity, time)
-
-    @wp.func
-    def closed_clearance(
-        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int
-    ):
-        return clearance(pos_w, vel_w, gravity, time, vehicle_w, samples)
-
     if not dragging:
-        return SimpleNamespace(time_to_height=closed_time, after=closed_after, clearance=closed_clearance)
-
+        return SimpleNamespace(time_to_height=time_to_height, after=projectile, clearance=clearance)
+    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
     step = build_step_in_flight(t, acceleration)
 
     @wp.func
@@ -176,7 +146,7 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
             time = time + h
             count = count + 1
             next_pos, next_vel = fly(rope, air, pos, vel, gravity, h)
-        share = time_to_height(pos, vel, height, gravity)
+        share = time_to_height(rope, air, pos, vel, height, gravity)
         for _ in range(3):
             next_pos, next_vel = fly(rope, air, pos, vel, gravity, share)
             if next_vel[2] < real(0.0):
