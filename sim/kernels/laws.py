@@ -209,6 +209,20 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
         laws' forces besides its own, and ``in_flight(air, vel_w)`` [N] on a payload that has left. Without laws both do nothing.
     """
     vec3, vec4, real, Vehicle, Rope, Air, QuadState = t.vec3, t.vec4, t.real, t.Vehicle, t.Rope, t.Air, t.QuadState
+    if not laws:  # their factors take a seventh of the time in which a kernel is composed
+
+        @wp.func
+        def nothing(
+            p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
+            stiffness: wp.array(dtype=real), command: vec4, attached: int,
+        ):  # fmt: skip
+            return air
+
+        @wp.func
+        def no_force(air: Air, vel_w: vec3):
+            return vec3()
+
+        return SimpleNamespace(on=nothing, in_flight=no_force)
     Around = make_struct("Around", _around(t))
     scalars, vectors = _factors(t, Around)
 
@@ -281,16 +295,9 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
         return out
 
     @wp.func
-    def nothing(
-        p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real), command: vec4, attached: int,
-    ):  # fmt: skip
-        return air
-
-    @wp.func
     def in_flight(air: Air, vel_w: vec3):
         a = Around()
         a.payload_vel_w = vel_w
         return payload_force(a, air.laws)
 
-    return SimpleNamespace(on=on if laws else nothing, in_flight=in_flight)
+    return SimpleNamespace(on=on, in_flight=in_flight)
