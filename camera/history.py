@@ -8,11 +8,7 @@ import torch
 
 
 def filled(new: torch.Tensor, length: int) -> torch.Tensor:
-    """History of ``length`` copies of new (E, ...): shape (E, H, ...).
-
-    Raises:
-        ValueError: length is below 1.
-    """
+    """History of ``length`` copies of new (E, ...): shape (E, H, ...). Raises ValueError: length is below 1."""
     if length < 1:
         raise ValueError(f"history length is {length}; expected at least 1 (the newest value itself)")
     return new.unsqueeze(1).repeat_interleave(length, 1)

@@ -21,7 +21,8 @@ def draw_overlay(
     """Draw keypoints, field of view and body axes.
 
     Goal corners are joined to a green square and the payload's edge midpoints to a red box; where one of a group is
-    invalid only its points are drawn. An invalid point is a grey cross where it reads.
+    invalid only its points are drawn. An invalid point is a grey cross where it reads. Raises ValueError: the image's shape or type is not
+    the camera's.
 
     Args:
         camera: The camera that made the keypoints.
@@ -31,9 +32,6 @@ def draw_overlay(
 
     Returns:
         A new picture, BGR, uint8, shape (H, W, 3).
-
-    Raises:
-        ValueError: The image's shape or type is not the camera's.
     """
     lens = camera.fisheye
     shape = (lens.params.height, lens.params.width, 3)

@@ -56,9 +56,7 @@ class FisheyeParams:
     def __post_init__(self) -> None:
         """Refuse intrinsics that describe no camera.
 
-        Raises:
-            ValueError: A value is not finite or out of range, or theta_d does not grow all the way to the edge of the field
-            of view.
+        Raises ValueError: a value is not finite or out of range, or theta_d does not grow all the way to the edge of the field of view.
         """
         for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
             if not math.isfinite(getattr(self, name)):
@@ -133,8 +131,7 @@ class KeypointNoiseParams:
     def __post_init__(self) -> None:
         """Refuse noise settings out of range.
 
-        Raises:
-            ValueError: A negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
+        Raises ValueError: a negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
         """
         for name in ("step_std", "bias_std", "latency", "scale_std"):
             if not getattr(self, name) >= 0.0:
@@ -159,11 +156,7 @@ class CameraParams:
     payload_radius: float  # radius of the ball whose bounding box is seen [m]
 
     def __post_init__(self) -> None:
-        """Refuse parameters that describe no camera.
-
-        Raises:
-            ValueError: A size that is not above 0.
-        """
+        """Refuse parameters that describe no camera. Raises ValueError: a size that is not above 0."""
         for name in ("goal_side", "payload_radius"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"camera {name} is {getattr(self, name)}; expected a length above 0 m")

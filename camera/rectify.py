@@ -36,11 +36,7 @@ def view_rotation(view: ViewParams) -> torch.Tensor:
 
 
 def view_focal(view: ViewParams) -> float:
-    """Focal length of a view [px].
-
-    Raises:
-        ValueError: The field of view is not one of a pinhole.
-    """
+    """Focal length of a view [px]. Raises ValueError: the field of view is not one of a pinhole."""
     if not 0.0 < view.fov_deg < 180.0:
         raise ValueError(
             f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a pinhole has"
@@ -67,6 +63,8 @@ def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tenso
 def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tensor:
     """Cut a rectified (pinhole) view out of fisheye frames.
 
+    Raises ValueError: the frames do not have the lens's size, or the view is no pinhole.
+
     Args:
         frames: Shape (B, C, H, W) of the lens's size.
         lens: The lens.
@@ -74,9 +72,6 @@ def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tens
 
     Returns:
         Shape (B, C, view.height, view.width), black where the fisheye sees nothing.
-
-    Raises:
-        ValueError: The frames do not have the lens's size, or the view is no pinhole.
     """
     from kornia.geometry.transform import remap
 

@@ -121,6 +121,8 @@ class HybridSim:
     ):
         """Allocate ``count`` plants.
 
+        Raises ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
+
         Args:
             params: the plant; its kinds and numerics hold for all.
             count: number of environments E.
@@ -135,9 +137,6 @@ class HybridSim:
             extensions: of :data:`sim.kernels.structs.EXTENSIONS`, to build in besides those that the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
             threads: at most, of a CPU; default all its cores. The bits do not depend on it.
-
-        Raises:
-            ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
         """
         vehicles, ropes = vehicles or [params.vehicle], ropes or [params.rope]
         airs, releases = airs or [params.air], releases or [params.release]
@@ -202,6 +201,8 @@ class HybridSim:
     ) -> None:
         """Put every plant into a stated pose, actuators at hover, command queue filled with hover.
 
+        Raises ValueError: a shape that does not fit.
+
         Args:
             pos_w: [m], shape (E, 3).
             quat_wb: xyzw, shape (E, 4); default level.
@@ -209,9 +210,6 @@ class HybridSim:
             cable_dir_w: unit vectors, shape (E, L, 3); default hanging.
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3).
             battery_used: fraction of charge used.
-
-        Raises:
-            ValueError: a shape that does not fit.
         """
         zero, rows = np.zeros(3), np.zeros((self.params.rope.segments, 3))
         given = {
@@ -249,11 +247,7 @@ class HybridSim:
         return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
     def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
-        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.
-
-        Raises:
-            ValueError: another shape.
-        """
+        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device. Raises ValueError: another shape."""
         asked = np.zeros(self.count) if release is None else np.asarray(release)
         if asked.shape != (self.count,):
             raise ValueError(f"release of shape {asked.shape}; expected {(self.count,)}")

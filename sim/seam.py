@@ -47,14 +47,13 @@ class Bodies(Protocol):
 class SeamSim:
     """Quadrotors on any bodies: the blocks' NumPy form, one wrench out and one root in every substep.
 
+    Raises ValueError: a period that is no whole number of substeps.
+
     Args:
         vehicle: Blocks; of its body the mass and inertia are the solver's.
         bodies: The solver.
         substep: Between two exchanges [s]; the paper's is 2 ms.
         control_period: Of the commands [s].
-
-    Raises:
-        ValueError: A period that is no whole number of substeps.
     """
 
     def __init__(self, vehicle: VehicleParams, bodies: Bodies, substep: float = 0.002, control_period: float = 0.02) -> None:
@@ -123,9 +122,8 @@ class FusedChain:
     def advance(self, force_b: np.ndarray, torque_b: np.ndarray, duration: float) -> None:
         """See `Bodies`.
 
-        Raises:
-            ValueError: A duration that is no whole number of intervals, or a force across body z, which the kernel has no place for:
-                its own blocks work there.
+        Raises ValueError: a duration that is no whole number of intervals, or a force across body z, which the kernel has no place for: its
+        own blocks work there.
         """
         force_b, torque_b = (np.broadcast_to(np.asarray(v, dtype=float), (self.count, 3)) for v in (force_b, torque_b))
         steps = round(duration / self.interval)

@@ -186,6 +186,9 @@ class QuadSim:
     ):
         """Allocate ``count`` quadrotors at the origin, in hover.
 
+        Raises ValueError: no environment, an unknown integrator or precision, a step or period that is not positive, vehicles of other
+        kinds of blocks, or an unphysical parameter.
+
         Args:
             vehicle: its kinds of blocks hold for all.
             count: number of environments E.
@@ -198,10 +201,6 @@ class QuadSim:
             vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[vehicle]``.
             air: wind and ground effect, for all.
             gravity: acceleration of free fall, along -z [m/s^2].
-
-        Raises:
-            ValueError: no environment, an unknown integrator or precision, a step or period that is not positive, vehicles
-                of other kinds of blocks, or an unphysical parameter.
         """
         if count < 1:
             raise ValueError(f"QuadSim of {count} environments; expected 1 or more")
@@ -247,7 +246,7 @@ class QuadSim:
         rate_b: np.ndarray | None = None,
         battery_used: float = 0.0,
     ) -> None:
-        """Set ``start`` for every environment and reset all.
+        """Set ``start`` for every environment and reset all. Raises ValueError: a shape that does not fit.
 
         Args:
             pos_w: [m], shape (E, 3).
@@ -255,9 +254,6 @@ class QuadSim:
             vel_w: [m/s], shape (E, 3).
             rate_b: [rad/s], shape (E, 3).
             battery_used: fraction of charge used.
-
-        Raises:
-            ValueError: a shape that does not fit.
         """
         zero = np.zeros(3)
         given = {"pos_w": (pos_w, zero), "quat_wb": (quat_wb, st.LEVEL), "vel_w": (vel_w, zero), "rate_b": (rate_b, zero)}

@@ -82,8 +82,7 @@ class Units:
 def in_units(value: Value, units: Units, dimensions: Mapping[str, Mapping[Dimension, str]] = PLANT) -> Value:
     """Dataclass of SI values with its numbers stated in other units, tables in it too.
 
-    Raises:
-        ValueError: a field whose dimension is not told, or a plant with laws, whose coefficients have none of their own.
+    Raises ValueError: a field whose dimension is not told, or a plant with laws, whose coefficients have none of their own.
     """
     if isinstance(value, PlantParams) and value.laws:
         raise ValueError(f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients have no dimension")

@@ -24,10 +24,9 @@ VIEW_AT_LEAST = 6
 class BoardParams:
     """A board: chessboard (inner corners, where four squares meet), circles (a grid of their centres) or ChArUco.
 
-    Convention: point (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns, y along the rows.
+    Raises ValueError: a size that is no board's, or a dictionary that OpenCV does not have.
 
-    Raises:
-        ValueError: A size that is no board's, or a dictionary that OpenCV does not have.
+    Convention: point (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns, y along the rows.
     """
 
     columns: int  # points along x: inner corners, or circles
@@ -136,7 +135,7 @@ def calibrate_from_boards(
     """Calibrate a fisheye from pictures of a board.
 
     OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the polynomial found there
-    goes on past 90 deg.
+    goes on past 90 deg. Raises ValueError: pictures differ in size, too few show the board, or OpenCV finds no solution.
 
     Args:
         images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3); at least three with the whole board in view.
@@ -145,9 +144,6 @@ def calibrate_from_boards(
 
     Returns:
         The fisheye and the residuals, for all views and for each.
-
-    Raises:
-        ValueError: Pictures differ in size, too few show the board, or OpenCV finds no solution.
     """
     import cv2
 
@@ -175,13 +171,12 @@ def calibrate_from_boards(
 def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
     """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the lens is left as it is.
 
+    Raises ValueError: pictures are not of the lens's size, or too few show the board.
+
     Args:
         images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3), of the lens's size.
         board: The board.
         fisheye: The lens.
-
-    Raises:
-        ValueError: Pictures are not of the lens's size, or too few show the board.
     """
     size, found = find_boards(images, board)
     if size != (fisheye.height, fisheye.width):
@@ -194,8 +189,7 @@ def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeP
 def find_boards(images: list[np.ndarray], board: BoardParams) -> tuple[tuple[int, int], list[View | None]]:
     """Size (height, width) of all pictures, and what each shows of the board.
 
-    Raises:
-        ValueError: Pictures differ in size, or fewer than three show the board.
+    Raises ValueError: pictures differ in size, or fewer than three show the board.
     """
     sizes = sorted({image.shape[:2] for image in images})
     if len(sizes) != 1:

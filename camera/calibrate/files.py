@@ -26,13 +26,12 @@ _KB4 = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
     """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration.
 
+    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
+
     Args:
         path: File with ``fisheye_model: 1``, ``image_width``, ``image_height``, ``camera_matrix`` and four
             ``distortion_coefficients``, as OpenCV's calibration sample writes them.
         fov_deg: Full field of view where the file has none [deg].
-
-    Raises:
-        ValueError: The file is missing, cut short, lacks a key, or holds another model.
     """
     import cv2
 
@@ -61,13 +60,12 @@ def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams
 def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> FisheyeParams:
     """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is Kannala-Brandt).
 
+    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
+
     Args:
         path: The camchain YAML.
         camera: Number of the camera in it.
         fov_deg: Full field of view where the file has none [deg].
-
-    Raises:
-        ValueError: The file is missing, cut short, lacks a key, or holds another model.
     """
     chain = _yaml(path)
     tree = _mapping(path, f"cam{camera}", _get(path, chain, f"cam{camera}"))
@@ -82,12 +80,11 @@ def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None)
 def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
     """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye`` distortion model.
 
+    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
+
     Args:
         path: The file.
         fov_deg: Full field of view where the file has none [deg].
-
-    Raises:
-        ValueError: The file is missing, cut short, lacks a key, or holds another model.
     """
     tree = _yaml(path)
     _expect(path, tree, "distortion_model", ("equidistant", "fisheye"))
@@ -107,6 +104,8 @@ def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
 def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> tuple[FisheyeParams, FitReport]:
     """Read one camera of a basalt calibration: ``kb4`` as it is, ``ds`` and ``eucm`` through a fit.
 
+    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
+
     Args:
         path: The JSON file.
         camera: Number of the camera in it.
@@ -114,9 +113,6 @@ def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None)
 
     Returns:
         The fisheye and what the fit left over (all zero for ``kb4``).
-
-    Raises:
-        ValueError: The file is missing, cut short, lacks a key, or holds another model.
     """
     try:
         tree = json.loads(_text(path, whole_lines=False))

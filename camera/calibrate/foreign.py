@@ -70,7 +70,8 @@ def fit_fisheye(
 ) -> tuple[FisheyeParams, FitReport]:
     """Fit our model to a foreign one on a grid of pixels, by least squares of the pixel difference.
 
-    The principal point is taken over (all three models are symmetric about it); fx, fy and k1 to k4 are fitted.
+    The principal point is taken over (all three models are symmetric about it); fx, fy and k1 to k4 are fitted. Raises ValueError: the
+    model is unknown, or no grid point lies in the field of view, or the fit describes no camera.
 
     Args:
         model: A key of `FOREIGN_MODELS`.
@@ -82,9 +83,6 @@ def fit_fisheye(
     Returns:
         The fisheye and what the fit left over. Its field of view is the asked one, cut to what the image sees and to
         where theta_d stops growing: nothing is extrapolated.
-
-    Raises:
-        ValueError: The model is unknown, or no grid point lies in the field of view, or the fit describes no camera.
     """
     if model not in FOREIGN_MODELS:
         raise ValueError(f"camera model {model!r} cannot be fitted; expected one of {sorted(FOREIGN_MODELS)}")
@@ -103,6 +101,8 @@ def fit_rays(
 ) -> tuple[FisheyeParams, FitReport]:
     """Fit our model to any lens that turns pixels into rays; see :func:`fit_fisheye`.
 
+    Raises ValueError: no grid point lies in the field of view, or the fit describes no camera.
+
     Args:
         model: What the report calls the lens.
         unproject: Rays, shape (N, 3), camera frame, and validity, shape (N,), of pixels [px], shape (N, 2).
@@ -111,9 +111,6 @@ def fit_rays(
         width: Image width [px].
         height: Image height [px].
         fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
-
-    Raises:
-        ValueError: No grid point lies in the field of view, or the fit describes no camera.
     """
     from scipy.optimize import least_squares
 

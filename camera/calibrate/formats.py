@@ -32,11 +32,7 @@ _MARKS = {
 
 
 def format_of(path: str | Path) -> str:
-    """Tell the format of a calibration file from its text.
-
-    Raises:
-        ValueError: The file is missing, no text, or of none of the formats.
-    """
+    """Tell the format of a calibration file from its text. Raises ValueError: the file is missing, no text, or of none of the formats."""
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file; expected a calibration of {', '.join(READERS)}")
     try:
@@ -50,7 +46,7 @@ def format_of(path: str | Path) -> str:
 
 
 def read(path: str | Path, format: str = "auto", camera: int = 0, fov_deg: float | None = None) -> tuple[str, FisheyeParams, FitReport]:
-    """Read a calibration file.
+    """Read a calibration file. Raises ValueError: the format is unknown, or its reader refuses the file.
 
     Args:
         path: The file.
@@ -60,9 +56,6 @@ def read(path: str | Path, format: str = "auto", camera: int = 0, fov_deg: float
 
     Returns:
         The format, the fisheye, and what a fit of another lens model left over (zero where the file holds ours).
-
-    Raises:
-        ValueError: The format is unknown, or its reader refuses the file.
     """
     name = format_of(path) if format == "auto" else format
     if name not in READERS:
@@ -73,6 +66,8 @@ def read(path: str | Path, format: str = "auto", camera: int = 0, fov_deg: float
 def read_ocam(path: str | Path, fov_deg: float | None = None) -> Reading:
     """Read the text file that OCamCalib's "export data" writes, and fit our model to its direct polynomial.
 
+    Raises ValueError: the file is missing, cut short, or describes no lens.
+
     Convention: the file counts rows before columns, from 0 at the centre of the top left pixel; its z axis points away from
     the scene. An affine part (c, d, e) that shears the image is beyond our model and shows in the report.
 
@@ -81,9 +76,6 @@ def read_ocam(path: str | Path, fov_deg: float | None = None) -> Reading:
     Args:
         path: The file: direct polynomial, inverse polynomial (unused), centre, affine part, image size (height, width).
         fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
-
-    Raises:
-        ValueError: The file is missing, cut short, or describes no lens.
     """
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file; expected a calibration file")

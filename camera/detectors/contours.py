@@ -112,14 +112,11 @@ class Detector:
         self._in_view = (plane < edge).astype(np.uint8)
 
     def detect(self, image: np.ndarray, known: Known | None = None) -> Seen:
-        """Find ball and goal.
+        """Find ball and goal. Raises ValueError: an image of another size or type.
 
         Args:
             image: BGR, uint8, shape (H, W, 3) of the lens.
             known: narrows what is looked for.
-
-        Raises:
-            ValueError: an image of another size or type.
         """
         self.check(image)
         p, known = self.params, known or Known()
@@ -129,11 +126,7 @@ class Detector:
         return Seen(self._ball(*ball, known), self._goal(*goal, colours.bright, known))
 
     def check(self, image: np.ndarray) -> None:
-        """Refuse an image of another size or type.
-
-        Raises:
-            ValueError: see there.
-        """
+        """Raise ValueError for an image of another size or type."""
         shape = (*self._in_view.shape, 3)
         if image.shape != shape or image.dtype != np.uint8:
             raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")

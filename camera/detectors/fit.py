@@ -44,11 +44,7 @@ NEAR = 0.5
 
 @dataclass(frozen=True)
 class FitParams:
-    """A training; one file of ``configs/detector``.
-
-    Raises:
-        ValueError: a count below 1, or more fresh frames than the pool holds.
-    """
+    """A training; one file of ``configs/detector``. Raises ValueError: a count below 1, or more fresh frames than the pool holds."""
 
     steps: int
     batch: int  # frames a step
@@ -324,11 +320,7 @@ class Fit:
         path.with_suffix(".part").replace(path)
 
     def load(self, path: Path) -> None:
-        """Take up a checkpoint; the pool is filled anew.
-
-        Raises:
-            ValueError: no checkpoint of such a training.
-        """
+        """Take up a checkpoint; the pool is filled anew. Raises ValueError: no checkpoint of such a training."""
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
             for name in ("networks", "optimizer", "rates"):

@@ -100,11 +100,7 @@ class Networks(nn.Module):
 
     @staticmethod
     def load(path: str | Path = SHIPPED) -> "Networks":
-        """Read what `save` wrote.
-
-        Raises:
-            ValueError: no such file, or not of this format.
-        """
+        """Read what `save` wrote. Raises ValueError: no such file, or not of this format."""
         found = Networks()
         try:
             with np.load(path, allow_pickle=False) as arrays:
@@ -185,8 +181,7 @@ class LearntDetector(Detector):
     def __init__(self, lens: Fisheye, payload_radius: float, goal_side: float, params=None, networks: Networks | None = None) -> None:
         """Take the lens, the true sizes and the networks; left out, those that are shipped.
 
-        Raises:
-            ValueError: a frame whose sides are no multiples of a cell.
+        Raises ValueError: a frame whose sides are no multiples of a cell.
         """
         super().__init__(lens, payload_radius, goal_side, params)
         if lens.params.height % CELL or lens.params.width % CELL:

@@ -86,9 +86,8 @@ class Runner:
     def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
         """Build all parts; the mechanism's lag is from its command to separation [s].
 
-        Raises:
-            MismatchError, PolicyError: the camera is not the one that the policy was trained with, or the policy is incomplete.
-            RunError: the mechanism is slower than the policy was trained for.
+        Raises MismatchError, PolicyError: the camera is not the one that the policy was trained with, or the policy is incomplete;
+        RunError: the mechanism is slower than the policy was trained for.
         """
         self.params, self.backend = params, backend
         self.pilot = Pilot(policy, params.camera)

@@ -84,8 +84,7 @@ class Lowest:
 class SettingEffect(Effect):
     """An effect as a change of a setting; a table of ``configs/effects``.
 
-    Raises:
-        ValueError: A condition or a kind of block that does not exist, or neither or both of changes and switch.
+    Raises ValueError: a condition or a kind of block that does not exist, or neither or both of changes and switch.
     """
 
     changes: tuple[Change, ...] = ()
@@ -147,11 +146,7 @@ class EffectTables:
 
 
 def apply(effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]) -> Setting:
-    """Return the setting with effects of these sizes.
-
-    Raises:
-        KeyError: No effect of that name.
-    """
+    """Return the setting with effects of these sizes. Raises KeyError: no effect of that name."""
     for name, size in theta.items():
         effect = effects[name]
         if size != 0.0:

@@ -53,7 +53,7 @@ def calibrated_voltage(vehicle: VehicleParams, settings: Mapping[str, str], weig
 
 
 def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float) -> ControllerParams:
-    """Numbers of the block ``motor_mixing``.
+    """Numbers of the block ``motor_mixing``. Raises ValueError: a setting is missing.
 
     Args:
         vehicle: whose rotors the firmware drives; its ``max_thrust`` is at the battery's reference voltage.
@@ -62,9 +62,6 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
             iterm_windup.
         mix_thrust: of a motor in hover [N].
         voltage: at which the throttle was calibrated [V].
-
-    Raises:
-        ValueError: a setting is missing.
     """
     lists = ("rollPID", "pitchPID", "yawPID", "ff_weight", "iterm_relax_cutoff", "motor_idle", "pidsum_limit", "iterm_windup")
     missing = [name for name in lists if name not in settings]

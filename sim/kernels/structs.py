@@ -170,13 +170,12 @@ def extensions_of(
 def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]) -> np.ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``.
 
+    Raises ValueError: other kinds of blocks, or rotors without torque, which no mixer can command yaw with.
+
     Args:
         t: types of the wanted precision.
         vehicles: one for all environments, or one each.
         kinds: of the blocks that the kernel was built for.
-
-    Raises:
-        ValueError: other kinds of blocks, or rotors without torque, which no mixer can command yaw with.
     """
     rows = np.zeros(len(vehicles), dtype=_numpy_type(t.Vehicle))
     for row, vehicle in zip(rows, vehicles, strict=True):
@@ -221,8 +220,7 @@ def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ..
 def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list[P.RopeParams]:
     """The ropes with their mounts stated from the centre of mass of the vehicle that each hangs on.
 
-    Raises:
-        ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with them.
+    Raises ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with them.
     """
     coms = [v.body.com for v in vehicles]
     if len(set(coms)) > 1:

@@ -55,11 +55,7 @@ class MujocoBodies:
         return np.array(self._sites).reshape(self.count, -1, 3)[:, self._site]
 
     def advance(self, force_b: np.ndarray, torque_b: np.ndarray, duration: float) -> None:
-        """See `Bodies`.
-
-        Raises:
-            ValueError: A duration that is no whole number of steps.
-        """
+        """See `Bodies`. Raises ValueError: a duration that is no whole number of steps."""
         steps = round(duration / self.step)
         if abs(steps * self.step - duration) > 1e-9:
             raise ValueError(f"{duration} s is no whole number of steps of {self.step} s")

@@ -10,10 +10,8 @@ class ReferenceExtras:
     """Switchable effects of the reference plant.
 
     Fields that end in ``_sigma`` are standard deviations of a normal draw at each reset, one an environment; fields
-    that end in ``_jitter`` are half-widths of a uniform draw at each event; the others are values. Zero switches off.
-
-    Raises:
-        ValueError: a negative value where only the sign of 0 or more makes sense.
+    that end in ``_jitter`` are half-widths of a uniform draw at each event; the others are values. Zero switches off. Raises ValueError: a
+    negative value where only the sign of 0 or more makes sense.
     """
 
     payload_drag: float = 0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]

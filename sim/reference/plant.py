@@ -45,7 +45,7 @@ def _refuse_unknown(params: PlantParams) -> None:
 
 
 class ReferencePlant:
-    """Vehicles with ropes.
+    """Vehicles with ropes. Raises ValueError: a step that is not positive, or a parameter that this plant does not know.
 
     Args:
         params: vehicle, rope, release; of ``params.sim`` only the control period is used.
@@ -53,9 +53,6 @@ class ReferencePlant:
         seed: of every random draw.
         count: E.
         step: largest integration step [s].
-
-    Raises:
-        ValueError: a step that is not positive, or a parameter that this plant does not know.
     """
 
     def __init__(
@@ -87,6 +84,8 @@ class ReferencePlant:
     ) -> None:
         """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in hover.
 
+        Raises ValueError: an array of another shape.
+
         Args:
             pos_w: of the frame's origin [m], shape (E, 3).
             quat_wb: xyzw, shape (E, 4).
@@ -94,9 +93,6 @@ class ReferencePlant:
             rate_b: [rad/s], shape (E, 3).
             cable_dir_w: unit directions of the segments from the mount outwards, shape (E, L, 3); None for hanging.
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3); None for zero.
-
-        Raises:
-            ValueError: an array of another shape.
         """
         count, segments = self.count, self.params.rope.segments
         hanging = np.tile([0.0, 0.0, -1.0], (count, segments, 1))

@@ -16,15 +16,12 @@ from sim.reference.rotations import cross, quat_wxyz_from_matrix, rotation_from_
 
 
 class RopeDynamics:
-    """Ropes of E environments, each with its own masses and lengths.
+    """Ropes of E environments, each with its own masses and lengths. Raises ValueError: models with different numbers of segments.
 
     Args:
         ropes: one model an environment, all with the same number of segments.
         stretch: stiffness [N/m] and damping [N s/m] between last segment and payload, or None.
         mount_damping: of the uppermost joint besides the ropes' own while it is on the vehicle [N m s].
-
-    Raises:
-        ValueError: models with different numbers of segments.
     """
 
     def __init__(self, ropes: list[RopeModel], stretch: tuple[float, float] | None = None, mount_damping: float = 0.0) -> None:

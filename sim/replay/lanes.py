@@ -63,6 +63,8 @@ FEW = 32
 class Replay:
     """Replays windows of recorded flights with perturbed parameters, initial states and forces.
 
+    Raises ValueError: plants of different blocks or segments, or an unphysical parameter.
+
     Args:
         plants: parameters of the rows that lanes choose from; one choice of blocks and one number of segments.
         sensings: of the same rows.
@@ -70,9 +72,6 @@ class Replay:
         precision: "float64", in which differences of lanes do not drown in rounding, or "float32".
         gravity: [m/s^2].
         download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
-
-    Raises:
-        ValueError: plants of different blocks or segments, or an unphysical parameter.
     """
 
     def __init__(

@@ -153,8 +153,7 @@ COMPENSATIONS = ("none", "release", "delay", "both")
 def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
     """Known delays of a plant: mean age of measurements; command queue, set-point filter and motors; release.
 
-    Raises:
-        ConfigError: no compensation of that name.
+    Raises ConfigError: no compensation of that name.
     """
     if compensation not in COMPENSATIONS:
         raise ConfigError(f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}")

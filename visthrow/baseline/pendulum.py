@@ -89,8 +89,7 @@ def _advance(model: Pendulum, state: np.ndarray, control: np.ndarray, period: fl
 def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float, substeps: int = 1) -> np.ndarray:
     """Advance states, shape (..., 16), under constant inputs, shape (..., 4), over a period [s] in so many Runge-Kutta steps.
 
-    Raises:
-        ValueError: Arrays of other widths.
+    Raises ValueError: arrays of other widths.
     """
     state, control = _checked(state, control)
     columns, inputs = np.moveaxis(state, -1, 0), np.moveaxis(control, -1, 0)

@@ -46,8 +46,7 @@ def landing_point(pos_w: np.ndarray, vel_w: np.ndarray, landing_height: float) -
 def release_for(target: float, height: float, speed: float, landing_height: float) -> Release:
     """Release state of a throw along x to a target [m], at a height [m] with a horizontal speed [m/s]; landing is the payload's centre's.
 
-    Raises:
-        ConfigError: No throw: a height below the landing's, or no speed.
+    Raises ConfigError: no throw: a height below the landing's, or no speed.
     """
     if not (height > landing_height and speed > 0.0):
         raise ConfigError(

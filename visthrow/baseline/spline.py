@@ -204,14 +204,13 @@ def optimise(
 ) -> Spline:  # fmt: skip
     """Plan the payload's path from hover to the release.
 
+    Raises PlanError: no horizontal velocity, a release beside the plane, or the optimisation does not find a path.
+
     Args:
         model, params: whose thrust the bounds are on.
         start_w, end_w: [m], shape (3,), in a vertical plane with ``velocity_w`` [m/s], which is not vertical.
         tick: period and offset [s]: the duration is the offset and a whole number of periods, so that a controller of that
             period can release at its end.
-
-    Raises:
-        PlanError: No horizontal velocity, a release beside the plane, or the optimisation does not find a path.
     """
     along = np.array([*velocity_w[:2], 0.0])
     speed = float(np.linalg.norm(along))
@@ -295,10 +294,8 @@ def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float
 def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path, position and five derivatives, shape (T, 6, 3).
 
-    The attitude is the shortest turn from level to the thrust's direction.
-
-    Raises:
-        PlanError: The payload falls freely, where the cable has no direction.
+    The attitude is the shortest turn from level to the thrust's direction. Raises PlanError: the payload falls freely, where the cable has
+    no direction.
 
     Source: Sreenath, Lee, Kumar, CDC 2013, Lemma 1: payload position and heading are flat outputs.
     """

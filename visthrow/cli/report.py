@@ -76,8 +76,7 @@ def _folder(name: str) -> Path:
 def quick(out: Path, jobs: int) -> None:
     """Make the few throws of ``configs/sweep/quick.toml`` and of the baseline, as far as they are not there.
 
-    Raises:
-        VisthrowError: throws that failed; the message names them.
+    Raises VisthrowError: throws that failed; the message names them.
     """
     from importlib.util import find_spec
 

@@ -9,8 +9,7 @@ from visthrow.common.errors import VisthrowError
 def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -> ModuleType:
     """Import a package of an optional extra, which ``what`` needs.
 
-    Raises:
-        VisthrowError: Of the type ``error``: it is not installed; the message names the extra.
+    Raises VisthrowError: of the type ``error``: it is not installed; the message names the extra.
     """
     try:
         return importlib.import_module(module)

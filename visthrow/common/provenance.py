@@ -76,10 +76,8 @@ def collect() -> dict[str, Any]:
 def write_run_folder(folder: str | Path, config_text: str, *, resume: bool = False, **extra: Any) -> dict[str, Any]:
     """Write the resolved config, TOML, and the provenance with ``extra`` beside the results of a run; returns that.
 
-    Where a folder holds a run that is resumed, its config is left, and the provenance goes to the next free ``provenance_<n>.json``.
-
-    Raises:
-        StorageError: If the folder holds a run already and ``resume`` is not set, or cannot be written.
+    Where a folder holds a run that is resumed, its config is left, and the provenance goes to the next free ``provenance_<n>.json``. Raises
+    StorageError if the folder holds a run already and ``resume`` is not set, or cannot be written.
     """
     folder = Path(folder)
     record = {**collect(), **extra}

@@ -97,8 +97,7 @@ def _of_both(function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray,
 def paired(a: np.ndarray, b: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
     """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a failed throw are left out.
 
-    Raises:
-        ValueError: arrays of different lengths, or no pair in which both landed.
+    Raises ValueError: arrays of different lengths, or no pair in which both landed.
     """
     if len(a) != len(b):
         raise ValueError(f"pairs of {len(a)} and {len(b)} throws; expected the same throws of both")
@@ -114,8 +113,7 @@ def ratio(a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int = 0, draws: 
 def correlation(x: np.ndarray, y: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
     """Pearson's correlation of pairs with its interval over pairs.
 
-    Raises:
-        ValueError: fewer than three pairs, or one side that never varies.
+    Raises ValueError: fewer than three pairs, or one side that never varies.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(x) != len(y) or len(x) < 3 or not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):

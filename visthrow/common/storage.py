@@ -16,10 +16,8 @@ from visthrow.common.errors import StorageError
 def atomic_write(path: str | Path, content: bytes | str) -> None:
     """Write bytes, or text as UTF-8, so that, whatever happens, the path holds the old content or the whole new one.
 
-    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in one step; folders are made.
-
-    Raises:
-        StorageError: If the disk is full or the place cannot be written; nothing half-written is left.
+    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in one step; folders are made. Raises
+    StorageError if the disk is full or the place cannot be written; nothing half-written is left.
     """
     path = Path(path)
     data = content.encode("utf-8") if isinstance(content, str) else content
@@ -71,8 +69,7 @@ def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.ndarray]:
     """Read all arrays of an ``.npz`` without pickle.
 
-    Raises:
-        Exception: Of class ``error``: no such file, cut short, damaged, or not what it should be.
+    Raises Exception: of class ``error``: no such file, cut short, damaged, or not what it should be.
     """
     path = Path(path)
     if not path.is_file():

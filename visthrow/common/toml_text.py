@@ -11,8 +11,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 def dumps(tree: dict[str, Any]) -> str:
     """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values: plain keys first, then tables.
 
-    Raises:
-        ValueError: If a value has no TOML form (NaN, infinity, None, other types).
+    Raises ValueError if a value has no TOML form (NaN, infinity, None, other types).
     """
     lines: list[str] = []
     _table(tree, (), lines)

@@ -32,6 +32,9 @@ T = TypeVar("T")
 def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
     """Load a TOML file into a frozen dataclass.
 
+    Raises ConfigError if a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the message names file,
+    key path, what came, what was expected and what exists.
+
     Args:
         schema: Dataclass that the file must fill.
         path: The file.
@@ -39,10 +42,6 @@ def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
 
     Returns:
         The filled dataclass.
-
-    Raises:
-        ConfigError: If a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the
-            message names file, key path, what came, what was expected and what exists.
     """
     return _built(schema, _read(schema, Path(path), ()), overrides)
 
@@ -71,10 +70,8 @@ def configs_root() -> Path:
 def find(kind: str, name: str | Path) -> Path:
     """Find a config by name (``find("vehicle", "paper")``) or by an explicit path.
 
-    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ...
-
-    Raises:
-        ConfigError: If there is none; the message lists what exists.
+    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ... Raises ConfigError if there is none; the message lists what
+    exists.
     """
     root = configs_root()
     text = str(name)

@@ -91,8 +91,7 @@ def fail(source: str, path: str, problem: str) -> typing.NoReturn:
 def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
     """Convert one node of the parsed tree, at a dotted path, into the type that the schema asks for.
 
-    Raises:
-        ConfigError: If anything is unknown, missing or of another type.
+    Raises ConfigError if anything is unknown, missing or of another type.
     """
     if is_union(annotation):
         return _build_union(annotation, node, path)

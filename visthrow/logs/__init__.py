@@ -21,13 +21,12 @@ RUN_LOG = "flight.npz"
 def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     """Read a file, or the folder of a run, into flight logs; a file may hold several.
 
+    Raises LogError: it cannot be read, or a table needs a mapping.
+
     Args:
         path: A file of one of the endings above or ``.npz``, or a folder that holds a ``flight.npz``. ``stand.csv:a1_*`` takes of the
             logs in a file those whose part fits the pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
-
-    Raises:
-        LogError: It cannot be read, or a table needs a mapping.
     """
     path, ending = Path(path), Path(path).suffix.lower()
     if path.is_dir():
@@ -87,11 +86,7 @@ def _of_folder(path: Path) -> list[FlightLog]:
 
 
 def table_of(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the columns of a table, by name.
-
-    Raises:
-        LogError: It cannot be read, or its format needs no mapping.
-    """
+    """Return the columns of a table, by name. Raises LogError: it cannot be read, or its format needs no mapping."""
     from visthrow.logs.readers import recordings, table
 
     path, ending = Path(path), Path(path).suffix.lower()

@@ -16,8 +16,7 @@ _AXIS = re.compile(r"[+-]?[xyz]")
 def matrix_of(axes: str) -> np.ndarray:
     """Return the matrix of a set of axes, mirror images too: ``v_ours = matrix @ v_source``, shape (3, 3).
 
-    Raises:
-        ValueError: Not three signed letters, or one of them twice.
+    Raises ValueError: not three signed letters, or one of them twice.
     """
     words = [word.strip() for word in axes.split(",")]
     if len(words) != 3 or not all(map(_AXIS.fullmatch, words)) or len({word[-1] for word in words}) != 3:
@@ -29,11 +28,7 @@ def matrix_of(axes: str) -> np.ndarray:
 
 
 def turn_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes that is a turn, shape (3, 3).
-
-    Raises:
-        ValueError: As :func:`matrix_of`, or a mirror image.
-    """
+    """Return the matrix of a set of axes that is a turn, shape (3, 3). Raises ValueError as :func:`matrix_of`, or a mirror image."""
     matrix = matrix_of(axes)
     if is_mirror(axes):
         signs = [np.where(np.arange(3) == row, -1.0, 1.0)[:, None] * matrix for row in range(3)]

@@ -21,9 +21,7 @@ FORMATS = (".csv", ".parquet")
 def export(log: FlightLog, path: str | Path) -> None:
     """Write a flight log as ``.csv`` or ``.parquet``, by the ending of the path; parquet carries the metadata along.
 
-    Raises:
-        LogError: If the ending is neither.
-        StorageError: If the place cannot be written.
+    Raises LogError if the ending is neither; StorageError if the place cannot be written.
     """
     ending = Path(path).suffix
     if ending == ".csv":

@@ -56,11 +56,7 @@ STANDARD_CHANNELS = {
 
 @dataclass(frozen=True)
 class Channel:
-    """Samples of one quantity.
-
-    Raises:
-        LogError: If lengths differ, time does not increase, or a valid sample is not finite.
-    """
+    """Samples of one quantity. Raises LogError if lengths differ, time does not increase, or a valid sample is not finite."""
 
     time: np.ndarray  # strictly increasing [s], shape (T,), float64
     values: np.ndarray  # shape (T, ...)
@@ -104,14 +100,13 @@ class Channel:
     def hold(self, time: np.ndarray) -> np.ndarray:
         """Return the last valid sample at or before each time (the first one where there is none yet).
 
+        Raises LogError if no sample is valid.
+
         Args:
             time: [s], shape (N,).
 
         Returns:
             Values, shape (N, ...).
-
-        Raises:
-            LogError: If no sample is valid.
         """
         known = np.flatnonzero(np.asarray(self.valid))
         if not len(known):
@@ -124,8 +119,7 @@ class Channel:
 class FlightLog:
     """All channels of a flight, and metadata: goal, plant, policy, config, provenance.
 
-    Raises:
-        LogError: If a channel of a standard name has another unit, frame or shape than the standard says.
+    Raises LogError if a channel of a standard name has another unit, frame or shape than the standard says.
     """
 
     channels: dict[str, Channel]
@@ -145,11 +139,7 @@ class FlightLog:
                 raise LogError(f"channel '{name}' has samples of shape {shape}; its name stands for {spec.shape}")
 
     def __getitem__(self, name: str) -> Channel:
-        """Return a channel.
-
-        Raises:
-            LogError: If there is none of that name; the message lists what exists.
-        """
+        """Return a channel. Raises LogError if there is none of that name; the message lists what exists."""
         if name not in self.channels:
             raise LogError(f"no channel '{name}'; {suggest(name, self.channels)}")
         return self.channels[name]
@@ -165,9 +155,7 @@ class FlightLog:
     def save(self, path: str | Path) -> None:
         """Write the log as an ``.npz`` without pickle, whole or not at all.
 
-        Raises:
-            LogError: If the metadata cannot be written as JSON.
-            StorageError: If the place cannot be written.
+        Raises LogError if the metadata cannot be written as JSON; StorageError if the place cannot be written.
         """
         units = {name: {"unit": channel.unit, "frame": channel.frame} for name, channel in self.channels.items()}
         try:
@@ -180,11 +168,7 @@ class FlightLog:
 
     @staticmethod
     def load(path: str | Path) -> "FlightLog":
-        """Read a log.
-
-        Raises:
-            LogError: If the file is missing, cut short, of another version, incomplete, or contradicts itself.
-        """
+        """Read a log. Raises LogError if the file is missing, cut short, of another version, incomplete, or contradicts itself."""
         arrays = loadz(path, LogError, "a flight log")
         try:
             header = from_json_array(arrays["header"])
@@ -222,15 +206,12 @@ class FlightRecorder:
         self._units[name] = (unit, frame)
 
     def add(self, time: float, valid: bool = True, **values: Any) -> None:
-        """Add one sample to each named channel.
+        """Add one sample to each named channel. Raises LogError if a channel has neither a standard name nor been declared.
 
         Args:
             time: [s].
             valid: Whether these samples are good.
             **values: One sample a channel: number, bool or array.
-
-        Raises:
-            LogError: If a channel has neither a standard name nor been declared.
         """
         for name, value in values.items():
             if name not in self._units:
@@ -240,11 +221,7 @@ class FlightRecorder:
             self._samples.setdefault(name, []).append((time, np.array(value), valid))
 
     def log(self) -> FlightLog:
-        """Return what was recorded so far.
-
-        Raises:
-            LogError: If samples of one channel do not fit together; the message names the channel.
-        """
+        """Return what was recorded so far. Raises LogError if samples of one channel do not fit together; the message names the channel."""
         channels = {}
         for name, samples in self._samples.items():
             time, values, valid = zip(*samples)

@@ -29,8 +29,7 @@ Signal = tuple[np.ndarray, np.ndarray]
 def join(logs: Sequence[FlightLog]) -> FlightLog:
     """Put logs of one flight together; of a channel that several measured, the first log's stays, and an estimated one where none did.
 
-    Raises:
-        LogError: Nothing was measured in both, or it does not go together.
+    Raises LogError: nothing was measured in both, or it does not go together.
     """
     whole, *others = logs
     channels, meta, estimated = dict(whole.channels), dict(whole.meta), set(whole.meta.get("estimated", ()))
@@ -51,8 +50,7 @@ def join(logs: Sequence[FlightLog]) -> FlightLog:
 def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
     """Return what to add to the second log's times [s], the correlation then, and by which quantity.
 
-    Raises:
-        LogError: Nothing was measured in both, or it does not go together.
+    Raises LogError: nothing was measured in both, or it does not go together.
     """
     tried = []
     for by, signal in (("body rates", _turning), ("speed", _velocity), ("force", _force)):

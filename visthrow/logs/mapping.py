@@ -14,11 +14,7 @@ _WIDTH = {"quaternion": (4,), "euler": (3,), "vector": None}
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """A clock: a column of stamps, or rows that are evenly spaced.
-
-    Raises:
-        ConfigError: Neither or both of them, or no unit of time.
-    """
+    """A clock: a column of stamps, or rows that are evenly spaced. Raises ConfigError: neither or both of them, or no unit of time."""
 
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
@@ -34,11 +30,7 @@ class TimeColumn:
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """Columns of one channel.
-
-    Raises:
-        ConfigError: A unit, frame, number of columns or order of axes that the channel cannot have.
-    """
+    """Columns of one channel. Raises ConfigError: a unit, frame, number of columns or order of axes that the channel cannot have."""
 
     name: str  # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are free
     columns: tuple[str, ...]
@@ -90,11 +82,7 @@ class Split:
 
 @dataclass(frozen=True)
 class TableMap:
-    """Mapping of a table's columns.
-
-    Raises:
-        ConfigError: Two channels of one name, or a clock that is not defined.
-    """
+    """Mapping of a table's columns. Raises ConfigError: two channels of one name, or a clock that is not defined."""
 
     time: TimeColumn
     channels: tuple[ChannelMap, ...]

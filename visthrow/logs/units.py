@@ -24,11 +24,7 @@ UNITS = {
 
 
 def to_si(unit: str, where: str) -> tuple[str, float]:
-    """Return our unit of the same kind and the factor to it.
-
-    Raises:
-        ConfigError: An unknown unit.
-    """
+    """Return our unit of the same kind and the factor to it. Raises ConfigError: an unknown unit."""
     if unit not in UNITS:
         raise ConfigError(f"{where}: unit '{unit}'; {suggest(unit, UNITS)}")
     return UNITS[unit]

@@ -148,8 +148,7 @@ class Problem:
     def __init__(self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads) -> None:
         """Take the measurements, the nominal camera, float64, and of the policy's contract masses and rope.
 
-        Raises:
-            CalibrationError: too few steps, or too few that show the ball.
+        Raises CalibrationError: too few steps, or too few that show the ball.
         """
         count = len(hovered.time)
         seen = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
@@ -306,12 +305,11 @@ def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Te
 def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration:
     """Find the camera's turn and latency and the thrust, with the policy's nominal camera, float64, and contract.
 
+    Raises CalibrationError: it shows too little, or nothing fits.
+
     Args:
         hovered: a hover of some 3 s that ends in a sway. camera, contract: see above.
         spreads: of noise and of what is known; left out, those of the training.
-
-    Raises:
-        CalibrationError: it shows too little, or nothing fits.
     """
     problem = Problem(hovered, camera, contract, spreads or Spreads())
     x, c = problem.start()

@@ -21,8 +21,7 @@ class HoverParams:
     ``velocity_gain`` damps it faster but costs margin: from 12 and 3.5 on, 20 ms of further delay make the vehicle
     without payload ring; at 18 it oscillates at the nominal delay. With these the swing halves every 1.4 s.
 
-    Raises:
-        ValueError: If a gain or limit is negative, or the thrust limits are not ordered.
+    Raises ValueError if a gain or limit is negative, or the thrust limits are not ordered.
     """
 
     position_gain: float = 1.5  # velocity asked for a metre off [1/s]

@@ -79,8 +79,7 @@ class Layout:
 def layout_of(params: Any) -> Layout:
     """Layout of :class:`visthrow.task.ObservationParams` (or anything with its fields).
 
-    Raises:
-        ValueError: an unknown layout or a negative history.
+    Raises ValueError: an unknown layout or a negative history.
     """
     if params.history < 0:
         raise ValueError(f"observation history {params.history}; expected 0 or more")

@@ -72,15 +72,13 @@ class Pilot:
     def __init__(self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1) -> None:
         """Read the conditions of the policy's contract.
 
+        Raises PolicyError: the contract lacks an entry, or a vision policy is given no camera; MismatchError: the camera is not the one
+        that the policy was trained with; ValueError: count below 1.
+
         Args:
             policy: on the CPU.
             camera_params: a vision policy's camera; with a state policy keypoints are computed for whoever draws them.
             count: E.
-
-        Raises:
-            PolicyError: The contract lacks an entry, or a vision policy is given no camera.
-            MismatchError: The camera is not the one that the policy was trained with.
-            ValueError: count below 1.
         """
         if count < 1:
             raise ValueError(f"pilot of {count} vehicles; expected 1 or more")
@@ -132,7 +130,7 @@ class Pilot:
         self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray,
         attached: np.ndarray | bool = True, keypoints: tuple[np.ndarray, np.ndarray] | None = None, now: float | None = None,
     ) -> PilotOutput:  # fmt: skip
-        """Decide one control step.
+        """Decide one control step. Raises ValueError: an array of another shape.
 
         Args:
             pos_w: of the vehicle's centre of mass [m], shape (E, 3), world frame.
@@ -144,9 +142,6 @@ class Pilot:
             keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8), in place of what payload
                 and goal project to; only with a camera.
             now: time of this step on any clock [s], where steps may be late or missing; None: they come a period apart.
-
-        Raises:
-            ValueError: An array of another shape.
         """
         begin = time.perf_counter()
         goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
@@ -205,8 +200,7 @@ class Pilot:
     def _measured(self, *views: np.ndarray | bool) -> Tensor:
         """The measurements of one step side by side, shape (E, 20): the columns of :data:`VIEWS`.
 
-        Raises:
-            ValueError: one of another shape.
+        Raises ValueError: one of another shape.
         """
         at = 0
         for (name, width), value in zip(VIEWS.items(), views):
@@ -265,9 +259,7 @@ class Pilot:
     def see(self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity, shape (E, 8).
 
-        Raises:
-            PolicyError: There is no camera.
-            ValueError: An array of another shape.
+        Raises PolicyError: there is no camera; ValueError: an array of another shape.
         """
         if self.camera is None:
             raise PolicyError("this pilot has no camera")

@@ -49,11 +49,8 @@ _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 class Policy:
     """A multi-layer perceptron ``obs (E, D) -> action (E, A)`` with an optional fixed normaliser before it.
 
-    With an estimator the perceptron looks at the estimate (E, S) in place of the observation, and the policy has a memory.
-
-    Raises:
-        PolicyError: If shapes do not fit each other or the contract, a number is not finite, or the activation is
-            unknown.
+    With an estimator the perceptron looks at the estimate (E, S) in place of the observation, and the policy has a memory. Raises
+    PolicyError if shapes do not fit each other or the contract, a number is not finite, or the activation is unknown.
     """
 
     weights: tuple[Tensor, ...]  # (out, in) each
@@ -94,16 +91,13 @@ class Policy:
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
-        """Return the deterministic action.
+        """Return the deterministic action. Raises PolicyError if the last axis is not D long.
 
         Args:
             obs: Observations as in training, shape (E, D); taken to the policy's dtype.
 
         Returns:
             Normalised actions, unclipped, shape (E, A).
-
-        Raises:
-            PolicyError: If the last axis is not D long.
         """
         if self.estimator is not None:
             raise PolicyError("this policy has a memory; expected a call of step or actor rather than act")
@@ -118,8 +112,7 @@ class Policy:
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Action as :meth:`act`, shape (E, A), and the memory for the next step, shape (E, H).
 
-        Raises:
-            PolicyError: If the last axis of the observations is not D long.
+        Raises PolicyError if the last axis of the observations is not D long.
         """
         seen = self._fitting(obs)
         if self.estimator is not None:
@@ -164,6 +157,8 @@ class Policy:
     ) -> dict[str, Any]:
         """Refuse to serve under other conditions than those of the training.
 
+        Raises MismatchError: naming every key that differs without allowance, with both values.
+
         Args:
             contract_now: The conditions here, as the training wrote them.
             sections: Top-level keys to compare; all if None.
@@ -172,9 +167,6 @@ class Policy:
 
         Returns:
             What differs by allowance: dotted key -> the value here, None where there is nothing.
-
-        Raises:
-            MismatchError: Naming every key that differs without allowance, with both values.
         """
         trained, now = _flat(self.contract, sections), _flat(contract_now, sections)
         known = sorted(trained.keys() | now.keys())
@@ -188,9 +180,7 @@ class Policy:
     def save(self, path: str | Path) -> None:
         """Write the policy file, whole or not at all.
 
-        Raises:
-            PolicyError: If contract or made_by cannot be written as JSON.
-            StorageError: If the place cannot be written.
+        Raises PolicyError if contract or made_by cannot be written as JSON; StorageError if the place cannot be written.
         """
         header = {"format_version": FORMAT_VERSIONS[self.estimator is not None], "activation": self.activation}
         header |= {"contract": self.contract, "made_by": self.made_by}
@@ -211,8 +201,7 @@ class Policy:
     def load(path: str | Path, device: str | torch.device = "cpu") -> "Policy":
         """Read a policy file.
 
-        Raises:
-            PolicyError: If the file is missing, cut short, of another version or incomplete, or contradicts itself.
+        Raises PolicyError if the file is missing, cut short, of another version or incomplete, or contradicts itself.
         """
         arrays = loadz(path, PolicyError, "a policy file written by `visthrow train`")
 
@@ -249,6 +238,8 @@ class Policy:
     ) -> "Policy":  # fmt: skip
         """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
 
+        Raises PolicyError if the state holds anything else (another model class), or does not fit the contract.
+
         Args:
             state: ``actor.state_dict()``: ``mlp.<i>.weight``, ``mlp.<i>.bias``, ``obs_normalizer._mean`` and ``._std``;
                 the spread under ``distribution.`` plays no part in the deterministic action.
@@ -256,9 +247,6 @@ class Policy:
             contract: Conditions of the training.
             made_by: Where it comes from.
             eps: Of the normaliser.
-
-        Raises:
-            PolicyError: If the state holds anything else (another model class), or does not fit the contract.
         """
         known = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(known))

@@ -10,8 +10,7 @@ SHIPPED = Path(__file__).resolve().parent / "policies"  # folder of the policies
 def find_policy(name: str | Path) -> Path:
     """Find a policy by the name of a shipped one (``vision``) or by the path of a file.
 
-    Raises:
-        PolicyError: If there is neither; the message lists what exists.
+    Raises PolicyError if there is neither; the message lists what exists.
     """
     for candidate in (Path(name), SHIPPED / f"{name}.npz"):
         if candidate.is_file():

@@ -135,10 +135,8 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
 def specialised(policy: Policy, experiment: Experiment, number: int = 0) -> tuple[Policy, Experiment]:
     """Policy for one vehicle of the fleet that the policy was trained for: an ordinary one, in SI units, and its experiment.
 
-    Units go into the normaliser, the vehicle's set-up into the first layer's bias: nothing on board knows that it was for many.
-
-    Raises:
-        PolicyError: the policy is none for many vehicles, or is told what only a simulator knows of one.
+    Units go into the normaliser, the vehicle's set-up into the first layer's bias: nothing on board knows that it was for many. Raises
+    PolicyError: the policy is none for many vehicles, or is told what only a simulator knows of one.
     """
     observation = policy.contract.get("observation", {})
     if "fleet" not in policy.contract or observation.get("setup") == "exact" or policy.mean is None or policy.std is None:

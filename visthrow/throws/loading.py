@@ -28,16 +28,14 @@ def load_policy(
 ) -> Loaded:
     """Load a policy and the experiment that it was trained in, or another one that fits its contract.
 
+    Raises PolicyError: no such policy, or it does not carry its config and none was named; MismatchError: the config breaks the policy's
+    contract; the message names every difference; ConfigError: a wrong config or override.
+
     Args:
         name: of a shipped policy, or a file.
         config_name: a config of ``configs/train`` to fly in instead of the policy's own, as its training says that it is flown.
         overrides: ``key=value`` changes of that config.
         allow: parts of the contract that may be broken, as of :meth:`visthrow.onboard.policy.Policy.require`.
-
-    Raises:
-        PolicyError: no such policy, or it does not carry its config and none was named.
-        MismatchError: the config breaks the policy's contract; the message names every difference.
-        ConfigError: a wrong config or override.
     """
     path = find_policy(name)
     policy = Policy.load(path)
@@ -62,8 +60,7 @@ def load_policy(
 def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) -> Experiment:
     """Experiment that a policy was trained in, as its training says that it is flown, with changes.
 
-    Raises:
-        PolicyError: the policy does not carry its config.
+    Raises PolicyError: the policy does not carry its config.
     """
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):

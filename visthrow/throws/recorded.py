@@ -101,7 +101,8 @@ def fly(
     """Hover until the swing is quiet, throw, and hover again at the start.
 
     The throw ends at separation; from there the hover controller has the vehicle. Keypoints are those that the pilot
-    computes from measured poses, and are recorded for a state policy too.
+    computes from measured poses, and are recorded for a state policy too. Raises ConfigError: the goal is not a point in reach of the
+    vehicle's bounds.
 
     Args:
         loaded: policy and experiment.
@@ -111,9 +112,6 @@ def fly(
 
     Returns:
         The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when.
-
-    Raises:
-        ConfigError: the goal is not a point in reach of the vehicle's bounds.
     """
     check_goal(loaded, goal_w)
     experiment = loaded.experiment

@@ -10,8 +10,7 @@ from visthrow.common.errors import DeviceError
 def resolve(name: str = "auto") -> str:
     """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu`` or ``cuda:<i>``.
 
-    Raises:
-        DeviceError: If there is no such device.
+    Raises DeviceError if there is no such device.
     """
     import torch
 

@@ -43,8 +43,7 @@ class Algorithm(Protocol):
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         """Build environment, of this seed, and networks; torch's own generators are the caller's to seed.
 
-        Raises:
-            ConfigError: what this algorithm cannot train.
+        Raises ConfigError: what this algorithm cannot train.
         """
 
     def collect(self, done: float) -> None:
@@ -159,8 +158,7 @@ class Trainer:
     def load(self, path: Path) -> None:
         """Take up a checkpoint, each process its own part; one that has none starts new episodes under a new seed.
 
-        Raises:
-            CheckpointError: a broken file, or one of another configuration or seed.
+        Raises CheckpointError: a broken file, or one of another configuration or seed.
         """
         try:
             saved = torch.load(path, map_location="cpu", weights_only=True)

@@ -59,9 +59,7 @@ Message = tuple[float, str, str, dict[str, Any]]
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     """Write a flight of :func:`visthrow.throws.recorded.fly`, or of a run, whole or not at all.
 
-    Raises:
-        LogError: The package mcap is not installed, or the log has no sample.
-        StorageError: The place cannot be written.
+    Raises LogError: the package mcap is not installed, or the log has no sample; StorageError: the place cannot be written.
     """
     writing = load_extra("mcap.writer", "recordings", f"{path}: an MCAP file", LogError)
     stamps = [channel.time[0] for channel in log.channels.values() if len(channel.time)]

@@ -33,8 +33,7 @@ FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     """Write a flight of :func:`visthrow.throws.recorded.fly` as a ``.rrd`` file with a blueprint that lays out the viewer.
 
-    Raises:
-        StorageError: the place cannot be written.
+    Raises StorageError: the place cannot be written.
     """
     with recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
         whole(stream, log, experiment)
@@ -69,8 +68,7 @@ def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
 def recording(path: str | Path, layout: rrb.Blueprint | None = None) -> Iterator[rr.RecordingStream]:
     """Give a stream whose content becomes a ``.rrd`` file, whole or not at all, with the layout of the viewer that opens it.
 
-    Raises:
-        StorageError: the place cannot be written.
+    Raises StorageError: the place cannot be written.
     """
     stream = rr.RecordingStream("visthrow", recording_id=None)
     with tempfile.TemporaryDirectory() as folder:

@@ -31,9 +31,7 @@ GHOST_EVERY = 0.06  # between the faint earlier poses [s]
 def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     """Draw the strip of a flight, whose keypoints are the camera's, as a PNG file.
 
-    Raises:
-        LogError: the flight has no release or landing.
-        StorageError: the place cannot be written.
+    Raises LogError: the flight has no release or landing; StorageError: the place cannot be written.
     """
     times = log.meta["times"]
     if "separation" not in times or "landing" not in times:

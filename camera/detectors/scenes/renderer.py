@@ -18,15 +18,12 @@ class Renderer:
     """
 
     def __init__(self, lens: FisheyeParams, device: str = "cpu", files: list[Path] | None = None, samples: int = 6) -> None:
-        """Load the photographs.
+        """Load the photographs. Raises ValueError: samples below 1, or no photographs.
 
         Args:
             lens: size of the pictures. device: "cpu" or "cuda:0".
             files: photographs; left out, those of the training; without any, scenes are plain.
             samples: rays a pixel.
-
-        Raises:
-            ValueError: samples below 1, or no photographs.
         """
         import warp as wp
 

@@ -18,14 +18,11 @@ HELD_OUT = ("grass", "chelsea", "motorcycle_right", "astronaut", "moon")
 
 
 def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAINING) -> list[Path]:
-    """Files of photographs.
+    """Files of photographs. Raises ValueError: no photograph there, or scikit-image is not installed.
 
     Args:
         folder: of one's own, all its PNG and JPEG files; None: scikit-image's.
         names: of scikit-image's.
-
-    Raises:
-        ValueError: no photograph there, or scikit-image is not installed.
     """
     if folder is None:
         found = find_spec("skimage")
@@ -43,8 +40,7 @@ def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAIN
 def pyramid(files: list[Path]) -> np.ndarray:
     """Textures with their coarser levels, RGB, uint8, shape (T, bytes of a pyramid): what the renderer reads.
 
-    Raises:
-        ValueError: a file that is no picture.
+    Raises ValueError: a file that is no picture.
     """
     import cv2
 

@@ -91,11 +91,7 @@ READERS = {
 
 
 def log_of_autopilot(path: str | Path) -> FlightLog:
-    """Read the log of an autopilot, by its ending.
-
-    Raises:
-        LogError: It cannot be read, or holds nothing of a vehicle's motion.
-    """
+    """Read the log of an autopilot, by its ending. Raises LogError: it cannot be read, or holds nothing of a vehicle's motion."""
     reader, taps = READERS[Path(path).suffix.lower()]
     found = reader(path, {message for message, _ in taps} | set(SWEEP))
     channels, notes = {}, {}

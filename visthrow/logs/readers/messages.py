@@ -56,8 +56,7 @@ class Messages:
 def read_ulog(path: str | Path, wanted: Collection[str]) -> Messages:
     """Read topics of PX4's ``.ulg``; the time is ``timestamp_sample`` where it is known.
 
-    Raises:
-        LogError: pyulog is not installed, or the file is no ULog.
+    Raises LogError: pyulog is not installed, or the file is no ULog.
     """
     ulog = load_extra("pyulog", "logs", f"{path}: a PX4 log", LogError)
     with _parsing(path, "a PX4 log (.ulg)"):
@@ -75,11 +74,7 @@ def read_ulog(path: str | Path, wanted: Collection[str]) -> Messages:
 
 
 def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
-    """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement.
-
-    Raises:
-        LogError: The file is no DataFlash log.
-    """
+    """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement. Raises LogError: the file is no DataFlash log."""
     from pymavlink.DFReader import DFReader_binary
 
     columns = _Columns()
@@ -113,8 +108,7 @@ def _next(log: Any, wanted: list[str], columns: "_Columns") -> Any:
 def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
     """Read messages of a ``.tlog``, of the first sender of each; the time is the sender's stamp where there is one.
 
-    Raises:
-        LogError: The file cannot be read, or holds no MAVLink message.
+    Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
     columns, sender, used = _Columns(), {}, 0
     for arrival, message in telemetry(path):
@@ -132,8 +126,7 @@ def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
 def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
     """Yield arrival [s] and message of a ``.tlog``, past damaged bytes.
 
-    Raises:
-        LogError: The file cannot be read, or holds no MAVLink message.
+    Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
     from pymavlink.dialects.v20 import ardupilotmega as mav
 
@@ -197,11 +190,7 @@ class Forward(io.BytesIO):
         self._returns: Counter[int] = Counter()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a byte, as in any file.
-
-        Raises:
-            LogError: It leads to a byte that was returned to too often.
-        """
+        """Go to a byte, as in any file. Raises LogError: it leads to a byte that was returned to too often."""
         before = self.tell()
         after = super().seek(offset, whence)
         if after < before:
@@ -215,10 +204,7 @@ class Forward(io.BytesIO):
 def _parsing(path: str | Path, what: str) -> Iterator[list[str]]:
     """Turn whatever a parser makes of a file that is none of its own into one error; what it prints becomes a list.
 
-    Some of them print a line a damaged byte, and past Python.
-
-    Raises:
-        LogError: Instead of any other exception.
+    Some of them print a line a damaged byte, and past Python. Raises LogError: instead of any other exception.
     """
     said: list[str] = []
     heard = io.StringIO()

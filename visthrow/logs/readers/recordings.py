@@ -29,8 +29,7 @@ _CARD_TYPES = set("BbHhIiQqfdeL?")
 def read_recording(path: Path) -> Table:
     """Read all columns of numbers from a file of one of :data:`READERS`, or of the Crazyflie's card.
 
-    Raises:
-        LogError: A package is missing, or the file cannot be read or holds no numbers.
+    Raises LogError: a package is missing, or the file cannot be read or holds no numbers.
     """
     reader, what = READERS.get(path.suffix.lower(), (_card, "a recording"))
     try:

@@ -36,13 +36,11 @@ def read_table(path: str | Path) -> Table:
     """Read a table.
 
     Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma, lists stand in a cell
-    (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); without a header line columns are called ``column 1`` and so on.
+    (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); without a header line columns are called ``column 1`` and so on. Raises LogError: it
+    cannot be read, has no rows, or a row has another number of cells than the header.
 
     Args:
         path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.txt`` or ``.parquet``.
-
-    Raises:
-        LogError: It cannot be read, has no rows, or a row has another number of cells than the header.
     """
     path = Path(path)
     try:
@@ -138,15 +136,12 @@ def _text(value: object) -> str:
 
 
 def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
-    """Make flight logs of a table.
+    """Make flight logs of a table. Raises LogError: a column is missing or holds no numbers, or nothing is left after splitting.
 
     Args:
         table: From :func:`read_table`.
         mapping: Of its columns.
         source: What messages call the table.
-
-    Raises:
-        LogError: A column is missing or holds no numbers, or nothing is left after splitting.
     """
     count = len(next(iter(table.values())))
     parts = _parts(table, mapping, count, source)
@@ -294,8 +289,7 @@ def is_export(table: Table) -> bool:
 def log_of_export(table: Table, path: Path) -> FlightLog:
     """Read back a table that :func:`visthrow.logs.export.export` wrote; parquet carries the metadata.
 
-    Raises:
-        LogError: Columns of one channel do not fit together.
+    Raises LogError: columns of one channel do not fit together.
     """
     time, found, channels = _numbers(table, "time [s]", str(path)), {}, {}
     for column in table:

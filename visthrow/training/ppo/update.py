@@ -54,8 +54,7 @@ class CapturedPPO(PPO):
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict) -> None:
         """Store one step's rewards and ends, shape (E,).
 
-        Raises:
-            ValueError: the environment bootstraps at its time limit, which is not served here.
+        Raises ValueError: the environment bootstraps at its time limit, which is not served here.
         """
         if "time_outs" in extras:
             raise ValueError("time_outs of the environment; expected none; its time limit is an end like others")

@@ -28,11 +28,7 @@ _GYRO_SCALE = 1.0  # gyroADC is logged in deg/s since Betaflight 3.1
 
 
 def logs_of_blackbox(path: str | Path) -> list[FlightLog]:
-    """Read a raw file: one flight log each log in it.
-
-    Raises:
-        LogError: As :func:`read_blackbox`.
-    """
+    """Read a raw file: one flight log each log in it. Raises LogError as :func:`read_blackbox`."""
     logs = read_blackbox(path)
     tables = [dict(zip(log.names, log.main.T.astype(np.float64))) for log in logs]
     return [_flight(table, log.header, _raw_meta(log, path, i)) for i, (log, table) in enumerate(zip(logs, tables), start=1)]
@@ -47,8 +43,7 @@ def is_decoded(table: Table) -> bool:
 def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
     """Make a flight log of a decoded CSV; its units are those of the raw log, or stand in brackets behind the names.
 
-    Raises:
-        LogError: A column has a unit in brackets that is not known, or the stamps are no numbers.
+    Raises LogError: a column has a unit in brackets that is not known, or the stamps are no numbers.
     """
     plain = {}
     for name, values in table.items():

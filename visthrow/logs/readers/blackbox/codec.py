@@ -30,22 +30,14 @@ class Reader:
         self.data, self.pos, self.end = data, pos, len(data)
 
     def byte(self) -> int:
-        """Next byte.
-
-        Raises:
-            EndOfLog: There is none.
-        """
+        """Next byte. Raises EndOfLog: there is none."""
         if self.pos >= self.end:
             raise EndOfLog
         self.pos += 1
         return self.data[self.pos - 1]
 
     def unsigned(self) -> int:
-        """Variable-length number, low bits first.
-
-        Raises:
-            Corrupt: Longer than 32 bits.
-        """
+        """Variable-length number, low bits first. Raises Corrupt: longer than 32 bits."""
         value = 0
         for shift in range(0, 7 * _LONGEST_VB, 7):
             byte = self.byte()

@@ -56,11 +56,7 @@ class BlackboxLog:
 
 
 def read_blackbox(path: str | Path) -> list[BlackboxLog]:
-    """Read every log of a raw file.
-
-    Raises:
-        LogError: No such file, no blackbox file, or none of its logs holds a frame.
-    """
+    """Read every log of a raw file. Raises LogError: no such file, no blackbox file, or none of its logs holds a frame."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:
