@@ -21,8 +21,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import VisthrowError
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams, effects_of
+from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -60,7 +61,7 @@ def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
         world[kind] = STRENGTH[kind] * (base["body"] + base["ball"]) * rng.choice([-1.0, 1.0])
     elif kind is None:
         kind = str(rng.choice(list(HIDDEN)))
-        floor = next(e.floor for e in effects_of(known(name), False) if e.name == kind)
+        floor = next(e.floor for e in effects_of("flyer", known(name)) if e.name == kind)
         world[HIDDEN[kind]] += FLOORS * floor * (1.0 if kind in ONE_SIDED else rng.choice([-1.0, 1.0]))
     return name, kind, world
 

@@ -12,6 +12,7 @@ SCHEMAS = {
     "release": "sim.params:ReleaseParams",
     "sim": "sim.params:SimParams",
     "effects": "sim.effects.effect:EffectTables",
+    "model_effects": "visthrow.diagnose.models.catalogue:ModelEffects",
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",

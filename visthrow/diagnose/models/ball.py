@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.rotations import cross
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -44,45 +44,14 @@ class BallParams:
     every: int = 1  # the samples taken: each so-manieth
 
 
-def effects(params: BallParams) -> list[Effect]:
-    """Catalogue of the ball."""
-    seen = (CHANNEL,)
-    flight = "payload aero"
-    return [
-        Effect("ball_drag", "air drag on the ball", "a -= theta |v| v", "1/m", flight, (-params.drag, 0.5), 0.03, 5e-4, seen,
-               "Cross and Lindsey 2014; table tennis ball 0.1, tennis ball 0.02", ("wind_z",), ("throw at two speeds",)),
-        Effect("linear_drag", "drag whose coefficient falls with speed", "a -= theta v", "1/s", flight, (0.0, 1.0), 0.1, 3e-3, seen,
-               "drag crisis of rough balls, Achenbach 1974", ("ball_drag",), ("throw at two speeds",)),
-        Effect("top_spin", "the ball spins about the horizontal axis across its path", "a += theta e_across x v", "1/s", flight,
-               (-2.0, 2.0), 0.1, 2e-3, seen, "Cross and Lindsey 2014, lift", ("frame_tilt_x", "frame_tilt_y", "wind_x", "wind_y"),
-               ("throw in two directions",)),
-        Effect("side_spin", "the ball spins about the vertical", "a += theta e_z x v", "1/s", flight, (-2.0, 2.0), 0.1, 5e-3, seen,
-               "Cross and Lindsey 2014, side force", (), ("throw in two directions",)),
-        *(Effect(f"wind_{axis}", f"wind along {axis}", "v relative to air that moves with theta", "m/s", "environment", (-3.0, 3.0),
-                 0.3, 0.03, seen, "draught of a hall", ("frame_tilt_x", "frame_tilt_y"), ("throw in two directions",))
-          for axis in "xy"),
-        *(Effect(f"frame_tilt_{axis}", f"the capture's frame is turned about {axis}", f"y = R_{axis}(theta) x", "rad", "sensing",
-                 (-0.1, 0.1), 0.0175, 4e-4, seen, "wand calibration", ("wind_x", "wind_y", "top_spin"),
-                 ("throw in two directions", "a plumb line")) for axis in "xy"),
-        Effect("clock_rate", "the capture's clock runs at another rate", "dt = (1 + theta) dt_stated", "1", "sensing",
-               (-0.05, 0.05), 0.003, 2e-4, seen, "frame rate setting", ("length_scale", "ball_drag"), ("a scale bar",)),
-        Effect("length_scale", "the capture's unit of length", "y = (1 + theta) x", "1", "sensing", (-0.05, 0.05), 0.003, 4e-4,
-               seen, "wand length", ("clock_rate",), ("a scale bar",)),
-    ]  # fmt: skip
-
-
 class BallModel(NumericModel):
     """Free flights of a ball, one window each."""
 
     def __init__(self, logs: Sequence[FlightLog], params: BallParams) -> None:
-        """Cut the free flights out of the logs.
-
-        Raises:
-            LogError: There is none.
-        """
+        """Cut the free flights out of the logs; LogError where there is none."""
         self.params = params
         stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _flights(log, i, params)]
-        super().__init__(effects(params), (CHANNEL,), stretches)
+        super().__init__(effects_of("ball", params), (CHANNEL,), stretches)
         self._across = np.array([s.data["across"] for s in self.stretches])
         self._span = np.array([np.ptp(s.data["time"]) for s in self.stretches])
 

@@ -12,7 +12,8 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
 from visthrow.common.rotations import cross
-from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams, effects_of
+from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, spare, stretches_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force, triangles
 from visthrow.logs.check.relations import on_grid
@@ -28,11 +29,7 @@ class FlyerModel(NumericModel):
     latent_step = 1e-2
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
-        """Cut the flights into windows.
-
-        Raises:
-            LogError: No log has the channels, or none flies.
-        """
+        """Cut the flights into windows; LogError where no log has the channels, or none flies."""
         self.params = params
         self.has_voltage = all("battery_voltage" in log for log in logs)
         channels = [params.position]
@@ -43,7 +40,8 @@ class FlyerModel(NumericModel):
         stretches = stretches_of(logs, params, channels)
         there = [name for name in ("battery_voltage", "acc_b", "rate_b") if all(name in log for log in logs)]
         inputs = [params.attitude, params.input, *there]
-        super().__init__(effects_of(params, self.has_voltage), channels, stretches, inputs)
+        effects = [e for e in effects_of("flyer", params) if not (self.has_voltage and e.name == "thrust_fade")]
+        super().__init__(effects, channels, stretches, inputs)
         self.steps = round(params.window / params.step)
         # see flyer_windows; the stretch is the first axis
         self._rot, told, self._volts, self._since, self._lean, self._direction = (

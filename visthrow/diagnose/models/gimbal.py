@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
@@ -43,45 +43,15 @@ class GimbalParams:
     largest: float  # detections further than this from the prediction are of something else [m]
 
 
-def effects(params: GimbalParams) -> list[Effect]:
-    """Catalogue of camera and motion capture."""
-    look = ("fly both ways, yaw half a turn",)
-    found = [
-        Effect(f"camera_tilt_{axis}", f"the camera is turned about its own {axis} axis", f"p_c = R_{axis}(theta) p", "rad",
-               "camera", (-0.6, 0.6), 0.0175, 1.7e-3, NEEDED, "assembly", (f"marker_rot_{other}",), look)
-        for axis, other in zip("xyz", "yxz")
-    ]  # fmt: skip
-    found += [
-        Effect(f"camera_lever_{axis}", f"the camera stands off along its own {axis} axis", "p_c -= theta", "m", "camera",
-               (-0.5, 0.5), 0.02, 2e-3, NEEDED, "assembly", (), ("vary the distance",)) for axis in "xyz"
-    ]  # fmt: skip
-    found += [
-        Effect("camera_delay", "the camera's image is older than the pose beside it", "p_c(t - theta)", "s", "camera",
-               (-0.6, 0.6), 0.05, 2e-3, NEEDED, "exposure, transport and detection", (), ("swing",)),
-        Effect("focal_scale", "the focal length", "(x, y) (1 + theta)", "1", "camera", (-0.3, 0.3), 0.02, 2e-3, NEEDED,
-               "calibration", ("range_scale",), ("vary the distance",)),
-        Effect("range_scale", "the marker's size", "z (1 + theta)", "1", "camera", (-0.5, 0.5), 0.05, 2e-3, NEEDED,
-               "calibration", ("focal_scale",), ("vary the distance",)),
-        *(Effect(f"marker_rot_{axis}", f"the tracked attitude, or the gimbal's mount, is turned about the body's {axis} axis",
-                 f"R_meas = R R_{axis}(theta)", "rad", "sensing", (-0.3, 0.3), 0.0175, 1.7e-3, NEEDED, "marker placement",
-                 (f"camera_tilt_{other}",), ("turn the gimbal", "dynamics of the flight")) for axis, other in zip("xyz", "yxz")),
-    ]  # fmt: skip
-    return found
-
-
 class GimbalModel(NumericModel):
     """Windows of the marker's positions in the camera's frame."""
 
     def __init__(self, logs: Sequence[FlightLog], params: GimbalParams) -> None:
-        """Cut the logs.
-
-        Raises:
-            LogError: None of them has poses of both bodies and the marker, or the marker is seen elsewhere than the payload.
-        """
+        """Cut the logs; LogError where none has poses of both bodies and the marker, or the marker is seen elsewhere than the payload."""
         self.params = params
         self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
         stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params, self.camera)]
-        super().__init__(effects(params), (CHANNEL,), stretches, NEEDED)
+        super().__init__(effects_of("gimbal", params), (CHANNEL,), stretches, NEEDED)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""

@@ -68,16 +68,9 @@ class NumericModel(ABC):
     def __init__(
         self, effects: Sequence[Effect], channels: Sequence[str], stretches: Sequence[Stretch], inputs: Sequence[str] = ()
     ) -> None:
-        """Take effects, channels and windows.
+        """Take the catalogue, channels that residuals are taken of, windows, and channels that are there and drive the simulation.
 
-        Args:
-            effects: Catalogue; an entry that needs a channel that is neither measured nor an input cannot be seen.
-            channels: That residuals are taken of.
-            stretches: Windows.
-            inputs: Channels that are there and drive the simulation.
-
-        Raises:
-            LogError: There is no window: nothing in the logs that the model could be held against.
+        An effect that needs any other channel cannot be seen. LogError where there is no window.
         """
         if not stretches:
             raise LogError(f"no stretch of these logs shows {', '.join(channels)} in a way that this model explains")
@@ -90,11 +83,7 @@ class NumericModel(ABC):
         self._base = np.zeros(len(self.effects))  # sizes that the model has before anything is found
 
     def extend(self, sizes: Mapping[str, float]) -> None:
-        """Give the model what a diagnosis found: sizes of its effects are counted, and bounded, from there.
-
-        Raises:
-            LogError: An effect that the model does not know, or a size outside its bounds.
-        """
+        """Give the model what a diagnosis found: sizes are counted, and bounded, from there; LogError for one outside its bounds."""
         base = self.size(sizes)
         for effect, size in zip(self.effects, base):
             if not effect.bounds[0] <= size <= effect.bounds[1]:
@@ -116,11 +105,7 @@ class NumericModel(ABC):
         return {}
 
     def size(self, theta: Mapping[str, float]) -> np.ndarray:
-        """Sizes of all effects in order, with those that the model has before, shape (K,).
-
-        Raises:
-            LogError: An effect that the model does not know.
-        """
+        """Sizes of all effects in order, with those that the model has before, shape (K,); LogError for an effect that it does not know."""
         for name in theta:
             if name not in self.numbers:
                 raise LogError(f"no effect '{name}'; {suggest(name, self.numbers)}")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -44,49 +44,21 @@ class PendulumParams:
     step: float  # of the integration [s]
     every: int  # the samples taken: each so-manieth
 
-
-def effects(params: PendulumParams) -> list[Effect]:
-    """Catalogue of the pendulum."""
-    seen, joint = (CHANNEL,), "rope"
-    spread = 0.05 * params.length
-    return [
-        Effect("pendulum_length", "the pendulum's equivalent length", "a = -g / (l + theta) sin(angle)", "m", joint,
-               (-0.5 * params.length, params.length), spread, 1e-3 * params.length, seen,
-               "inertia about the pivot; gravity is known to 0.1 %", (),
-               ("swing at two amplitudes",)),
-        Effect("viscous_friction", "friction in proportion to the rate", "a -= theta rate", "1/s", joint,
-               (-params.viscous, 2.0), 0.1, 5e-4, seen, "bearing grease", ("quadratic_drag", "coulomb_friction"),
-               ("swing from large to small amplitude",)),
-        Effect("coulomb_friction", "dry friction", "a -= theta sign(rate)", "rad/s^2", joint, (-params.coulomb, 2.0), 0.1, 2e-3,
-               seen, "bearing", ("viscous_friction",), ("swing until it stops",)),
-        Effect("quadratic_drag", "air drag", "a -= theta |rate| rate", "1/rad", "payload aero",
-               (-params.quadratic, 0.5), 0.02, 1e-4, seen, "drag of a bluff body", ("viscous_friction",),
-               ("swing from large to small amplitude",)),
-        Effect("encoder_offset", "the encoder's zero", "y = angle + theta", "rad", "sensing", (-0.5, 0.5), 0.03, 5e-4, seen,
-               "mounting", (), ("let it hang",)),
-        Effect("encoder_scale", "the encoder's scale", "y = (1 + theta) angle", "1", "sensing", (-0.3, 0.3), 0.02, 5e-4, seen,
-               "lines a turn", (), ("swing at two amplitudes",)),
-        Effect("clock_rate", "the logger's clock", "dt = (1 + theta) dt_stated", "1", "sensing", (-0.05, 0.05), 1e-3, 5e-4, seen,
-               "crystal; gravity is known to 0.1 %", ("pendulum_length",), ("another clock",)),
-        Effect("joint_stiffness", "a spring at the joint: the encoder's cable, or the bearing", "a -= theta angle", "1/s^2", joint,
-               (-0.1 * params.gravity / params.length, params.gravity / params.length), 0.5, 0.03, seen,
-               "period over amplitude, as the encoder's scale", ("encoder_scale",), ("swing from large to small amplitude",)),
-    ]  # fmt: skip
+    @property
+    def stiffness(self) -> float:
+        """Of small swings [1/s^2]."""
+        return self.gravity / self.length
 
 
 class PendulumModel(NumericModel):
     """Free swings, cut into windows."""
 
     def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
-        """Cut the logs.
-
-        Raises:
-            LogError: None of them holds an angle, or one holds angles that are no radians from where it hangs.
-        """
+        """Cut the logs; LogError where none holds an angle, or one holds angles that are no radians from where it hangs."""
         self.params = params
         stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)]
         self._steps = round(params.window / params.step)
-        super().__init__(effects(params), (CHANNEL,), stretches)
+        super().__init__(effects_of("pendulum", params), (CHANNEL,), stretches)
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class; the unknowns are angle from hanging and rate at the window's start. Returns them over the grid."""

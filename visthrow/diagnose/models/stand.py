@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.flightlog import FlightLog
 
@@ -32,44 +32,14 @@ class StandParams:
     lowest_speed: float  # steps below are left out [rad/s]
 
 
-def effects(params: StandParams) -> list[Effect]:
-    """Catalogue of the stand."""
-    seen = ("thrust", "rotor_speed")
-    power = ("current", "rotor_speed", "supply_voltage")
-    return [
-        Effect("thrust_gain", "the propeller's thrust coefficient", "f = k_f (1 + theta) W^2", "1", "thrust map", (-0.8, 3.0), 0.3,
-               3e-3, seen, "Agilicious 2022", (), ("another propeller",)),
-        Effect("thrust_exponent", "the power of speed that thrust grows with", "f = k_f W^2 (W / W_mid)^theta", "1", "thrust map",
-               (-0.8, 0.8), 0.1, 1e-2, seen, "arXiv 2404.07837", ("thrust_linear",), ("steps from idle to full",)),
-        Effect("thrust_linear", "a linear part of the thrust curve", "f += theta k_f W_mid W", "1", "thrust map", (-0.8, 0.8), 0.1,
-               1e-2, seen, "arXiv 2404.07837", ("thrust_exponent",), ("steps from idle to full",)),
-        Effect("thrust_voltage", "the thrust's dependence on the supply at one speed", "f (1 + theta (U - U_ref))", "1/V",
-               "battery", (-0.3, 0.3), 0.02, 1e-3, (*seen, "supply_voltage"), "there is none at a given speed", (),
-               ("two supplies",)),
-        Effect("load_cell_zero", "the load cell's zero", "y = f + theta", "N", "sensing", (-2.0, 2.0), 0.1, 5e-3, seen, "tare", (),
-               ("a step with the motor off",)),
-        Effect("power_gain", "the propeller's power coefficient", "P = k_p (1 + theta) W^3", "1", "thrust map", (-0.8, 5.0), 0.3,
-               1e-2, power, "momentum theory", (), ()),
-        Effect("power_exponent", "the power of speed that power grows with", "P = k_p W^3 (W / W_mid)^theta", "1", "thrust map",
-               (-1.0, 1.0), 0.1, 1e-2, power, "momentum theory", ("resistance",), ("steps from idle to full",)),
-        Effect("idle_power", "power at rest", "P += theta", "W", "battery", (-5.0, 20.0), 1.0, 0.1, power, "controller", (), ()),
-        Effect("resistance", "the resistance of motor and leads", "U I = P + (R + theta) I^2", "Ohm", "battery", (-0.2, 0.5), 0.05,
-               3e-3, power, "winding", ("power_exponent",), ("two supplies",)),
-    ]  # fmt: skip
-
-
 class StandModel(NumericModel):
     """Static steps of tests on one stand; a test is a flight."""
 
     def __init__(self, logs: Sequence[FlightLog], params: StandParams) -> None:
-        """Take the settled steps of the logs.
-
-        Raises:
-            LogError: No log has thrust, speed, voltage and current.
-        """
+        """Take the settled steps of the logs; LogError where none has thrust, speed, voltage and current."""
         self.params = params
         stretches = [s for i, log in enumerate(logs) if (s := _steps(log, i, params)) is not None]
-        super().__init__(effects(params), CHANNELS, stretches, ("rotor_speed", "supply_voltage"))
+        super().__init__(effects_of("stand", params), CHANNELS, stretches, ("rotor_speed", "supply_voltage"))
         self.middle = float(np.median(np.concatenate([s.data["speed"] for s in stretches])))
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:

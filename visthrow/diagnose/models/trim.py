@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.models.flyer_params import MOTORS
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
@@ -39,42 +38,15 @@ class TrimParams:
     com_spread: float  # of its centre of mass: the pack is not where it was [m]
 
 
-def effects(params: TrimParams) -> list[Effect]:
-    """Catalogue of the balance."""
-    seen, arm, usual = (params.command, params.position), params.arm, params.motor_spread
-    return [
-        *(Effect(f"motor_{key}", f"the {words} propeller's thrust", "f_i (1 + theta)", "1", "thrust map", (-0.7, 0.7), 0.15,
-                 usual, seen, "fault detection literature", ("added_mass",), ("yaw response",)) for key, words in MOTORS.items()),
-        *(Effect(f"added_{key}", f"a weight near the {words} motor", "m + theta at the rotor", "kg", "rigid body",
-                 (0.0, 0.3 * params.mass), 0.05 * params.mass, 0.25 * usual * params.mass, seen, "a scale", (f"motor_{key}",),
-                 ("weigh the vehicle",)) for key, words in MOTORS.items()),
-        Effect("mass_quad", "the vehicle's mass", "m + theta", "kg", "rigid body", (-0.3 * params.mass, 0.5 * params.mass),
-               0.05 * params.mass, 0.5 * usual * params.mass, seen, "a scale", ("thrust_gain",), ("weigh the vehicle",)),
-        Effect("thrust_gain", "all motors' thrust", "f (1 + theta)", "1", "thrust map", (-0.6, 0.6), 0.1, 0.5 * usual, seen,
-               "Agilicious 2022", ("mass_quad",), ("weigh the vehicle",)),
-        Effect("battery_sag", "the thrust's dependence on the battery voltage", "f (1 + theta (u - u_ref))", "1/V", "battery",
-               (-1.0, 1.0), 0.1, 5e-3, (*seen, "battery_voltage"), "Bauersfeld and Scaramuzza 2022", ("thrust_gain",),
-               ("fresh and empty pack",)),
-        *(Effect(f"com_{axis}", f"the centre of mass lies off along {axis}", "torque = r x T", "m", "rigid body",
-                 (-0.5 * arm, 0.5 * arm), 0.1 * arm, params.com_spread, seen, "build", (), ()) for axis in "xy"),
-        Effect("yaw_trim", "one turning sense's drag torque", "torque_z += theta kappa T / 4", "1", "thrust map", (-0.7, 0.7), 0.1,
-               usual, seen, "propeller wear", ("motor_fl", "motor_fr", "motor_rl", "motor_rr"), ("yaw doublets",)),
-    ]  # fmt: skip
-
-
 class TrimModel(NumericModel):
     """Means over windows of slow level flight."""
 
     def __init__(self, logs: Sequence[FlightLog], params: TrimParams) -> None:
-        """Cut the logs.
-
-        Raises:
-            LogError: None of them flies slowly with motor commands logged.
-        """
+        """Cut the logs; LogError where none flies slowly with motor commands logged."""
         self.params = params
         usable = [(i, log) for i, log in enumerate(logs) if params.command in log and params.position in log]
         stretches = [s for i, log in usable for s in _cut(log, i, params)]
-        super().__init__(effects(params), (params.command,), stretches, (params.position, "battery_voltage"))
+        super().__init__(effects_of("trim", params), (params.command,), stretches, (params.position, "battery_voltage"))
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: the commands at which everything balances, shape (B, 4)."""
