@@ -14,8 +14,7 @@ ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
 MOTORS = ("motor_command", "motor_speed", "pwm")
 THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
 
-STILL = 0.01
-"""A vehicle whose position keeps within this [m] for the whole log has not flown, if its motors stood or nothing tells."""
+STILL = 0.01  # a vehicle whose position keeps within this [m] for the whole log has not flown, if its motors stood or nothing tells
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from visthrow.logs.check.rows import worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view.parts import png_of
 
-MOST = 10
-"""Channels in a picture."""
+MOST = 10  # channels in a picture
 _FIRST = ("pos_w", "vel_w", "quat_wb", "rate_b", "acc_b", "payload_pos_w", "command", "motor_command", "battery_voltage")
 _POINTS = 4000
 _SHADE = {"ok": style.COLOURS[2], "warn": style.COLOURS[4], "bad": style.COLOURS[1]}

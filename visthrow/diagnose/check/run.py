@@ -13,13 +13,10 @@ from visthrow.logs.check import physics, relations, thrust
 from visthrow.logs.check.rows import NOTHING, Known, Row, Verdict, worst
 from visthrow.logs.flightlog import FlightLog
 
-_ALIKE = 0.2
-"""Logs that share a larger part of their samples are copies of one another."""
-_ONE_PAYLOAD = 0.005
-"""Two logs whose payloads' paths agree to this [m] hold one payload."""
+_ALIKE = 0.2  # logs that share a larger part of their samples are copies of one another
+_ONE_PAYLOAD = 0.005  # two logs whose payloads' paths agree to this [m] hold one payload
 _MOST_PAIRED = 12
-_OTHER_SCALE = 0.08
-"""Of the logarithm of thrust over force, that a battery's charge alone does not make."""
+_OTHER_SCALE = 0.08  # of the logarithm of thrust over force, that a battery's charge alone does not make
 _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
 
@@ -41,12 +38,7 @@ class Checked:
 
 
 def check(logs: Sequence[FlightLog], known: Known = NOTHING) -> list[Checked]:
-    """Look at logs one by one, and at what they have in common.
-
-    Args:
-        logs: Of flights.
-        known: What the model says of the vehicle.
-    """
+    """Look at logs one by one, and at what they have in common."""
     common = [_copies(logs), _shared_payloads(logs), _masses(logs, known)]
     rows = [(*_look(log, known), *(row for found in common for row in found.get(i, ()))) for i, log in enumerate(logs)]
     return [Checked(label(log, i), of) for i, (log, of) in enumerate(zip(logs, rows))]

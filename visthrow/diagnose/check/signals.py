@@ -8,20 +8,16 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 MAD_TO_SIGMA = 1.4826
 FEW_SAMPLES = 20
-FEW_STEPS, SLOW_PERIOD = 5, 0.5
-"""Values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice."""
-SHORT = 0.5
-"""Shorter channels answer nothing [s]."""
-LONG = 1800.0
-"""Of longer logs only windows spread over them are simulated [s]."""
+FEW_STEPS, SLOW_PERIOD = 5, 0.5  # values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice
+SHORT = 0.5  # shorter channels answer nothing [s]
+LONG = 1800.0  # of longer logs only windows spread over them are simulated [s]
 
 _GAP_PERIODS = 3.0
 _JITTER_WARN = 0.25  # of a period, 95th percentile
 _STUCK_TIME = 0.25  # [s]; a moving vehicle's pose does not stand still to the last digit for so long
 _RAIL_SHARE = 0.01
 _RAILED = ("command", "motor_command", "motor_output", "pwm", "acc_b", "rate_b", "throttle", "motor_speed")
-_SWITCHES = ("release_command", "attached", "mode")
-"""Channels that rest on one of few values by their nature."""
+_SWITCHES = ("release_command", "attached", "mode")  # channels that rest on one of few values by their nature
 _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
 _FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad": 50.0, "V": 500.0}
 """Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs."""
@@ -35,10 +31,7 @@ def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -
     """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
 
     Third differences of a motion that is smooth over four samples vanish; those of white noise have 20 times its variance.
-
-    Args:
-        values: evenly sampled, shape (T,) or (T, D), T >= 4.
-        good: which third differences count.
+    ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: which third differences count.
 
     Returns:
         Sigma in the values' unit, shape () or (D,).
@@ -75,13 +68,7 @@ def _resolution(values: np.ndarray) -> np.ndarray:
 
 
 def look(name: str, channel: Channel, notes: dict) -> list[Row]:
-    """All checks of one channel.
-
-    Args:
-        name: Of the channel.
-        channel: Its samples.
-        notes: What the reader left out; see :func:`visthrow.logs.readers.table.make_channel`.
-    """
+    """All checks of one channel; ``notes``: what the reader left out; see :func:`visthrow.logs.readers.table.make_channel`."""
     count = len(channel.time)
     span = float(np.ptp(channel.time)) if count else 0.0
     if count >= FEW_STEPS and span > SLOW_PERIOD * count:

@@ -27,8 +27,7 @@ DEFAULT_FREE = {
 }
 """Model -> effects that are fitted where none are named; what cannot be told from the logs keeps its prior."""
 ROUNDS = 4
-UNKNOWN_SHARE = 0.5
-"""An effect whose deviation is still this share of its prior was not told by the logs."""
+UNKNOWN_SHARE = 0.5  # an effect whose deviation is still this share of its prior was not told by the logs
 
 
 @dataclass(frozen=True)
@@ -53,12 +52,8 @@ class Fitted:
 def fit(model: Model, free: Sequence[str]) -> Fitted:
     """Fit effects of a model jointly.
 
-    Args:
-        model: Linearisable; its windows' latent forces and noise levels are estimated on the way.
-        free: Names of effects.
-
-    Raises:
-        DiagnoseError: A name that the model does not have, or none.
+    ``model``: linearisable; its windows' latent forces and noise levels are estimated on the way.
+    DiagnoseError: a name that the model does not have, or none.
     """
     from visthrow.diagnose.select.point import Problem, fitted, linearise
 
@@ -101,14 +96,7 @@ def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParam
     """A simulated vehicle with what was found; everything else as in ``base``.
 
     A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest thrust follows the map.
-
-    Args:
-        setup: What was assumed before.
-        found: What was fitted.
-        base: Vehicle that lends all other numbers.
-
-    Raises:
-        DiagnoseError: The setup's model is of no vehicle.
+    ``base``: vehicle that lends all other numbers; DiagnoseError: the setup's model is of no vehicle.
     """
     size = dict(zip(found.names, map(float, found.theta)))
     if setup.flyer is not None:
@@ -159,11 +147,10 @@ def _of_stand(p: Any, size: Mapping[str, float], middle: float, base: VehiclePar
 def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequence[FlightLog], base: VehicleParams) -> list[Path]:
     """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance and provenance.
 
+    StorageError: the folder cannot be written.
+
     Returns:
         Their paths.
-
-    Raises:
-        StorageError: The folder cannot be written.
     """
     from visthrow.common.storage import atomic_write, write_json
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.diagnose.models.interface import Effect
 
-WITHIN = 3.0
-"""Deviations of a measurement beyond which the configured value cannot be off."""
+WITHIN = 3.0  # deviations of a measurement beyond which the configured value cannot be off
 
 
 @dataclass(frozen=True)
@@ -34,12 +33,8 @@ MEASUREMENTS = (
 def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:
     """The catalogue where some configured values were measured.
 
-    Args:
-        effects: of the model.
-        measured: effect -> deviation of the measurement that the configuration's value comes from, in its unit.
-
-    Raises:
-        DiagnoseError: No effect of that name, or a deviation that is not above 0.
+    ``measured``: effect -> deviation of the measurement that the configuration's value comes from, in its unit.
+    DiagnoseError: no effect of that name, or a deviation that is not above 0.
     """
     known = [e.name for e in effects]
     for name, sd in measured.items():
@@ -57,11 +52,7 @@ def _narrow(effect: Effect, sd: float) -> Effect:
 
 
 def parsed(items: Sequence[str]) -> dict[str, float]:
-    """Read ``NAME=DEVIATION`` of the command line.
-
-    Raises:
-        DiagnoseError: Something else.
-    """
+    """Read ``NAME=DEVIATION`` of the command line; DiagnoseError: something else."""
     out = {}
     for item in items:
         name, _, sd = item.partition("=")

@@ -10,8 +10,7 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_PLANT = "state"
-THROW = "throw"
-"""Name of the model that is no setup's own: the whole throw."""
+THROW = "throw"  # name of the model that is no setup's own: the whole throw
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,8 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     """Read the logs and build the model.
 
-    Raises:
-        ConfigError, LogError, DiagnoseError: As what is read and built; ``--set`` with a setup's own model.
+    ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's own model.
     """
     from visthrow.diagnose.inputs import measures
 
@@ -126,11 +124,7 @@ def _only(model: Model, names: Sequence[str]) -> Model:
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """Flights named on the command line.
-
-    Raises:
-        DiagnoseError: Something else than numbers between commas.
-    """
+    """Flights named on the command line; DiagnoseError: something else than numbers between commas."""
     try:
         return tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:

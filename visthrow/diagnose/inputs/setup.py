@@ -24,11 +24,7 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Setup:
-    """File of ``configs/diagnose``; at most one of the models.
-
-    Raises:
-        ConfigError: More than one model.
-    """
+    """File of ``configs/diagnose``; at most one of the models; ConfigError: more than one model."""
 
     about: str  # whose logs these are
     table: TableMap | None = None  # of tables' columns; None: the logs say themselves what they hold
@@ -65,11 +61,7 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
 
 
 def load(name: str | Path) -> Setup:
-    """Load a setup by its name in ``configs/diagnose``, or a file.
-
-    Raises:
-        ConfigError: There is none, or it does not fill the schema.
-    """
+    """Load a setup by its name in ``configs/diagnose``, or a file; ConfigError: there is none, or it does not fill the schema."""
     from visthrow import config
 
     return config.load(Setup, config.find("diagnose", str(name)))
@@ -78,12 +70,8 @@ def load(name: str | Path) -> Setup:
 def known(name: str | Path | None, plant: str | None = None) -> Known:
     """Return what a setup, or the plant of an experiment, says of the vehicle.
 
-    Args:
-        name: Of a setup, or None.
-        plant: Of configs/train, or a file; asked only where the setup has no flying model.
-
-    Raises:
-        ConfigError: As :func:`load`.
+    ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the setup has no flying model.
+    ConfigError: as :func:`load`.
     """
     flyer = load(name).flyer if name is not None else None
     if flyer is not None:
@@ -100,15 +88,7 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
 
 
 def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:
-    """Read logs, tables by the setup's mapping.
-
-    Args:
-        paths: Files or folders.
-        name: Of a setup, or None.
-
-    Raises:
-        LogError, ConfigError: As the readers and :func:`load`.
-    """
+    """Read logs, tables by the setup's mapping; ``name``: of a setup, or None; LogError, ConfigError: as the readers and :func:`load`."""
     from visthrow.logs import read_all
 
     return read_all(paths, load(name).table if name is not None else None)

@@ -34,14 +34,12 @@ PERIODS = 2.0 ** np.arange(0.0, 5.25, 0.25)
 """Correlation times that are tried, in the samples' period: at low frequencies, noise of second order goes with the time's fourth power."""
 LONGEST = 0.15
 """Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something that the model lacks."""
-STRIDES = (4, 2, 1)
-"""Steps among them, one after the other."""
+STRIDES = (4, 2, 1)  # steps among them, one after the other
 
 SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
 """Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within what doubles hold."""
 
-LOOKED_AT = 8
-"""Windows that the estimate is made of, and that tell whether a question is worth asking all."""
+LOOKED_AT = 8  # windows that the estimate is made of, and that tell whether a question is worth asking all
 
 
 @dataclass(frozen=True)
@@ -69,12 +67,7 @@ def components(window: Window, channel: int) -> np.ndarray | None:
 
 
 def with_correlations(windows: Sequence[Window], known: Mapping[int, Correlation]) -> list[Window]:
-    """Tell windows of the correlations of their channels' noise.
-
-    Args:
-        windows: of white noise.
-        known: of channels, by number.
-    """
+    """Tell windows of the correlations of their channels' noise; ``windows``: of white noise; ``known``: of channels, by number."""
     return each(lambda window: _told(window, known), windows) if known else list(windows)
 
 
@@ -92,10 +85,7 @@ def _told(window: Window, known: Mapping[int, Correlation]) -> Window:
 def correlations(windows: Sequence[Window], slabs: np.ndarray, channels: int) -> dict[int, Correlation]:
     """Estimate which channels' noise is correlated, and how.
 
-    Args:
-        windows: of the flights.
-        slabs: prior deviation of each effect in its unit, shape (K,).
-        channels: number of the model's channels.
+    ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the model's channels.
 
     Returns:
         Channel -> its noise, where that is surely not white.

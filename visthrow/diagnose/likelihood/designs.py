@@ -49,8 +49,6 @@ class _Design:
         Args:
             windows: of each, its nuisances, latents, effects, deviations of nuisances, sigmas and channels.
             floors: of the effects, shape (K,).
-            channels: of the model.
-            device: where to calculate.
         """
         self._widths = [sum(parts.shape[1] for parts in own[:3]) for own in windows]
         shape, width = (len(windows), max(len(own[4]) for own in windows)), max(self._widths)
@@ -109,14 +107,8 @@ def _kept(arrays: Same, channels: int, device: str) -> _Design:
 def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int, device: str) -> list[Gram]:
     """Reduce windows to their inner products, see :func:`visthrow.diagnose.likelihood.marginal.gram_of`.
 
-    Args:
-        windows: with finite residuals and derivatives.
-        floors: of the effects, shape (K,).
-        channels: of the model.
-        device: where to calculate.
-
-    Raises:
-        DiagnoseError: A window's arrays do not fit together, or hold NaN or infinity.
+    ``windows``: with finite residuals and derivatives; ``floors``: of the effects, shape (K,).
+    DiagnoseError: a window's arrays do not fit together, or hold NaN or infinity.
     """
     if device == "cpu" or not windows or _correlated(windows):
         return each(lambda w: gram_of(w, floors, channels), windows)
@@ -145,7 +137,6 @@ def padded(
         inner: of the grams, see :attr:`Gram.placed`.
         part: of one gram's, given its number.
         shape: to pad to.
-        device: where to.
     """
     if not any(isinstance(own, There) for own in inner):
         return side_by_side([[part(own, i)] for i, own in enumerate(inner)], shape, device)
@@ -163,7 +154,6 @@ def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float,
         grams: of the windows, with ``factor`` the identity.
         windows: for the knots.
         time: correlation time [s].
-        device: where to calculate.
     """
     if device == "cpu" or not all(gram.latents for gram in grams):
         return each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
@@ -185,11 +175,8 @@ def left_by(
     """What initial states and latent forces leave of windows' residuals.
 
     Args:
-        windows: of the model.
         floors: of the effects, shape (K,).
-        channels: of the model.
         fits: of each window, its initial state in prior deviations and its latents at the knots, shape (D + L,).
-        device: where to calculate.
 
     Returns:
         Of each window, shape (N,).
@@ -206,10 +193,8 @@ def with_residuals(
 
     Args:
         grams: of the windows, whose latents are at the knots.
-        windows: of the model.
         floors: of the effects, shape (K,).
         residuals: of each window, shape (N,).
-        device: where to calculate.
     """
     if device == "cpu" or _correlated(windows):
         return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))

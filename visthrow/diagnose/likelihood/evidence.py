@@ -51,11 +51,7 @@ class Priors:
 
     @staticmethod
     def of(effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]) -> "Priors":
-        """Read them off the catalogue.
-
-        Raises:
-            DiagnoseError: A floor or prior is not above 0, or bounds do not hold 0.
-        """
+        """Read them off the catalogue; DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0."""
         for e in effects:
             if not (e.floor > 0.0 and e.prior_sd > 0.0 and e.bounds[0] <= 0.0 <= e.bounds[1]):
                 raise DiagnoseError(
@@ -116,12 +112,7 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
     """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not visible.
 
     A change of one prior is a rank-one update, so all candidates and all draws cost one factorisation.
-
-    Args:
-        information: shape (K, K).
-        score: shape (K,) or (n, K).
-        priors: of the effects.
-        active: named already.
+    ``information``: shape (K, K); ``score``: shape (K,) or (n, K).
 
     Returns:
         Nats, of the score's shape.

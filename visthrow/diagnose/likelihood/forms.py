@@ -14,11 +14,9 @@ from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.interface import Window
 from visthrow.logs.flightlog import STANDARD_CHANNELS
 
-HEAD = 0.4
-"""Share of a window, at most HEAD_SECONDS, in which the initial state is fitted."""
+HEAD = 0.4  # share of a window, at most HEAD_SECONDS, in which the initial state is fitted
 HEAD_SECONDS = 0.4
-HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0)
-"""Upper ends of the horizons [s]; what lies beyond the last belongs to it."""
+HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0)  # upper ends of the horizons [s]; what lies beyond the last belongs to it
 
 
 UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marker_pos_c": "m"}
@@ -54,7 +52,6 @@ def forms(windows: Sequence[Window], groups: Sequence[int], noise: Noise, column
     """Build the quadratic forms.
 
     Args:
-        windows: that are predicted.
         groups: to which group (flight) each belongs.
         noise: for the sensor scales.
         columns: of each window, shape (N, Q), in the channels' units; the residual stands first.

@@ -26,19 +26,13 @@ from visthrow.common import rotations
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 
-Unit = tuple[int, int, int]
-"""Exponents of kg, m and s."""
+Unit = tuple[int, int, int]  # exponents of kg, m and s
 
 Knots = Mapping[str, np.ndarray]
 
-JOINT = "rope joint"
-"""Block of the torque between vehicle and rope, which acts in all latent blocks at once."""
-
-BLOCKS = (*LATENT_BLOCKS, JOINT)
-"""What a term can act on."""
-
-FINE = 8
-"""Points between two knots at which a curve is looked at."""
+JOINT = "rope joint"  # block of the torque between vehicle and rope, which acts in all latent blocks at once
+BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
+FINE = 8  # points between two knots at which a curve is looked at
 
 
 class Known(dict):
@@ -189,8 +183,7 @@ SCALARS: dict[str, Factor] = {
 }  # fmt: skip
 """Scalars of a term."""
 
-ONLY_JOINT = ("joint_rate",)
-"""Scalars of terms in the rope's joint alone."""
+ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
 
 VECTORS: dict[str, dict[str, Factor]] = {
     "vehicle force": {
@@ -302,10 +295,7 @@ def acting(block: str) -> tuple[str, ...]:
 def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]:
     """What terms exert in each latent block: a torque in the joint on the vehicle, on the rope and, by it, on the payload.
 
-    Args:
-        block: of the terms.
-        knots: of a window.
-        values: of the terms, shape (k, 3, T), in the block's frame.
+    ``values``: of the terms, shape (k, 3, T), in the block's frame.
 
     Returns:
         The latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).

@@ -130,24 +130,19 @@ def columns(window: Window, floors: np.ndarray) -> np.ndarray:
 def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
     """Reduce a window to its inner products.
 
+    DiagnoseError: the window's arrays do not fit together, or hold NaN or infinity.
+
     Args:
         window: with finite residuals and derivatives.
         floors: of the effects, shape (K,).
         channels: number C of the model's channels.
-
-    Raises:
-        DiagnoseError: The window's arrays do not fit together, or hold NaN or infinity.
     """
     check(window, len(floors), channels)
     return _inner_products(window, columns(window, floors), channels)
 
 
 def hidden_gram(window: Window, channels: int) -> Gram:
-    """The same of a window whose effects are not asked for.
-
-    Raises:
-        DiagnoseError: As :func:`gram_of`.
-    """
+    """The same of a window whose effects are not asked for; DiagnoseError: as :func:`gram_of`."""
     check(window, window.effects.shape[1], channels)
     return _inner_products(window, columns(replace(window, effects=window.effects[:, :0]), np.zeros(0)), channels)
 
@@ -197,11 +192,7 @@ def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float
 
 
 def check(window: Window, effects: int, channels: int) -> None:
-    """Refuse a window whose arrays do not fit together.
-
-    Raises:
-        DiagnoseError: They do not, or hold NaN or infinity.
-    """
+    """Refuse a window whose arrays do not fit together; DiagnoseError: they do not, or hold NaN or infinity."""
     n = len(window.residual)
     where = f"window of flight {window.flight}, phase {window.phase}"
     shapes = {"time": window.time.shape[:1], "channel": window.channel.shape, "sigma": window.sigma.shape,
@@ -218,10 +209,7 @@ def check(window: Window, effects: int, channels: int) -> None:
 def correlated(gram: Gram, window: Window, time: float) -> Gram:
     """Multiply the Cholesky factor of Ornstein-Uhlenbeck latents into a Gram whose factor is still the identity.
 
-    Args:
-        gram: of the window.
-        window: for the knots.
-        time: correlation time [s]; latent forces at knots dt apart correlate by exp(-dt/time).
+    ``window``: for the knots; ``time``: correlation time [s]; latent forces at knots dt apart correlate by exp(-dt/time).
     """
     if not gram.latents:
         return gram
@@ -315,13 +303,7 @@ class WindowStatistics(Share):
 def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
     """Add up windows by flight.
 
-    Args:
-        grams: of the windows.
-        parts: of the windows.
-        theta: linearisation point in floors, shape (K,).
-
-    Raises:
-        DiagnoseError: Information came out negative beyond rounding.
+    ``theta``: linearisation point in floors, shape (K,); DiagnoseError: information came out negative beyond rounding.
     """
     flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
     size, count = len(theta), len(flights)
@@ -343,11 +325,7 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
 def rescored(known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
     """What windows say with other residuals: their information stays.
 
-    Args:
-        known: of the same windows.
-        grams: of the windows.
-        parts: of the windows.
-        theta: linearisation point in floors, shape (K,).
+    ``known``: of the same windows; ``theta``: linearisation point in floors, shape (K,).
     """
     row = {flight: i for i, flight in enumerate(known.flights.tolist())}
     which = [row[gram.flight] for gram in grams]

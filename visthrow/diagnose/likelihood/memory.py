@@ -4,8 +4,7 @@ import ctypes
 import gc
 from functools import cache
 
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
-"""Numbers of glibc's ``malloc.h``."""
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # numbers of glibc's ``malloc.h``
 KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
 MAPPED = 2**30  # bytes from which an array has a mapping of its own, which goes back when it is freed
 

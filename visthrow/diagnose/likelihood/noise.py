@@ -21,40 +21,29 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
 """Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""
 
-SCALE_BOUNDS = (0.3, 10.0)
-"""Of a channel's sigma against what the model said."""
+SCALE_BOUNDS = (0.3, 10.0)  # of a channel's sigma against what the model said
 
 LEVEL_LOW, LEVEL_HIGH = 1e-2, 1e4
 """Latent deviations, in the level at which they become visible. A hundredth of it is as good as none: thousands of knots
 together do not show it, and far below it slopes are lost in rounding."""
 
-HUBER = 6.0
-"""Sigmas from which a sample loses weight."""
-
-HUBER_SHARE = 0.02
-"""More samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible."""
-
-SHARE_BOUNDS = (0.1, 1e3)
-"""Latent deviation of a window, in its phase's."""
+HUBER = 6.0  # sigmas from which a sample loses weight
+HUBER_SHARE = 0.02  # more samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible
+SHARE_BOUNDS = (0.1, 1e3)  # latent deviation of a window, in its phase's
 
 PRIOR_CURVATURE = (0.05, 2.0)
 """Limits of the prior's curvature by the logarithm of a window's share, in that at 1: it falls where windows stand far out."""
 
-CLEANINGS = 4
-"""Rounds in which outliers lose weight."""
-
-WIDE = 30.0
-"""Latent forces while outliers are looked for, in the level at which they become visible."""
+CLEANINGS = 4  # rounds in which outliers lose weight
+WIDE = 30.0  # latent forces while outliers are looked for, in the level at which they become visible
 
 ITERATIONS = 40
 ENOUGH_NATS, ROUGHLY_NATS = 0.2, 1.0
 """A step that promises less is the last in the search for the levels, and leaves some twentieth of it; while correlation times are
 compared."""
-LONGEST_FALL = 1.0
-"""Of the logarithm of a level in one step: its variance may be predicted to fall below 0."""
+LONGEST_FALL = 1.0  # of the logarithm of a level in one step: its variance may be predicted to fall below 0
 HALVINGS = 8
-STALLED = 1e-9
-"""Of the step: limits and levels count as met within this."""
+STALLED = 1e-9  # of the step: limits and levels count as met within this
 
 
 def fit(
@@ -66,7 +55,6 @@ def fit(
         windows: for the knots of the latent forces.
         grams: of the windows, with ``factor`` the identity.
         start: an earlier estimate: its correlation time is kept, its levels are where the search starts.
-        device: where to calculate.
 
     Returns:
         The levels, and the grams with correlated latent forces that belong to them.
@@ -102,10 +90,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
 def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:
     """Estimate the levels anew, with the correlation time that the grams have been given.
 
-    Args:
-        grams: of the windows, with correlated latent forces.
-        start: where the search starts.
-        device: where to calculate.
+    ``grams``: of the windows, with correlated latent forces; ``start``: where the search starts.
     """
     return _maximise(grams, start, device)[0]
 
@@ -195,12 +180,7 @@ def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = 
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
-
-    Args:
-        grams: of the windows.
-        noise: where the search starts.
-        device: where to calculate.
-        enough: nats; a step that promises less is the last.
+    ``noise``: where the search starts; ``enough``: nats; a step that promises less is the last.
     """
     layout, stack = _Layout.of(grams, noise), Stack(grams, device)
     low, high = layout.limits(grams)
@@ -275,12 +255,7 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: n
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
 
     Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
-
-    Args:
-        windows: of the flights.
-        grams: of the windows, with ``factor`` the identity.
-        floors: of the effects, shape (K,).
-        device: where to calculate.
+    ``grams``: of the windows, with ``factor`` the identity; ``floors``: of the effects, shape (K,).
     """
     sigmas = [window.sigma for window in windows]
     left, given, bare = list(range(len(windows))), list(windows), [without_effects(gram) for gram in grams]

@@ -23,8 +23,7 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS
 
 T = TypeVar("T")
 
-ROUNDING = 1e-10
-"""Relative growth of the normal equations' diagonal where they are positive definite but for rounding."""
+ROUNDING = 1e-10  # relative growth of the normal equations' diagonal where they are positive definite but for rounding
 
 BATCH = 8  # windows of a batch on the CPU
 BEGUN = 4  # noise levels that are kept: a round's, and those that its candidates come to while sizes and levels are estimated in turn
@@ -35,13 +34,7 @@ class _Columns:
     """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded columns are 0."""
 
     def __init__(self, inner: Sequence[There | np.ndarray], sizes: Sequence[int], device: str):
-        """Keep them.
-
-        Args:
-            inner: of each window, shape (C, P, P).
-            sizes: of each window, its hidden columns.
-            device: where to calculate.
-        """
+        """Keep them; ``inner``: of each window, shape (C, P, P); ``sizes``: of each window, its hidden columns."""
         self._inner, self._sizes, self._device = inner, sizes, device
         whole = inner[0].of if isinstance(inner[0], There) else inner[0]
         self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
@@ -138,10 +131,7 @@ class Stack:
     def __init__(self, grams: Sequence[Gram], device: str = "cpu", windows: Sequence[int] | None = None):
         """Pad and move.
 
-        Args:
-            grams: of the windows, with or without effects.
-            device: where to calculate.
-            windows: of each gram, the row of the noise's shares; default: their order.
+        ``grams``: of the windows, with or without effects; ``windows``: of each gram, the row of the noise's shares; default: their order.
         """
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
         self.device, size = device, BATCH if device == "cpu" else max(len(grams), 1)
@@ -171,17 +161,12 @@ class Stack:
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
 
-        Raises:
-            DiagnoseError: The normal equations are not positive definite, which only broken derivatives can cause.
+        DiagnoseError: the normal equations are not positive definite, which only broken derivatives can cause.
         """
         return self._in_order([part for (part,) in self._each(lambda batch: (_solved(_shape(batch, noise), batch).value,))])
 
     def fitted(self, noise: Noise) -> list[np.ndarray]:
-        """Most probable initial state and unit latent forces of each window, shape (D + L,).
-
-        Raises:
-            DiagnoseError: As :meth:`values`.
-        """
+        """Most probable initial state and unit latent forces of each window, shape (D + L,); DiagnoseError: as :meth:`values`."""
 
         def found(batch: _Batch) -> tuple[torch.Tensor]:
             at = _shape(batch, noise)
@@ -193,16 +178,11 @@ class Stack:
     def look(self, noise: Noise, first: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
 
-        Args:
-            noise: levels.
-            first: whether others may look at these levels as well, with other residuals.
+        ``first``: whether others may look at these levels as well, with other residuals; DiagnoseError: as :meth:`values`.
 
         Returns:
             Values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C).
             What the scales share with the fitted columns is given to the channels by their part in them.
-
-        Raises:
-            DiagnoseError: As :meth:`values`.
         """
         found = self._each(lambda batch: _looked(batch, noise, first))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
@@ -210,8 +190,7 @@ class Stack:
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
         """What is left of the effects' columns of each window, or of those of latent forces and effects.
 
-        Raises:
-            DiagnoseError: As :meth:`values`.
+        DiagnoseError: as :meth:`values`.
         """
         return Integrals(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
 
@@ -350,12 +329,7 @@ class Integrals:
     gathered: Statistics | None = None
 
     def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
-        """Keep it.
-
-        Args:
-            order: numbers of each batch's windows.
-            batches: what is left of them.
-        """
+        """Keep it; ``order``: numbers of each batch's windows."""
         self._order, self._parts = order, batches
 
     @property

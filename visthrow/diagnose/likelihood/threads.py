@@ -17,8 +17,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
-MOST_ASIDE = 2
-"""The same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a fifth."""
+MOST_ASIDE = 2  # the same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a fifth
 PIECES = 4  # of what is to be done, for each thread
 BESIDE = 3  # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth longer
 

@@ -7,8 +7,7 @@ import torch
 
 from visthrow.diagnose.likelihood.threads import each
 
-FEW = 1_000_000
-"""Numbers up to which one thread lays them."""
+FEW = 1_000_000  # numbers up to which one thread lays them
 
 
 def to_host(tensor: torch.Tensor) -> np.ndarray:
@@ -29,10 +28,7 @@ def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
 def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], device: str) -> torch.Tensor:
     """Arrays one beside the other on a device, each padded with zeros to one shape.
 
-    Args:
-        parts: of each array, what stands side by side along its last axis, of one height unless it is empty.
-        shape: to pad to.
-        device: where to.
+    ``parts``: of each array, what stands side by side along its last axis, of one height unless it is empty; ``shape``: to pad to.
 
     Returns:
         Shape (arrays, *shape).

@@ -25,12 +25,10 @@ from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "payload_pos_w"
-STEPS = 80
-"""Of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a millimetre."""
+STEPS = 80  # of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a millimetre
 FALLS = 0.7
 """Acceleration besides gravity's, in its, below which a ball is in flight: drag and lift of fast, spinning balls; at rest it is 1."""
-KNOTS = 9
-"""Of the latent force over a free flight."""
+KNOTS = 9  # of the latent force over a free flight
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermi
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
-SHORTEST = 1e-3
-"""Of the motors' lag [s]: a lag of nothing divides by it."""
+SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
 
 
 class FlyerModel(NumericModel):

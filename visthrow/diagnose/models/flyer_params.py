@@ -7,8 +7,7 @@ import numpy as np
 
 from visthrow.common.errors import ConfigError
 
-MOST_LATE = 0.15
-"""By which attitudes may be late or early [s]."""
+MOST_LATE = 0.15  # by which attitudes may be late or early [s]
 MOTORS = ("fl", "fr", "rl", "rr")
 
 

@@ -12,18 +12,12 @@ from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
-FINE = 16
-"""Entries of the commands' table in a step of the integration: between them, commands switch at their own times."""
-KNOTS = 8
-"""Of the latent forces over a window."""
-_GUESS = 0.25
-"""First guesses are straight lines through so much of a window [s]."""
-_MOST_MISSING = 0.25
-"""Largest gap in an input within a window [s]."""
-_MOST_THRUST = 5.0
-"""Median thrust over the weight, by the map: a map may be far off, a unit is off by more."""
-_IDLE = 0.3
-"""Windows in which the thrust falls below this share of the weight are on the ground."""
+FINE = 16  # entries of the commands' table in a step of the integration: between them, commands switch at their own times
+KNOTS = 8  # of the latent forces over a window
+_GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
+_MOST_MISSING = 0.25  # largest gap in an input within a window [s]
+_MOST_THRUST = 5.0  # median thrust over the weight, by the map: a map may be far off, a unit is off by more
+_IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 
 def stretches_of(logs: Sequence[FlightLog], params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:

@@ -18,13 +18,10 @@ from visthrow.logs.flightlog import Channel
 
 EFFECT_STEP = 0.05
 """Step of the differences by effects, in their prior deviations: errors of curvature cancel, those of rounding do not matter."""
-NUISANCE_STEP = 1e-3
-"""Step of the differences by unknowns at the start, in their prior deviations."""
+NUISANCE_STEP = 1e-3  # step of the differences by unknowns at the start, in their prior deviations
 SETTLE_STEPS = 5
-SETTLED = 1e-3
-"""A Gauss-Newton step on the unknowns at the start that gains less than this [nats] is the last."""
-MOST_LANES = 6000
-"""Simulated in one batch."""
+SETTLED = 1e-3  # a Gauss-Newton step on the unknowns at the start that gains less than this [nats] is the last
+MOST_LANES = 6000  # simulated in one batch
 
 
 @dataclass(frozen=True)
@@ -220,9 +217,7 @@ class NumericModel(ABC):
 def sigma_of(channel: Channel, least: float) -> np.ndarray:
     """Noise of a channel's components as the samples show it.
 
-    Args:
-        channel: Of a log.
-        least: Below which none is believed; ten times that stands where too few samples tell.
+    ``least``: below which none is believed; ten times that stands where too few samples tell.
     """
     seen = noise(channel)
     return np.maximum(np.where(np.isfinite(seen), seen, 10.0 * least), least)
@@ -234,7 +229,6 @@ def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray,
     Args:
         slope: Of the half step counted from the start, and the state.
         state: At the start, shape (B, S).
-        steps: Their number.
         step: [s], shape (B, 1).
     """
     path, half = np.empty((len(state), steps + 1, state.shape[1])), 0.5 * step
@@ -298,7 +292,6 @@ def latent_force(latent: np.ndarray, steps: int, blocks: int, axes: int = 3) -> 
 
     Args:
         latent: Coefficients, shape (B, G), ordered by :func:`latent_layout`.
-        steps: Of the grid.
         blocks: Number of blocks in the layout.
         axes: Of each block.
 

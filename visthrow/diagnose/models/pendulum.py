@@ -20,14 +20,10 @@ from visthrow.diagnose.models.numeric import (
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "angle"
-KNOTS = 11
-"""Of the latent torque per inertia over a window; told as one axis of the payload's force."""
-FEWEST = 20
-"""Samples of a window."""
-FARTHEST = 2.0 * np.pi
-"""Median distance from where the pendulum hangs [rad]: no free swing goes round and round most of the time."""
-SMOOTH = 0.02
-"""Dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator."""
+KNOTS = 11  # of the latent torque per inertia over a window; told as one axis of the payload's force
+FEWEST = 20  # samples of a window
+FARTHEST = 2.0 * np.pi  # median distance from where the pendulum hangs [rad]: no free swing goes round and round most of the time
+SMOOTH = 0.02  # dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator
 
 
 @dataclass(frozen=True)

@@ -30,29 +30,19 @@ SLOWEST, FASTEST = 0.08, 2.0
 ADDED = 0.5, 12.0
 """Frequencies of what is added to the commands [Hz]: above the position loop, up to a quarter of the rate of the reference's rows."""
 
-FADE = 1.0
-"""In which sweeps begin and end [s]."""
-
-YAW_RATE = 1.5
-"""Of the heading's sweep [rad/s]: within what the hover controller asks for."""
-
-ABORTED = 1e3
-"""Cost of a flight that is aborted at the limit: above what any other costs [nats/s]."""
+FADE = 1.0  # in which sweeps begin and end [s]
+YAW_RATE = 1.5  # of the heading's sweep [rad/s]: within what the hover controller asks for
+ABORTED = 1e3  # cost of a flight that is aborted at the limit: above what any other costs [nats/s]
 
 NEAR = 0.5
 """Way from the manoeuvre to the corners of the box of numbers that the first look goes at most: with all sweeps at once, few fly."""
 
-SCATTERED = 16
-"""Points of the first look, a power of 2 as a Sobol sequence wants it."""
+SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wants it
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What vehicle and hall allow.
-
-    Raises:
-        DiagnoseError: one that is not above 0, or a ceiling below the floor.
-    """
+    """What vehicle and hall allow; DiagnoseError: one that is not above 0, or a ceiling below the floor."""
 
     half: tuple[float, float] = (2.5, 2.5)  # of the hall, from its middle, that the path stays in [m]
     lowest: float = 0.8  # [m]
@@ -116,8 +106,7 @@ NUMBERS = ("kept", *(f"{what}_{axis}" for axis in ("x", "y", "z", "yaw") for wha
            "rate_x", "rate_y", "rate_z", "thrust", "added_to")  # fmt: skip
 """What is varied, each from 0 to 1: shares of the limits, frequencies by their logarithm."""
 
-START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])
-"""The manoeuvre as it is."""
+START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the manoeuvre as it is
 
 
 def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
@@ -190,14 +179,7 @@ def optimise(aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits, *, s
              progress: Callable[[str], None] = lambda text: None) -> Design | None:  # fmt: skip
     """Find the sweeps over a manoeuvre that promise the most nats a second; None where nothing that was tried can be flown.
 
-    Args:
-        aim: what is to be settled.
-        base: manoeuvre to begin with.
-        simulate: flies manoeuvres in the simulator.
-        limits: of vehicle and hall.
-        seed: of the search.
-        steps: generations of the search, of as many flights as the first look.
-        progress: is told what was reached.
+    ``steps``: generations of the search, of as many flights as the first look.
     """
     count = len(NUMBERS)
     scattered = START + NEAR * (qmc.Sobol(count, seed=seed).random(SCATTERED) - START)
@@ -231,8 +213,7 @@ class _Search:
     def costs(self, columns: np.ndarray) -> np.ndarray:
         """Less for more expected nats a second; of what would be aborted, more than of all others and the more the nearer to a crash.
 
-        Args:
-            columns: designs, shape (numbers, n).
+        ``columns``: designs, shape (numbers, n).
         """
         self.flights += columns.shape[1]
         simulated = self.simulate([designed(self.base, self.limits, x) for x in columns.T])

@@ -17,13 +17,11 @@ AMPLITUDES = (1.5, 1.5, 1.0)
 LOW, HIGH, SECONDS = 0.5, 15.0, 20.0
 """First and last frequency [Hz]: a swing of the hover to three times a rate loop of 30 rad/s; duration [s]."""
 
-FADE = 2.0
-"""In which ArduPilot's sweep begins and ends [s]."""
+FADE = 2.0  # in which ArduPilot's sweep begins and ends [s]
 
 CHIRP_BOX, SYSTEMID = 55, 25
 
-AXES = {"roll": 7, "pitch": 8, "yaw": 9}
-"""SID_AXIS of the sweeps of a rate."""
+AXES = {"roll": 7, "pitch": 8, "yaw": 9}  # SID_AXIS of the sweeps of a rate
 
 
 def betaflight() -> str:

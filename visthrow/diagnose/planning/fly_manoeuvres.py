@@ -23,17 +23,10 @@ from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 
-SAMPLE_PERIOD = 0.005
-"""Period of the recorded poses [s]: motion capture at 200 Hz."""
-
-COARSE = 2.0
-"""Steps of a promise, in those of the search."""
-
-AWAY = 1.5
-"""Time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]."""
-
-HIGHEST = 75.0
-"""Swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string hangs slack."""
+SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
+COARSE = 2.0  # steps of a promise, in those of the search
+AWAY = 1.5  # time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]
+HIGHEST = 75.0  # swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string hangs slack
 
 ASTRAY = 0.5
 """Distance from the reference [m] beyond which a flight is aborted: as :meth:`Reference.limits` says, its box is wider by that."""
@@ -41,11 +34,8 @@ ASTRAY = 0.5
 TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
 """A controller that follows a moving reference: the hover controller with room for it."""
 
-LOST = 10.0
-"""The same of a vehicle that flies off."""
-
-THREAD = 1e-3
-"""Mass of a setup's cable, in that of its payload: the setup's model has it without mass."""
+LOST = 10.0  # the same of a vehicle that flies off
+THREAD = 1e-3  # mass of a setup's cable, in that of its payload: the setup's model has it without mass
 
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 
@@ -65,14 +55,8 @@ def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[Fl
                  seed: int = 0) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:  # fmt: skip
     """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it can.
 
-    Args:
-        model: of the flights at hand.
-        diagnosis: for the sizes of what was found and the sensors' noise.
-        made: gives a setup's own model of some logs.
-        seed: of the noise.
-
-    Raises:
-        DiagnoseError: no vehicle flies in this model.
+    ``diagnosis``: for the sizes of what was found and the sensors' noise; ``made``: gives a setup's own model of some logs.
+    DiagnoseError: no vehicle flies in this model.
     """
     whole = getattr(model, "whole", model)
     if isinstance(whole, ThrowModel):
@@ -222,14 +206,7 @@ class Flight:
 
 
 def fly(plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu") -> list[Flight]:
-    """Fly all manoeuvres at once; those without payload drop it first.
-
-    Args:
-        plant: that flies.
-        manoeuvres: to fly.
-        seed: of the noise that is added later.
-        device: of the simulator.
-    """
+    """Fly all manoeuvres at once; those without payload drop it first."""
     from sim.hybrid import HybridSim
 
     references = [m.reference() for m in manoeuvres]

@@ -9,14 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-PERIOD = 0.02
-"""Between two rows of a reference [s]: the paper's command rate."""
-
-SETTLE = 1.0
-"""Hover before and after [s]."""
-
-HEIGHT = 1.5
-"""Height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up."""
+PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
+SETTLE = 1.0  # hover before and after [s]
+HEIGHT = 1.5  # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
 
 RUN = 3.6
 """Way of a throw from rest to rest [m], released half way: over a shorter one the payload would trail as high as the rotors."""

@@ -24,8 +24,7 @@ DECISIVE = 11.0
 """Expected nats that tell two members of a class apart: those that come scatter with twice their mean as variance, and exceed
 the 3 nats of a class in 95 % of flights."""
 
-NAMEABLE = 0.2
-"""Deviation of an effect, in that of its prior, from which on its usual size is named."""
+NAMEABLE = 0.2  # deviation of an effect, in that of its prior, from which on its usual size is named
 
 MOST_REPEATS = 10
 
@@ -64,12 +63,7 @@ class Aim:
     def __init__(self, diagnosis: Diagnosis, about: Sequence[str] = ()) -> None:
         """Take the classes to be separated, or else what could not be identified, or else every effect that can be seen.
 
-        Args:
-            diagnosis: of the flights at hand.
-            about: names of the effects to plan for; empty for all.
-
-        Raises:
-            DiagnoseError: An effect that the diagnosis does not know.
+        ``about``: names of the effects to plan for; empty for all; DiagnoseError: an effect that the diagnosis does not know.
         """
         work = diagnosis.work
         self.diagnosis, self.base, self.priors = diagnosis, work.after, work.problem.priors
@@ -118,12 +112,7 @@ class Aim:
 
 
 def propose(aim: Aim, told: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Proposal]:
-    """Rank manoeuvres and measurements, best first.
-
-    Args:
-        aim: what is to be settled.
-        told: manoeuvres to choose among, and the expected information of each.
-    """
+    """Rank manoeuvres and measurements, best first; ``told``: manoeuvres to choose among, and the expected information of each."""
     return sorted([*(aim.proposal(*each) for each in told), *_measured(aim)], key=_worth, reverse=True)
 
 

@@ -15,8 +15,7 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
 
 CENTRES = 20
-WIDTH = 1.5
-"""Width of a radial function, in deviations of the inputs."""
+WIDTH = 1.5  # width of a radial function, in deviations of the inputs
 REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """Prior deviations of the weights, in the block's strongest latent force; the likeliest is taken."""
 
@@ -108,11 +107,7 @@ class Trained:
 def train(point: Point, table: Table, groups: Sequence[int], theta: np.ndarray | None = None) -> Trained:
     """Gather what the windows say about the table's weights.
 
-    Args:
-        point: linearised anywhere.
-        table: whose weights are asked for.
-        groups: of the windows.
-        theta: sizes of the effects beside the table, in floors, shape (K,); default 0.
+    ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors, shape (K,); default 0.
     """
     back = point.statistics.theta - (0.0 if theta is None else theta)
     names = np.array(sorted(set(groups)))

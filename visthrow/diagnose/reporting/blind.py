@@ -14,12 +14,10 @@ from visthrow.diagnose.likelihood.evidence import STRONG, additions
 from visthrow.diagnose.models.interface import Linearised, Model, Window
 from visthrow.diagnose.select.result import Diagnosis
 
-SIZES = np.geomspace(1.0, 64.0, 13)
-"""Hidden sizes [floors]."""
+SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
 
 DRAWS = 200
-FEWEST_FLIGHTS = 6
-"""Fewer give too few patterns of signs; noise is then drawn from its fitted level."""
+FEWEST_FLIGHTS = 6  # fewer give too few patterns of signs; noise is then drawn from its fitted level
 NAMED = 0.9
 
 
@@ -54,7 +52,6 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
 
     Args:
         diagnosis: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out first.
-        seed: of the draws.
         draws: worlds for each effect, size and sign.
     """
     work, rng = diagnosis.work, np.random.default_rng(seed)
@@ -115,12 +112,7 @@ class Hidden:
     """A model whose flights hold one more effect: their measurements are shifted by what the simulation says it does."""
 
     def __init__(self, model: Model, truth: Mapping[str, float]) -> None:
-        """Simulate twice and keep the difference.
-
-        Args:
-            model: of the flights.
-            truth: hidden sizes, in the effects' units.
-        """
+        """Simulate twice and keep the difference; ``truth``: hidden sizes, in the effects' units."""
         self.model, self.effects, self.channels = model, model.effects, model.channels
         self._shift = [a - b for a, b in zip(model.residuals({}), model.residuals(truth))]
 
@@ -149,12 +141,7 @@ class Trial:
 def verify(diagnosis: Diagnosis, count: int, *, floors: float = 10.0, seed: int = 0, only: Sequence[str] = ()) -> list[Trial]:
     """Hide effects in the measurements and run the whole search on each.
 
-    Args:
-        diagnosis: of the flights.
-        count: number of searches.
-        floors: size of what is hidden.
-        seed: which effects and signs.
-        only: names to choose among; empty for all that can be seen.
+    ``floors``: size of what is hidden; ``only``: names to choose among; empty for all that can be seen.
     """
     from visthrow.diagnose.select.search import explain
 

@@ -12,8 +12,7 @@ from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnos
 MOST_SPOILED = 0.5
 """Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
 
-REFUSED = 1
-"""Exit status where no cause can be named: the data contradict themselves, or the simulation does not follow them."""
+REFUSED = 1  # exit status where no cause can be named: the data contradict themselves, or the simulation does not follow them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,14 +57,7 @@ def explained(
 ) -> Diagnosis:
     """Leave out what contradicts itself, or repeats another log, and search for causes in the rest.
 
-    Args:
-        model: of the logs.
-        logs: in the model's order.
-        known: what the setup says of the vehicle.
-        seed: of the null worlds.
-        without: flights to leave out.
-        say: is told each step in a line.
-        laws: see :func:`visthrow.diagnose.select.search.explain`.
+    ``laws``: see :func:`visthrow.diagnose.select.search.explain`.
     """
     from visthrow.diagnose.check.run import check, contradictions, copies
     from visthrow.diagnose.select import search

@@ -38,9 +38,7 @@ class Gain:
 def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     """Measure the gain of a diagnosis on held-out flights.
 
-    Args:
-        diagnosis: of :func:`visthrow.diagnose.select.search.explain`.
-        seed: of the black box's basis.
+    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; ``seed``: of the black box's basis.
     """
     work, rng = diagnosis.work, np.random.default_rng(seed)
     cross = crossed(diagnosis)

@@ -32,11 +32,7 @@ def landing_gain(
 ) -> LandingGain | None:
     """What the named causes do to predicted landings.
 
-    Args:
-        work: of the diagnosis.
-        theta: sizes of the named effects.
-        trained: flight -> their sizes by the other flights; empty where none were held out.
-        seed: of the bootstrap.
+    ``trained``: flight -> their sizes by the other flights; empty where none were held out.
 
     Returns:
         None where the model has no throws whose landing was seen.

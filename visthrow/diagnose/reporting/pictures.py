@@ -18,20 +18,15 @@ from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.select.state import Work
 from visthrow.view.parts import png_of
 
-WIDTH = 9.2
-"""[inch]"""
+WIDTH = 9.2  # [inch]
 BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
 SHOWN_WINDOWS = 3
-SHOWN_EFFECTS = 14
-"""Rows and columns of the confusion picture."""
-MOST_CURVES = 24
-"""Curves of the completeness picture; of more effects it shows where their curves rise."""
-SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Ticks [s]."""
+SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
+MOST_CURVES = 24  # curves of the completeness picture; of more effects it shows where their curves rise
+SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
 STEPS_ACROSS = 3
 MOST_TICKS = 16  # over the whole width
-STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))
-"""Within a decade of a logarithmic axis; the finest that leaves room is taken."""
+STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))  # within a decade of a logarithmic axis; the finest that leaves room is taken
 
 def _figure(rows: int, columns: int, height: float, **more):
     import matplotlib.pyplot as plt
@@ -73,10 +68,7 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
 def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> bytes:
     """What an optimised manoeuvre lays over the one that it began with, and what each manoeuvre promises.
 
-    Args:
-        base: manoeuvre that it began with.
-        found: the optimised one.
-        rates: expected nats a second of manoeuvres by their name.
+    ``rates``: expected nats a second of manoeuvres by their name.
     """
     rows = {"x [m]": lambda r: r.pos_w[:, 0], "y [m]": lambda r: r.pos_w[:, 1], "z [m]": lambda r: r.pos_w[:, 2],
             "heading [deg]": lambda r: np.degrees(r.yaw), "thrust [%]": lambda r: 100.0 * (r.thrust_factor - 1.0),

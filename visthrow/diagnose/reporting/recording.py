@@ -14,20 +14,14 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.view.rerun_view import colour_code, recording
 
 TIMELINE = "flight_time"
-PATHS = ("pos_w", "payload_pos_w")
-"""Channels that are drawn in space."""
+PATHS = ("pos_w", "payload_pos_w")  # channels that are drawn in space
 
 
 def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> None:
     """Write a ``.rrd``: for each flight the measured paths, the ghosts of both models, and all residuals over time.
 
-    Args:
-        path: The file.
-        diagnosis: with its ``work``.
-        logs: in the order in which the model numbers them; a model that numbers them otherwise gets residuals alone.
-
-    Raises:
-        StorageError: The place cannot be written.
+    ``logs``: in the order in which the model numbers them; a model that numbers them otherwise gets residuals alone.
+    StorageError: the place cannot be written.
     """
     work = diagnosis.work
     with recording(path) as stream:

@@ -121,15 +121,7 @@ def sections(
     diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None,
     step_check: Mapping[str, float] | None = None, about: Mapping[str, Any] | None = None,
 ) -> list[Section]:  # fmt: skip
-    """All sections of the page.
-
-    Args:
-        diagnosis: of the flights.
-        gain: measured on held-out flights.
-        blind: detection limits.
-        step_check: channel -> largest difference between the replay and one with finer steps, in sigmas.
-        about: provenance.
-    """
+    """All sections of the page; ``step_check``: channel -> largest difference between the replay and one with finer steps, in sigmas."""
     made = [_verdict(diagnosis, gain)]
     work = diagnosis.work
     if work is not None and diagnosis.theta:

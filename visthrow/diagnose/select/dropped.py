@@ -24,8 +24,7 @@ from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judged
 
-NAME = "dropped_commands"
-"""Of the random effect in the catalogue."""
+NAME = "dropped_commands"  # of the random effect in the catalogue
 
 EITHER = 0.5
 """Mean and deviation of m where either is as likely. From half of it as a deviation 0 and 1 are told apart: half way is two from both."""
@@ -49,7 +48,6 @@ class Told:
         """Ask windows under a point's noise levels.
 
         Args:
-            problem: of the search.
             point: where the windows' residuals are.
             windows: whose initial states and latent forces are integrated out.
             columns: of each window's commands, shape (N, T).
@@ -90,11 +88,7 @@ class Told:
 def verdict(problem: Problem, point: Point, active: Sequence[int], least: float) -> Scatter | None:
     """Whether commands got lost, beside a set of effects or any that are still missing; None where none was, or a model cannot tell.
 
-    Args:
-        problem: of the search.
-        point: of the set.
-        active: the set.
-        least: nats that a finding needs.
+    ``least``: nats that a finding needs.
     """
     if not hasattr(problem.model, "without_commands"):
         return None

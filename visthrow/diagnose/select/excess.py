@@ -30,11 +30,7 @@ STEP, MOST_STEPS = 1.4, 60
 def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple[Level, ...]:
     """Compare the latent forces of each block and phase with the block's quietest phase, and with what would move a landing.
 
-    Args:
-        problem: of the search.
-        before: the model as it stands.
-        after: with what was named.
-        least: nats from which a level would count as excessive if it were the only one; of many, one is higher by chance.
+    ``least``: nats from which a level would count as excessive if it were the only one; of many, one is higher by chance.
     """
     found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
@@ -102,7 +98,6 @@ def acts_on(point: Point, j: int, *, joint: bool = False, beside: Sequence[int] 
 
     Args:
         point: with the latent forces' derivatives.
-        j: the effect.
         joint: consider the torque between vehicle and rope as well.
         beside: effects that may take any size: what they can stand in for is left out.
     """

@@ -38,10 +38,8 @@ PARTS = 3
 """With fewer flights so many parts of each are left out instead, and the report says so: two sets that were trained on differ."""
 FIRM = 2.0 / 3.0
 """More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
-TELLING = 0.1
-"""Of what flights promise in the mean, from which one counts among those that can tell."""
-MOSTLY = 0.6
-"""Share of what is left from which it is said to lie in one axis or one flight."""
+TELLING = 0.1  # of what flights promise in the mean, from which one counts among those that can tell
+MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,6 @@ def select(
     Args:
         information: of the flights, shape (K, K).
         score: about 0, shape (K,).
-        priors: of the effects.
         least: threshold [nats].
         begin: a set to begin from; causes that hide each other are not found one by one.
     """
@@ -137,11 +134,7 @@ def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) ->
 
     A right size promises theta' I theta / 2 nats with a variance of twice that. The interval is that of the flights' scatter (Student,
     over flights that can tell), or of this chance where it is wider.
-
-    Args:
-        statistics: of the flights.
-        trained: sizes that the other flights gave, in floors, shape (F, K).
-        theta: sizes that all flights gave, shape (K,).
+    ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``: sizes that all flights gave, shape (K,).
     """
     promised = 0.5 * np.einsum("i,fij,j->f", theta, statistics.information, theta)
     quadratic = np.einsum("fi,fij,fj->f", trained, statistics.information, trained)
@@ -159,10 +152,7 @@ def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) ->
 def channel_gains(work: Work, cross: Crossed, box: np.ndarray | None = None) -> tuple[ChannelGain, ...]:
     """Prediction errors on held-out flights of every measured channel.
 
-    Args:
-        work: of the diagnosis.
-        cross: searches that leave flights out.
-        box: squared errors of a black box, shape (F, C, H).
+    ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C, H).
     """
     before, after, names = work.before, work.after, work.problem.model.channels
     by_effect = [np.hstack((w.residual[:, None], w.effects * work.problem.priors.floor)) for w in after.windows]
@@ -197,9 +187,7 @@ def _channel(name, c, after: Point, own: Forms, before, error, box) -> ChannelGa
 def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
     """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the jackknife over groups.
 
-    Args:
-        before: sums of squares by group, shape (F,).
-        after: the same afterwards.
+    ``before``: sums of squares by group, shape (F,).
 
     Source: Efron and Tibshirani 1993, ch. 11, on the logarithm of the ratio; Student's quantile.
     """

@@ -29,11 +29,8 @@ ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led, and rounds of lost windows: each
 round has some tenth of what the one before had to do."""
 
-UNKNOWN_RATIO = 3.0
-"""What is so many times the noise, or the quietest phase's gusts, is neither."""
-
-LOST_SHARE = 0.15
-"""Share of windows that the simulation may lose; where more are so far off, something is missing."""
+UNKNOWN_RATIO = 3.0  # what is so many times the noise, or the quietest phase's gusts, is neither
+LOST_SHARE = 0.15  # share of windows that the simulation may lose; where more are so far off, something is missing
 
 SMALL_STEP = 0.5 * OWN_FLOOR
 """In floors: a step that is not worth a simulation, and the distance at which an estimate lies on its bound."""
@@ -120,10 +117,7 @@ class Point:
 def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
     """The point with changes, and what its windows then say.
 
-    Args:
-        point: to change.
-        integrals: of the grams under the noise levels, where they are known.
-        changes: fields of the point.
+    ``integrals``: of the grams under the noise levels, where they are known; ``changes``: fields of the point.
     """
     changed = replace(point, **changes)
     integrals = stack.integrals(changed.grams, changed.noise, changed.device) if integrals is None else integrals
@@ -142,7 +136,6 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     """Simulate and linearise at ``theta``, estimate the noise levels, gather.
 
     Args:
-        problem: of the search.
         theta: in floors, shape (K,).
         start: noise levels to start from.
         windows: what the model gave there, if it was asked already.
@@ -239,12 +232,7 @@ def advantage(
 
     The noise levels of a point were estimated without the floors; a set may do better with the levels of another set. Between
     points that fly different kinds of blocks there is no such choice: neither's derivatives hold for the other.
-
-    Args:
-        priors: of the effects.
-        first: a set at its own point.
-        second: another.
-        switches: which effects are another kind of block, shape (K,), bool; default: none.
+    ``switches``: which effects are another kind of block, shape (K,), bool; default: none.
     """
     points = first[0], second[0]
     kinds = [np.zeros(0) if switches is None else point.theta[switches] != 0.0 for point in points]
@@ -257,10 +245,7 @@ def advantage(
 def curvature(problem: Problem, origin: Point, there: Point) -> float:
     """What the simulation's distance from its linearisation would be taken for: the largest size of any effect, in floors.
 
-    Args:
-        problem: of the search.
-        origin: where the derivatives were taken.
-        there: a point moved from it, with the same derivatives.
+    ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same derivatives.
     """
     change = problem.priors.floor * (there.theta - origin.theta)
     bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
@@ -288,11 +273,7 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
 
     What a dozen effects below their floors leave is no gust, but it is nothing that is missing either; nor is what an effect
     that varies has of its own in each flight.
-
-    Args:
-        problem: of the search.
-        point: whose derivatives and residuals are taken.
-        active: effects named.
+    ``point``: whose derivatives and residuals are taken.
     """
     theta = covariance(point.information, problem.priors.deviation(list(active))) @ point.score
     return _with_noise_at(point, theta, own_shares(point.plain, theta, point.varies))
@@ -323,10 +304,7 @@ def shifted(gram: Gram, change: np.ndarray) -> Gram:
 def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step that does not help is halved.
 
-    Args:
-        problem: of the search.
-        point: where the derivatives were taken.
-        active: effects that may move; all others go to 0.
+    ``point``: where the derivatives were taken; ``active``: effects that may move; all others go to 0.
     """
     inside = np.isin(np.arange(len(point.theta)), list(active))
     best = point if np.all(point.theta[~inside] == 0.0) else moved(problem, point, np.where(inside, point.theta, 0.0))
@@ -370,10 +348,7 @@ def _misfit(problem: Problem, point: Point) -> float:
 def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first goes over to the sizes.
 
-    Args:
-        problem: of the search.
-        point: whose derivatives and noise levels it begins with.
-        active: the set.
+    ``point``: whose derivatives and noise levels it begins with.
     """
     point = with_fitted_noise(fitted(problem, _switched(problem, point, active), active))
     for _ in range(TURNS):

@@ -9,8 +9,7 @@ from visthrow.diagnose.throw.interface import Mistake
 
 FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
 CANDIDATE = "CANDIDATE"
-NAMED = (FOUND, CLASS, CANDIDATE)
-"""Verdicts on effects that the flights ask for."""
+NAMED = (FOUND, CLASS, CANDIDATE)  # verdicts on effects that the flights ask for
 NOT_IDENTIFIABLE, UNOBSERVABLE = "NOT IDENTIFIABLE", "UNOBSERVABLE"
 VERDICTS = {
     FOUND: "the model lacks it, and nothing else in the catalogue says the same",

@@ -20,20 +20,15 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, additions, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-FLIGHT, DAY, COMMAND = "flight", "day", "command"
-"""What has a share of its own."""
-FORM = "_by_"
-"""Before these, at the end of the names of effects that differ and are none of the catalogue's random effects."""
-LEAST_FLIGHTS = 4
-"""Or days: with fewer a deviation is anybody's guess."""
+FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
+FORM = "_by_"  # before these, at the end of the names of effects that differ and are none of the catalogue's random effects
+LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
 REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
 """Deviations that are tried, in their prior's; every which of them, where flights are left out."""
-FAR = 3.0
-"""Floors of a flight's own estimate from which its derivative is not relied upon."""
+FAR = 3.0  # floors of a flight's own estimate from which its derivative is not relied upon
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
-FINE = 400
-"""Places between them at which a curve is looked at."""
+FINE = 400  # places between them at which a curve is looked at
 CHAIN = 2
 """More effects that differ, or more names, are a wrong form, which brings one after the other: terms are weighed at once, and in a block
 whose latent forces stay excessive none is told."""
@@ -107,10 +102,7 @@ def varying(
     """Verdicts on everything that may vary among these flights.
 
     Args:
-        statistics: of the flights.
         theta: sizes found, in floors, shape (K,).
-        priors: of the effects.
-        names: of the effects.
         least: nats that a finding needs.
         again: the flights simulated at other sizes, in floors; None where that fails.
         others: what may vary besides the catalogue's random effects; told where it does.
@@ -161,12 +153,7 @@ def straightened(
 ) -> Statistics:
     """Statistics whose scores are those about the size of one effect at which each flight fits best by itself.
 
-    Args:
-        statistics: of the flights.
-        theta: sizes found, in floors.
-        priors: with the effects' bounds.
-        j: the effect.
-        again: see :func:`varying`.
+    ``theta``: sizes found, in floors; ``again``: see :func:`varying`.
     """
     shift = (statistics.information @ (theta - statistics.theta))[:, j]
     own, score = statistics.information[:, j, j], statistics.score[:, j] - shift
@@ -216,7 +203,6 @@ def judged(v: RandomEffect, reach: np.ndarray, nats: np.ndarray, least: float, f
     """The verdict on a quantity by the evidence of its sizes.
 
     Args:
-        v: the quantity.
         reach: sizes that were tried, from small to large, above 0.
         nats: of evidence of each against none.
         least: that a finding needs.
@@ -251,14 +237,7 @@ def disagreement(
 ) -> tuple[int | None] | None:
     """Whether flights disagree on an effect of a set: shares of their own say more than a floor and a part of the effect's size would.
 
-    Args:
-        statistics: of the flights.
-        priors: of the effects.
-        drawn: effects that vary.
-        active: the set.
-        j: the effect.
-        least: nats that a finding needs.
-        share: of the effect, by which flights may differ for its form alone.
+    ``least``: nats that a finding needs; ``share``: of the effect, by which flights may differ for its form alone.
 
     Returns:
         The flight that alone disagrees, or None in its place where all do; None where they agree, too few can say, or other effects
@@ -298,12 +277,7 @@ def differences(statistics: Statistics, priors: Priors, active: Sequence[int], t
     In each flight a name may have a share of its own, whose deviation is u times what is allowed. What the flights say of u, which is
     half normal before, is integrated over: one flight alone says nothing of it, and many that agree leave little. Where nothing is
     named, nothing is added.
-
-    Args:
-        statistics: of the flights.
-        priors: of the effects.
-        active: the named ones.
-        theta: their sizes, in floors.
+    ``theta``: their sizes, in floors.
 
     Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
     """
@@ -330,7 +304,6 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
     """Statistics of what flights, or days, share: the shares that each has of its own are integrated out.
 
     Args:
-        statistics: of the flights.
         varies: effects that have such shares. Where days have some, what is returned is of days.
     """
     left = _integrated(statistics, varies.flights)
@@ -346,8 +319,6 @@ def freed_beside(
         own: information of each, shape (F, T).
         score: about 0, shape (F, T).
         cross: information with the effects, shape (F, T, K).
-        statistics: of the flights.
-        varies: effects that have shares of their own.
     """
     rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
     for shares in (varies.flights, varies.drifts):
@@ -397,7 +368,6 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in floors, shape (F, K).
 
     Args:
-        statistics: of the flights.
         theta: sizes that all flights share, in floors.
         varies: effects that have shares. Those of days come first, and flights share what is left of them.
     """

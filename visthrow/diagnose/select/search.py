@@ -27,18 +27,15 @@ def explain(
 ) -> Diagnosis:
     """Say what the model gets wrong about its flights.
 
+    DiagnoseError: the model gives no window, or contradicts itself.
+
     Args:
         model: a simulation of measured flights with its catalogue of effects.
         seed: of the null worlds that the threshold is calibrated on.
-        without: flights to leave out.
         laws: whether to look for laws outside the catalogue where it does not suffice.
-        progress: is told each step in a sentence.
 
     Returns:
         One verdict for every effect, and one overall.
-
-    Raises:
-        DiagnoseError: The model gives no window, or contradicts itself.
     """
     begun, say = time.monotonic(), progress or (lambda _: None)
     memory.keep()
@@ -79,10 +76,7 @@ def put_right(
 ) -> tuple[Model, list[FlightLog]]:
     """A model of logs whose commands are as the simulation takes them: without each suspected mistake that does not earn its price.
 
-    Args:
-        logs: of flights.
-        plant: that the commands are for.
-        build: makes a model of logs.
+    ``plant``: that the commands are for; ``build``: makes a model of logs.
 
     Returns:
         The model, which names what was put right as its ``mistakes``, and its logs.

@@ -32,20 +32,14 @@ from visthrow.diagnose.select.result import Step
 from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
 from visthrow.diagnose.select.state import Move, SearchState
 
-MOST_NAMES = 3 * CHAIN
-"""A longer list of causes is a wrong form, not a finding."""
-
-SHORTLIST = 3
-"""Sets of a kind whose simulation is run again in each round, of exchanges twice as many."""
+MOST_NAMES = 3 * CHAIN  # a longer list of causes is a wrong form, not a finding
+SHORTLIST = 3  # sets of a kind whose simulation is run again in each round, of exchanges twice as many
 
 DOUBT = 15.0
 """Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to ``STRONG`` it counts as possible."""
 
-AHEAD = 1.0
-"""Nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and Raftery 1995)."""
-
-SHOWN = 10
-"""Sets that a step keeps for the report."""
+AHEAD = 1.0  # nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and Raftery 1995)
+SHOWN = 10  # sets that a step keeps for the report
 
 HOPELESS = 0.5
 """Of what the best or what stands there brings, by the linear statistics, that another must bring to be simulated. Of three laws that
@@ -286,14 +280,7 @@ class Selector(SearchState):
         return True
 
     def stands_without(self, gone: Sequence[int], problem: Problem, nominal: Point, least: float) -> bool:
-        """Leave windows out, and say whether each name is still worth the threshold, so that the search may go on from there.
-
-        Args:
-            gone: numbers of the windows.
-            problem: without them.
-            nominal: point without them.
-            least: threshold without them.
-        """
+        """Leave windows out, and say whether each name is still worth the threshold, so that the search may go on from there."""
         if self.terms or self.dropped is not None:
             return False
         left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
@@ -307,8 +294,7 @@ class Selector(SearchState):
     def _vary(self, last: bool = False) -> bool:
         """Let effects differ from flight to flight, where that says more than any name; False where nothing new does.
 
-        Args:
-            last: there is no name any more: any effect may be what varies, if no law is why flights differ.
+        ``last``: there is no name any more: any effect may be what varies, if no law is why flights differ.
         """
         scatter = [s for s in self.scatter(self.active, every=last) if s.found]
         varies = deviations(scatter, self.priors, [e.name for e in self.problem.effects], self.problem.varies.days)
@@ -336,9 +322,7 @@ class Selector(SearchState):
         """Let commands have got lost, if that says more than what varies and than any name; False where it does not.
 
         It is asked before anything is named, and where the search would end.
-
-        Args:
-            rival: nats of what says most beside it.
+        ``rival``: nats of what says most beside it.
         """
         if self.dropped is not None or self.terms or self.came is self.point:
             return False

@@ -96,9 +96,7 @@ class SearchState:
     def price(self, active: Sequence[int], beside: bool = True) -> float:
         """Return what the names of a set cost [nats].
 
-        Args:
-            active: the set.
-            beside: whether those that act in a law's block, and may be a part of its form, cost more.
+        ``beside``: whether those that act in a law's block, and may be a part of its form, cost more.
         """
         prices, lawful = self.prices, [j for j in active if self.is_term(j)] if beside else []
         more = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
@@ -148,9 +146,7 @@ class SearchState:
     def about_means(self, active: Sequence[int], varies: Varies) -> Statistics:
         """Return what the flights say of the means of effects that vary; flights far from the mean are simulated again at their own size.
 
-        Args:
-            active: effects named.
-            varies: what differs among flights.
+        ``varies``: what differs among flights.
         """
         statistics, theta = self.point.plain, self.sizes(active)
         for j in sorted(set(varies.effects) & set(active)):
@@ -160,9 +156,7 @@ class SearchState:
     def scatter(self, active: Sequence[int], *, every: bool = False) -> tuple[Scatter, ...]:
         """Return the verdicts on what varies from flight to flight about the sizes of a set of effects.
 
-        Args:
-            active: the set.
-            every: ask about all effects, not only those of the catalogue's random effects and those that are known to vary.
+        ``every``: ask about all effects, not only those of the catalogue's random effects and those that are known to vary.
         """
         asked = self.point, tuple(active), every
         if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
@@ -201,10 +195,7 @@ class SearchState:
     def settle(self, point: Point, active: Sequence[int], doubted: int | None = None) -> Point:
         """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum.
 
-        Args:
-            point: where it stands.
-            active: the set.
-            doubted: an effect of it without which the point is of no use, so that it ends where this one is not sure.
+        ``doubted``: an effect of it without which the point is of no use, so that it ends where this one is not sure.
         """
         kinds = self.problem.switches
         same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)

@@ -33,8 +33,7 @@ LAW = 2.0 * STRONG
 NARROW = 1e-3
 """Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a name in that of one of any size."""
 
-WEIGHED = 6
-"""Terms that become effects to be weighed: as many as other sets that are simulated in their place."""
+WEIGHED = 6  # terms that become effects to be weighed: as many as other sets that are simulated in their place
 
 
 @lru_cache(maxsize=32)
@@ -83,14 +82,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
 
 
 def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> Screen | None:
-    """Gather what each term of a block says; None where the windows carry no knots for any.
-
-    Args:
-        point: that the terms are about.
-        parts: statistics of its windows.
-        block: of the terms.
-        known: quantities at the knots of its windows.
-    """
+    """Gather what each term of a block says; None where the windows carry no knots for any."""
     through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
     names = [set(point.windows[w].knots) for w in through]
     shared = tuple(sorted(set.intersection(*names))) if names else ()
@@ -136,10 +128,7 @@ def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: gr
 def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout, device: str) -> tuple[np.ndarray, ...]:
     """Square, information, score and cross information of all terms, of these windows together.
 
-    Args:
-        windows: of each, what is exerted at its knots, and the scalars and vectors there.
-        layout: of the terms.
-        device: where to calculate.
+    ``windows``: of each, what is exerted at its knots, and the scalars and vectors there.
     """
     longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
     square, information, score, cross, scalars, vectors = (
@@ -230,9 +219,6 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     """The terms that say most beside a set of names, by the linear statistics.
 
     Args:
-        problem: of the search.
-        point: of the set.
-        active: the set.
         strongest: latent force of each block where the model stood alone [N or N m].
         least: nats that a term must bring beyond its price.
     """
@@ -271,11 +257,7 @@ def strongest_forces(point: Point) -> dict[str, float]:
 def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
     """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts in.
 
-    Args:
-        problem: with the term.
-        point: of it.
-        j: number of the term among the effects.
-        size: its coefficient.
+    ``j``: number of the term among the effects.
     """
     term = problem.effects[j].term
     layout = grammar.Layout.of([term])

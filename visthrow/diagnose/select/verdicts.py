@@ -33,11 +33,7 @@ BIT = 0.5
 
 
 def conclude(search: Selector) -> Diagnosis:
-    """Turn a finished search into verdicts.
-
-    Args:
-        search: that has run.
-    """
+    """Turn a finished search into verdicts."""
     point, model = search.point, search.problem.model
     scatter = (*search.scatter(search.active), *([search.dropped] if search.dropped else []))
     varies = deviations(scatter, search.priors, [e.name for e in model.effects], search.problem.varies.days)

@@ -63,8 +63,6 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
     """Cut one flight.
 
     Args:
-        flight: what was recorded.
-        number: of the flight.
         lag: of the release, as far as known [s].
         landing_height: of the payload's centre [m].
         carries: whether the flight carries a payload.
@@ -101,7 +99,6 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
     """A window cut about the time in which the rope was slack: that is only flown through.
 
     Args:
-        c: the window.
         first, last: of that time [s].
         separation: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight after it.
     """

@@ -23,14 +23,10 @@ from visthrow.diagnose.throw.states import smoothed
 from visthrow.logs.flightlog import FlightLog
 
 LANDING, KEYPOINTS = "landing", "keypoints"
-LANDING_SIGMA = 2e-3
-"""Of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart."""
-GRID = 0.02
-"""Between the smoothed poses that a camera's views are predicted from [s]."""
-NEAR = 0.025
-"""Reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late."""
-SHORT = 1e-3
-"""Over which the speed of a keypoint is taken [s]: its row differs from the others' by a few milliseconds at most."""
+LANDING_SIGMA = 2e-3  # of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart
+GRID = 0.02  # between the smoothed poses that a camera's views are predicted from [s]
+NEAR = 0.025  # reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late
+SHORT = 1e-3  # over which the speed of a keypoint is taken [s]: its row differs from the others' by a few milliseconds at most
 LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
 MEASURED = np.array([(1, 1)] * 4 + [(1, 0), (0, 1), (1, 0), (0, 1)], dtype=bool)
 """Coordinates (8, 2) that a detector measures: corners, and where each side of a box is; the rest are middles of sides."""
@@ -88,9 +84,7 @@ def with_direct(
 
     Args:
         window: with a column for every effect.
-        number: of the window.
         kinds: of direct measurements.
-        channels: of the model.
         settings: the one that is linearised about, then one for each effect, a step away.
         steps: of the effects, 0 for those without a derivative here, shape (K,).
     """

@@ -20,13 +20,9 @@ def without_each_command(
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
     Args:
-        flights: cut into windows.
         windows: their numbers.
         known: delay of the commands by which those that act in a window are told [s]: their number is the same in all settings.
-        setting: what is simulated.
-        states: initial ones, of all windows.
         substep: largest integration step [s].
-        device: of the replay.
 
     Returns:
         Of each of these windows, shape (N, T), with the T commands that differ from the one before.

@@ -10,12 +10,7 @@ def effects_for(
 ) -> dict[str, SettingEffect]:
     """Return effects that make sense in a setting and for logs with these channels, bounded by the setting's own values.
 
-    Args:
-        setting: what is diagnosed.
-        channels: of the logs.
-        payload: whether a payload is flown.
-        releases: whether one is thrown.
-        simpler: whether blocks simpler than the setting's are considered.
+    ``simpler``: whether blocks simpler than the setting's are considered.
     """
     chosen = {}
     for name, e in catalogue().items():

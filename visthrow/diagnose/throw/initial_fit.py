@@ -17,8 +17,7 @@ from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
 from visthrow.diagnose.throw.states import Direction, States, concerns, moved, moved_along, rows_of, stacked
 
-DAMPING, DAMPING_MOST = 1e-3, 1e5
-"""Of the Levenberg-Marquardt steps: at first, and where a window counts as settled."""
+DAMPING, DAMPING_MOST = 1e-3, 1e5  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
 ROUNDS = 25
 LADDER = np.array([1.0, 10.0, 100.0, 1000.0])
 """Dampings that are tried at once, in the one at hand, for windows whose last step did not bring what it promised."""
@@ -71,13 +70,9 @@ class InitialFit:
         """Make ready.
 
         Args:
-            flights: cut into windows.
-            retained: windows that count.
             directions: in which states may be wrong.
-            setting: what is simulated.
             lag: of the release, as far as known [s].
             substep: largest integration step [s].
-            device: of the replay.
         """
         self.flights, self.retained, self.directions, self.setting = flights, retained, directions, setting
         self.substep = substep
@@ -242,11 +237,7 @@ class InitialFit:
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that they promise.
 
-        Args:
-            w: the window.
-            residual: where it stands.
-            done: how far it has been moved, shape (directions,).
-            dampings: of the steps, shape (T,).
+        ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape (T,).
 
         Returns:
             Steps, shape (T, directions); falls of the cost, shape (T,).
@@ -286,12 +277,7 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
 def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
     """How a window's initial state follows its effects: so that the flight stays as near to where it was as it can.
 
-    Args:
-        flights: cut into windows.
-        w: number of the window there.
-        window: its derivatives.
-        free: which parts of the state follow, shape (D,), bool.
-        lag: of the release, as far as known [s].
+    ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as known [s].
 
     Returns:
         Changes in the state's units by the effects' sizes, shape (D, K).

@@ -17,8 +17,7 @@ from visthrow.logs.axes import EVERY, matrix_of
 from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
-FOLLOWS = 0.8
-"""Correlation of commanded and measured rates, with whichever axes, from which a log tells of its commands."""
+FOLLOWS = 0.8  # correlation of commanded and measured rates, with whichever axes, from which a log tells of its commands
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
 VARIED, LATE, SLOPES = 0.05, 0.05, (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle

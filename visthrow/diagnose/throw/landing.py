@@ -93,10 +93,7 @@ class FlownModel(Protocol):
 def landings(model: FlownModel, theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
     """Predict the landings of throws with effects at ``theta``.
 
-    Args:
-        model: of the flights.
-        theta: sizes of effects in their units; those not named at 0.
-        flights: numbers of flights to look at; default all.
+    ``theta``: sizes of effects in their units; those not named at 0; ``flights``: numbers of flights to look at; default all.
     """
     plane = model.setting.plant.release.landing_height
     numbers = range(len(model.flights.flights)) if flights is None else flights

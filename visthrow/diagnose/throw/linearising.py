@@ -29,8 +29,7 @@ a rope whips, those by all effects and states do; latent forces there differ by 
 STILL = 0.1
 """Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the air's own doing: rooms have
 draughts of that speed, and a gust brings a hovering vehicle a velocity that goes with it, as if drag were negative."""
-AERODYNAMIC = "aerodynamics"
-"""Block whose effects go with that velocity."""
+AERODYNAMIC = "aerodynamics"  # block whose effects go with that velocity
 
 
 def exact(e: SettingEffect) -> bool:
@@ -41,10 +40,7 @@ def exact(e: SettingEffect) -> bool:
 def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:
     """A window in which vehicle and air hardly move against each other, without what speeds would tell there; others as they are.
 
-    Args:
-        window: with all columns.
-        blocks: of its effects.
-        wind_w: of the setting [m/s].
+    ``window``: with all columns; ``wind_w``: of the setting [m/s].
     """
     knots = window.knots
     if "vel_w" not in knots or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > STILL:
@@ -71,11 +67,7 @@ class Plan:
     def slopes(self, rows: int, steps: np.ndarray, directions: Sequence[Direction], seen: torch.Tensor) -> list[torch.Tensor]:
         """Derivatives of the window's samples by effects, states and latent forces, shape (3 rows, columns) each.
 
-        Args:
-            rows: of its samples.
-            steps: of the effects' derivatives.
-            directions: of initial states.
-            seen: what all lanes of the run saw, shape (rows or more, lanes, 3).
+        ``seen``: what all lanes of the run saw, shape (rows or more, lanes, 3).
         """
         sizes = [*steps, *[directions[d].step for d in self.nuisances], *[LATENT_SIZES[axis] for axis, _ in self.latents]]
         own = seen[:rows, self.first : self.first + len(self.order) + 2].transpose(1, 2).reshape(3 * rows, -1)
@@ -92,11 +84,7 @@ class Plan:
         """What comes of the lanes.
 
         Args:
-            flights: all windows.
-            setting: of the nominal lane.
-            directions: of initial states.
             channel: of the window's samples.
-            residual: of the nominal lane.
             slopes: see :meth:`slopes`.
             knots: simulated quantities at all its knots.
         """
@@ -117,8 +105,6 @@ def lanes_of(
     """Lanes of one window.
 
     Args:
-        flights: all windows.
-        w: the window.
         alike: of each effect, whether it is flown like the nominal lane.
         needs: of each effect, whether it needs the nominal steps.
         directions: of initial states; row ``(1 + d) W + w`` of the states is moved along one.

@@ -15,11 +15,8 @@ NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
 """Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m], [rad/s]."""
 
-UNIFORM = 12.0**-0.5
-"""Standard deviation of what rounding takes, of its step."""
-
-BETWEEN = 0.05
-"""Attitudes further apart [s] tell nothing of the times between them."""
+UNIFORM = 12.0**-0.5  # standard deviation of what rounding takes, of its step
+BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
 
 
@@ -106,11 +103,7 @@ def resolution(values: np.ndarray) -> float:
 
 
 def record_of(log: FlightLog, number: int = 0) -> Recorded:
-    """Take from a log what a replay needs.
-
-    Raises:
-        DiagnoseError: No commands, or no poses of the vehicle.
-    """
+    """Take from a log what a replay needs; DiagnoseError: no commands, or no poses of the vehicle."""
     missing = [name for name in ("command", "pos_w", "quat_wb") if measured(log, name) is None]
     if missing:
         raise DiagnoseError(
@@ -131,8 +124,7 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
 def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]:
     """Positions and attitudes of the same times: of common stamps, else attitudes between their samples.
 
-    Raises:
-        DiagnoseError: Neither has them.
+    DiagnoseError: neither has them.
     """
     common, at_pos, at_quat = np.intersect1d(np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True)
     if len(common) >= 0.2 * min(len(pos.time), len(quat.time)) and len(common) >= 5:

@@ -18,11 +18,9 @@ from visthrow.diagnose.throw.states import States, rows_of, stacked
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
-FINENESS = {"throw": 0.25}
-"""Step in a phase against the one asked for: the rope whips in throws."""
+FINENESS = {"throw": 0.25}  # step in a phase against the one asked for: the rope whips in throws
 FINEST = 0.01  # of the square of the step: a tenth of the step asked for
-ROUGHER = 3.0
-"""Added to the square of the step, in the nominal one, of rough lanes: twice as long steps."""
+ROUGHER = 3.0  # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
 STABLE = 1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
 BATCH, CUDA_BATCH = 4096, 32768  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
 
@@ -53,11 +51,7 @@ class Flights:
     def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float], stride: int = 1):
         """Lay out flights and windows.
 
-        Args:
-            flights: all of them.
-            cuts: windows, by number of the flight.
-            delays: of vehicle, payload and gyro that the setting knows of [s].
-            stride: use every so many samples.
+        ``delays``: of vehicle, payload and gyro that the setting knows of [s]; ``stride``: use every so many samples.
         """
         self.flights, self.cuts, self.stride = list(flights), list(cuts), stride
         self._known: dict[tuple[str, int], np.ndarray] = {}
@@ -217,7 +211,6 @@ def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: 
     Args:
         flights: the windows, those of one flight in order of time.
         replay: whose row 0 is the setting.
-        setting: what is simulated.
         begin: function ``(flight, cut, inner or None)`` -> one state, with ``inner`` the end of the window before.
         substep: largest integration step [s].
 

@@ -29,8 +29,7 @@ HUNG = 0.1
 """Of that, where the rope hung still before: there ropes arrive with bends of 0.0005 rad. A wider prior invents bends of
 0.02 rad out of noise; they whip, and tell of the rope's and the payload's mass what is not so."""
 
-States = dict[str, np.ndarray]
-"""Fields of ``STATE_FIELDS``, shape (S, ...)."""
+States = dict[str, np.ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
 
 
 @dataclass(frozen=True)

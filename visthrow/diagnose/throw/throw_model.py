@@ -71,9 +71,9 @@ class ThrowModel:
     ):
         """Cut the flights and find the windows' initial states.
 
+        DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
+
         Args:
-            logs: flights.
-            plant: the diagnosed one.
             sensing: what is known of the sensors.
             device: "cpu" or "cuda:0".
             substep: largest integration step [s].
@@ -82,9 +82,6 @@ class ThrowModel:
             carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
             simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
             camera: whose keypoints the logs hold.
-
-        Raises:
-            DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
         """
         self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device, self.substep = device, substep
@@ -195,9 +192,7 @@ class ThrowModel:
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[np.ndarray]:
         """Change of some windows' replayed samples by each command that does not come: the one before stays. Shape (N, T) each.
 
-        Args:
-            theta: sizes of the effects, at which :meth:`windows` was asked for before.
-            windows: numbers among those that came.
+        ``theta``: sizes of the effects, at which :meth:`windows` was asked for before; ``windows``: numbers among those that came.
         """
         setting = apply(self.entries, self.setting, theta)
         states, known = self._settled_at.get(_key(theta), self._fitted()[0]), self.setting.plant.vehicle.queue.delay
