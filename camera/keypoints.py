@@ -7,7 +7,7 @@ batch of one.
 import torch
 
 from camera.fisheye import AXIS_EPSILON, Fisheye
-from camera.mount import extrinsics_with_error, nominal_rot_cb, points_c_from_w, rotation_from_vector
+from camera.mount import nominal_rot_cb, points_c_from_w, rotate, rotation_from_vector
 from camera.params import CameraParams
 
 GOAL_KEYPOINTS = 4
@@ -51,7 +51,7 @@ class KeypointCamera:
     def extrinsics(
         self, rotation_error: torch.Tensor, position_error: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Extrinsics with an error per environment; see `camera.mount.extrinsics_with_error`.
+        """Extrinsics with an error per environment: ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
 
         Args:
             rotation_error: Rotation vectors [rad], shape (E, 3), body frame.
@@ -60,7 +60,8 @@ class KeypointCamera:
         Returns:
             rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3): the ``extrinsics`` of `keypoints`.
         """
-        return extrinsics_with_error(self.rot_cb, self.position_b, rotation_error, position_error)
+        turn = rotation_from_vector(rotation_error)  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
+        return rotate(turn, self.rot_cb.expand(turn.shape)), self.position_b + position_error
 
 
 def goal_square(side: float) -> torch.Tensor:

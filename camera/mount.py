@@ -47,24 +47,6 @@ def nominal_rot_cb(mount: MountParams) -> torch.Tensor:
     return rot_cb
 
 
-def extrinsics_with_error(
-    rot_cb: torch.Tensor, position_b: torch.Tensor, rotation_error: torch.Tensor, position_error: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Extrinsics of cameras that are mounted a little off.
-
-    Args:
-        rot_cb: Nominal rotation, body to camera, shape (3, 3) or (E, 3, 3).
-        position_b: Nominal lens position [m], shape (3,) or (E, 3), body frame.
-        rotation_error: Rotation vector by which the camera is turned on the body [rad], shape (E, 3), body frame.
-        position_error: Offset of the lens [m], shape (E, 3), body frame.
-
-    Returns:
-        rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3).
-    """
-    turn = rotation_from_vector(rotation_error)  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
-    return rotate(turn, rot_cb.expand(turn.shape)), position_b + position_error
-
-
 def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """``rot @ v`` for each row v of vectors; as a matrix product, ``vectors @ rot^T``.
 

@@ -54,10 +54,6 @@ class FisheyeParams:
         return math.radians(self.fov_deg) / 2.0
 
     def __post_init__(self) -> None:
-        """Refuse intrinsics that describe no camera.
-
-        Raises ValueError: a value is not finite or out of range, or theta_d does not grow all the way to the edge of the field of view.
-        """
         for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a finite number")
@@ -92,11 +88,7 @@ class MountParams:
     """
 
     position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # lens from the centre of mass [m], body frame
-    rpy_deg: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # roll, pitch, yaw from the downward pose [deg], about body axes
+    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # roll, pitch, yaw from the downward pose [deg], about body axes
     rotation_error_std: float = 0.0  # per episode and axis, unknown to the policy [rad]
     position_error_std: float = 0.0  # per episode and axis, unknown to the policy [m]
 
@@ -129,10 +121,6 @@ class KeypointNoiseParams:
         return int(-(-self.latency // 1)) + 1
 
     def __post_init__(self) -> None:
-        """Refuse noise settings out of range.
-
-        Raises ValueError: a negative spread or latency, a probability outside [0, 1], or an unknown ``invalid_reads``.
-        """
         for name in ("step_std", "bias_std", "latency", "scale_std"):
             if not getattr(self, name) >= 0.0:
                 raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number of at least 0")
@@ -156,7 +144,6 @@ class CameraParams:
     payload_radius: float  # radius of the ball whose bounding box is seen [m]
 
     def __post_init__(self) -> None:
-        """Refuse parameters that describe no camera. Raises ValueError: a size that is not above 0."""
         for name in ("goal_side", "payload_radius"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"camera {name} is {getattr(self, name)}; expected a length above 0 m")

@@ -1,6 +1,5 @@
 """Calibration from pictures of a board, through OpenCV's fisheye calibration, and the check of a lens against such pictures."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -147,9 +146,8 @@ def calibrate_from_boards(
     """
     import cv2
 
-    size, found = find_boards(images, board)
+    (height, width), found = find_boards(images, board)
     views = [view for view in found if view is not None]
-    height, width = size
     # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step inside the model.
     start = np.array([[width / np.pi, 0.0, width / 2 - 0.5], [0.0, width / np.pi, height / 2 - 0.5], [0.0, 0.0, 1.0]])
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
@@ -163,9 +161,8 @@ def calibrate_from_boards(
         raise ValueError(f"OpenCV found no fisheye for {len(views)} boards: {str(error).strip()}") from error
     fx, fy, cx, cy, k1, k2, k3, k4 = map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel()))
     params = FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, fov_deg)
-    project = _projection(Fisheye(params))
-    poses = iter(zip(rotations, translations, strict=True))
-    return params, _report([None if v is None else _residual(project, v, np.concatenate(next(poses)).ravel()) for v in found])
+    lens, poses = Fisheye(params), iter(zip(rotations, translations, strict=True))
+    return params, _report([None if v is None else _residual(lens, v, np.concatenate(next(poses)).ravel()) for v in found])
 
 
 def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
@@ -182,8 +179,7 @@ def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeP
     if size != (fisheye.height, fisheye.width):
         raise ValueError(f"pictures of {size[1]} x {size[0]} px came; expected {fisheye.width} x {fisheye.height}, the lens's size")
     lens = Fisheye(fisheye)
-    project = _projection(lens)
-    return _report([None if v is None else _residual(project, v, board_pose(lens, v)) for v in found])
+    return _report([None if v is None else _residual(lens, v, board_pose(lens, v)) for v in found])
 
 
 def find_boards(images: list[np.ndarray], board: BoardParams) -> tuple[tuple[int, int], list[View | None]]:
@@ -218,32 +214,24 @@ def board_pose(lens: Fisheye, view: View) -> np.ndarray:
         )
     plane = rays[before, :2] / rays[before, 2:]
     _, turn, place = cv2.solvePnP(view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
-    project, start = _projection(lens), np.concatenate([turn, place]).ravel()
 
     def residual(pose: np.ndarray) -> np.ndarray:
-        return _residual(project, view, pose)
+        return _residual(lens, view, pose)
 
-    return np.asarray(least_squares(residual, start, x_scale="jac", method="lm").x)
+    return np.asarray(least_squares(residual, np.concatenate([turn, place]).ravel(), x_scale="jac", method="lm").x)
 
 
 def reprojected(lens: Fisheye, view: View) -> np.ndarray:
     """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was fitted."""
-    return np.asarray(view.pixels + _residual(_projection(lens), view, board_pose(lens, view)).reshape(-1, 2))
+    return np.asarray(view.pixels + _residual(lens, view, board_pose(lens, view)).reshape(-1, 2))
 
 
-def _projection(lens: Fisheye) -> Callable[[np.ndarray], np.ndarray]:
-    def project(points_c: np.ndarray) -> np.ndarray:
-        return np.asarray(lens.project(torch.from_numpy(points_c))[0].numpy())
-
-    return project
-
-
-def _residual(project: Callable[[np.ndarray], np.ndarray], view: View, pose: np.ndarray) -> np.ndarray:
+def _residual(lens: Fisheye, view: View, pose: np.ndarray) -> np.ndarray:
     """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector, place)."""
     import cv2
 
     points_c = view.points_m @ np.asarray(cv2.Rodrigues(pose[:3])[0]).T + pose[3:]
-    return np.asarray(project(points_c) - view.pixels).ravel()
+    return np.asarray(lens.project(torch.from_numpy(points_c))[0].numpy() - view.pixels).ravel()
 
 
 def _report(residuals: list[np.ndarray | None]) -> BoardReport:

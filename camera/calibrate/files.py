@@ -2,12 +2,14 @@
 
 Convention: all four count pixels from the centre of the top left one and x right, y down, z forward, as `FisheyeParams`
 does. None of them holds a field of view; it is read from an extra key ``fov_deg``, which their own readers ignore. A
-file without it gets the ``fov_deg`` of the call or, that left out, the angle that the farthest corner of the image
-sees.
+file without it gets the ``fov_deg`` of the call [deg] or, that left out, the angle that the farthest corner of the image
+sees. A file that is missing, cut short, lacks a key, or holds another model is a ValueError; ``camera`` is the number of
+one in a file that holds several.
 """
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,114 +26,66 @@ _KB4 = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 
 
 def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
-    """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration.
-
-    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
-
-    Args:
-        path: File with ``fisheye_model: 1``, ``image_width``, ``image_height``, ``camera_matrix`` and four
-            ``distortion_coefficients``, as OpenCV's calibration sample writes them.
-        fov_deg: Full field of view where the file has none [deg].
-    """
+    """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration, ``fisheye_model: 1``, as OpenCV's calibration sample writes it."""
     import cv2
 
-    _text(path)
-    numbers = ("fisheye_model", "image_width", "image_height", "fov_deg")
+    text_of(path)
     tree: dict[str, Any] = {}
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        exists = sorted(storage.root().keys())
-        for key in exists:
+        for key in sorted(storage.root().keys()):
             node = storage.getNode(key)
-            if key in numbers and (node.isInt() or node.isReal()):
-                tree[key] = node.real()
-            elif key in ("camera_matrix", "distortion_coefficients") and node.isMap():
+            tree[key] = node.real() if node.isInt() or node.isReal() else None
+            if key in ("camera_matrix", "distortion_coefficients") and node.isMap():
                 tree[key] = node.mat().ravel().tolist()
     except (cv2.error, SystemError, AttributeError) as error:
         raise ValueError(f"{path} cannot be read as an OpenCV file (cut short?): {str(error).strip()}") from error
-    if _get(path, tree, "fisheye_model", exists) != 1:
-        raise ValueError(f"{path}: fisheye_model is {tree['fisheye_model']}; expected 1, the Kannala-Brandt model")
-    fx, cx, fy, cy = _from_matrix(path, _get(path, tree, "camera_matrix", exists))
-    k = _floats(path, "distortion_coefficients", _get(path, tree, "distortion_coefficients", exists), 4)
-    size = [_get(path, tree, key, exists) for key in ("image_width", "image_height")]
-    return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
+    file = _Entry(path, tree)
+    file["fisheye_model"].among(1)  # the Kannala-Brandt model
+    size = [file[key].value for key in ("image_width", "image_height")]
+    return _params(file, size, (*file["camera_matrix"].focal_and_centre(), *file["distortion_coefficients"].floats(4)), fov_deg)
 
 
 def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> FisheyeParams:
-    """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is Kannala-Brandt).
-
-    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
-
-    Args:
-        path: The camchain YAML.
-        camera: Number of the camera in it.
-        fov_deg: Full field of view where the file has none [deg].
-    """
-    chain = _yaml(path)
-    tree = _mapping(path, f"cam{camera}", _get(path, chain, f"cam{camera}"))
-    _expect(path, tree, "camera_model", ("pinhole",))
-    _expect(path, tree, "distortion_model", ("equidistant",))
-    fx, fy, cx, cy = _floats(path, "intrinsics", _get(path, tree, "intrinsics"), 4)
-    k = _floats(path, "distortion_coeffs", _get(path, tree, "distortion_coeffs"), 4)
-    size = _floats(path, "resolution", _get(path, tree, "resolution"), 2)
-    return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
+    """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is Kannala-Brandt)."""
+    file = _yaml(path)[f"cam{camera}"]
+    file["camera_model"].among("pinhole")
+    file["distortion_model"].among("equidistant")
+    values = (*file["intrinsics"].floats(4), *file["distortion_coeffs"].floats(4))
+    return _params(file, file["resolution"].value, values, fov_deg)
 
 
 def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
-    """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye`` distortion model.
-
-    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
-
-    Args:
-        path: The file.
-        fov_deg: Full field of view where the file has none [deg].
-    """
-    tree = _yaml(path)
-    _expect(path, tree, "distortion_model", ("equidistant", "fisheye"))
-    matrix = _mapping(path, "camera_matrix", _get(path, tree, "camera_matrix"))
-    fx, cx, fy, cy = _from_matrix(path, _get(path, matrix, "data"))
-    node = _mapping(path, "distortion_coefficients", _get(path, tree, "distortion_coefficients"))
-    k = _floats(path, "distortion_coefficients.data", _get(path, node, "data"), 4)
-    for key, count in (
-        ("rectification_matrix", 9),
-        ("projection_matrix", 12),
-    ):  # unused, but a file cut short lacks them
-        _floats(path, f"{key}.data", _get(path, _mapping(path, key, _get(path, tree, key)), "data"), count)
-    size = [_get(path, tree, key) for key in ("image_width", "image_height")]
-    return _params(path, size, (fx, fy, cx, cy, *k), tree.get("fov_deg"), fov_deg)
+    """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye`` distortion model."""
+    file = _yaml(path)
+    file["distortion_model"].among("equidistant", "fisheye")
+    values = (*file["camera_matrix"]["data"].focal_and_centre(), *file["distortion_coefficients"]["data"].floats(4))
+    for key, count in (("rectification_matrix", 9), ("projection_matrix", 12)):  # unused, but a file cut short lacks them
+        file[key]["data"].floats(count)
+    return _params(file, [file[key].value for key in ("image_width", "image_height")], values, fov_deg)
 
 
 def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> tuple[FisheyeParams, FitReport]:
-    """Read one camera of a basalt calibration: ``kb4`` as it is, ``ds`` and ``eucm`` through a fit.
-
-    Raises ValueError: the file is missing, cut short, lacks a key, or holds another model.
-
-    Args:
-        path: The JSON file.
-        camera: Number of the camera in it.
-        fov_deg: Full field of view where the file has none [deg]; fitted models are fitted inside it.
+    """Read one camera of a basalt calibration: ``kb4`` as it is, ``ds`` and ``eucm`` through a fit inside the field of view.
 
     Returns:
         The fisheye and what the fit left over (all zero for ``kb4``).
     """
     try:
-        tree = json.loads(_text(path, whole_lines=False))
+        tree = json.loads(text_of(path, whole_lines=False))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no complete JSON (cut short?): {error}") from error
-    tree = _mapping(path, "value0", _get(path, _mapping(path, "the file", tree), "value0"))
-    node = _mapping(path, "intrinsics", _item(path, "intrinsics", _get(path, tree, "intrinsics"), camera))
-    size = _floats(path, "resolution", _item(path, "resolution", _get(path, tree, "resolution"), camera), 2)
-    model = _get(path, node, "camera_type")
-    if model != "kb4" and model not in FOREIGN_MODELS:
-        raise ValueError(f"{path}: camera_type is {model!r}; expected one of {['kb4', *sorted(FOREIGN_MODELS)]}")
-    given = _mapping(path, "intrinsics", _get(path, node, "intrinsics"))
+    file = _Entry(path, tree)["value0"]
+    node = file["intrinsics"][camera]
+    model = node["camera_type"].among("kb4", *sorted(FOREIGN_MODELS))
     names = _KB4 if model == "kb4" else FOREIGN_MODELS[model][0]
-    numbers = _floats(path, "intrinsics", [_get(path, given, name) for name in names], len(names))
-    values = dict(zip(names, numbers, strict=True))
+    values = _Entry(path, [node["intrinsics"][name].value for name in names], "intrinsics").floats(len(names))
+    size = file["resolution"][camera]
     if model == "kb4":
-        return _params(path, size, tuple(values[n] for n in _KB4), node.get("fov_deg"), fov_deg), EXACT
+        return _params(node, size.value, tuple(values), fov_deg), EXACT
+    width, height = map(int, size.floats(2))
     try:
-        return fit_fisheye(model, values, int(size[0]), int(size[1]), fov_deg)
+        return fit_fisheye(model, dict(zip(names, values, strict=True)), width, height, fov_deg)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -147,29 +101,67 @@ def image_fov_deg(fisheye: FisheyeParams) -> float:
     return 2.0 * math.degrees(float(widest.angle(rays)[0].max()))
 
 
-def _params(path: str | Path, size: list[Any], values: tuple[float, ...], own_fov: Any, asked_fov: float | None) -> FisheyeParams:
-    """Assemble and check intrinsics; the message of a refusal names the file."""
-    width, height = (int(s) for s in _floats(path, "image size", size, 2))
-    named = dict(zip(_KB4, values, strict=True))
+@dataclass(frozen=True)
+class _Entry:
+    """What stands in a file under a name; where it is not what is asked for, the ValueError names both."""
+
+    path: str | Path
+    value: Any
+    name: str = ""
+
+    def _refused(self, expected: str) -> ValueError:
+        text = repr(self.value)
+        shown = text if len(text) <= 80 else text[:77] + "..."
+        return ValueError(f"{self.path}: {self.name or 'the file'} is {shown}; expected {expected}")
+
+    def __getitem__(self, key: str | int) -> "_Entry":
+        """Entry of a mapping by its key, of a list by the number of the camera."""
+        if isinstance(key, int):
+            count = len(self.value) if isinstance(self.value, list) else 0
+            if not 0 <= key < count:
+                raise ValueError(f"{self.path}: camera {key} asked for; expected below {count}, the number of {self.name} in the file")
+        elif not isinstance(self.value, dict):
+            raise self._refused("a mapping of keys to values")
+        elif key not in self.value:
+            raise ValueError(f"{self.path} lacks the key {key!r} (cut short?); it has {sorted(map(str, self.value))}")
+        return _Entry(self.path, self.value[key], f"{self.name}.{key}".lstrip("."))
+
+    def among(self, *choices: Any) -> Any:
+        """The value, which must be one of these."""
+        if self.value not in choices:
+            raise self._refused(f"one of {list(choices)}")
+        return self.value
+
+    def floats(self, count: int) -> list[float]:
+        """So many numbers."""
+        values = self.value
+        good = isinstance(values, list | tuple) and len(values) == count
+        if not good or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+            raise self._refused(f"{count} numbers")
+        return [float(v) for v in values]
+
+    def focal_and_centre(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy of a camera matrix without skew."""
+        fx, skew, cx, _, fy, cy, *_ = self.floats(9)
+        if abs(skew) > 1e-9 * abs(fx):
+            raise self._refused("a matrix without skew, which our model has not")
+        return fx, fy, cx, cy
+
+
+def _params(entry: _Entry, size: Any, values: tuple[float, ...], asked_fov: float | None) -> FisheyeParams:
+    """Intrinsics in the order of `_KB4`; the field of view is the entry's own, the asked one, or what the farthest corner sees."""
+    width, height = map(int, _Entry(entry.path, size, "image size").floats(2))
+    lens = dict(zip(_KB4, values, strict=True))
+    fov = asked_fov if entry.value.get("fov_deg") is None else entry.value["fov_deg"]
     try:
-        fov = own_fov if own_fov is not None else asked_fov
         if fov is None:
-            fov = image_fov_deg(FisheyeParams(width, height, **named, fov_deg=1.0))
-        params = FisheyeParams(width, height, **named, fov_deg=_floats(path, "fov_deg", [fov], 1)[0])
+            fov = image_fov_deg(FisheyeParams(width, height, **lens, fov_deg=1.0))
+        return FisheyeParams(width, height, **lens, fov_deg=_Entry(entry.path, [fov], "fov_deg").floats(1)[0])
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    return params
+        raise ValueError(f"{entry.path}: {error}") from error
 
 
-def _from_matrix(path: str | Path, values: Any) -> tuple[float, float, float, float]:
-    """fx, cx, fy, cy of a camera matrix without skew."""
-    fx, skew, cx, _, fy, cy, *_ = _floats(path, "camera_matrix", values, 9)
-    if abs(skew) > 1e-9 * abs(fx):
-        raise ValueError(f"{path}: camera_matrix has a skew of {skew}; expected 0, which our model has")
-    return fx, cx, fy, cy
-
-
-def _text(path: str | Path, whole_lines: bool = True) -> str:
+def text_of(path: str | Path, whole_lines: bool = True) -> str:
     """Text of a file that exists and, where the format has no closing bracket, does not end within a line."""
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file; expected a calibration file")
@@ -180,49 +172,10 @@ def _text(path: str | Path, whole_lines: bool = True) -> str:
     return text
 
 
-def _yaml(path: str | Path) -> dict[str, Any]:
+def _yaml(path: str | Path) -> _Entry:
     import yaml
 
     try:
-        tree = yaml.safe_load(_text(path))
+        return _Entry(path, yaml.safe_load(text_of(path)))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no complete YAML (cut short?): {error}") from error
-    return _mapping(path, "the file", tree)
-
-
-def _mapping(path: str | Path, name: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: {name} is {_short(value)}; expected a mapping of keys to values")
-    return value
-
-
-def _get(path: str | Path, tree: dict[str, Any], key: str, exists: list[str] | None = None) -> Any:
-    if key not in tree:
-        exists = sorted(map(str, tree)) if exists is None else exists
-        raise ValueError(f"{path} lacks the key {key!r} (cut short?); it has {exists}")
-    return tree[key]
-
-
-def _item(path: str | Path, name: str, values: Any, index: int) -> Any:
-    if not isinstance(values, list) or not 0 <= index < len(values):
-        count = len(values) if isinstance(values, list) else 0
-        raise ValueError(f"{path}: camera {index} asked for; expected below {count}, the number of {name} in the file")
-    return values[index]
-
-
-def _floats(path: str | Path, name: str, values: Any, count: int) -> list[float]:
-    listed = isinstance(values, list | tuple) and len(values) == count
-    if not listed or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-        raise ValueError(f"{path}: {name} is {_short(values)}; expected {count} numbers")
-    return [float(v) for v in values]
-
-
-def _expect(path: str | Path, tree: dict[str, Any], key: str, choices: tuple[str, ...]) -> None:
-    value = _get(path, tree, key)
-    if value not in choices:
-        raise ValueError(f"{path}: {key} is {_short(value)}; expected one of {list(choices)}")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

@@ -33,10 +33,8 @@ _MARKS = {
 
 def format_of(path: str | Path) -> str:
     """Tell the format of a calibration file from its text. Raises ValueError: the file is missing, no text, or of none of the formats."""
-    if not Path(path).is_file():
-        raise ValueError(f"{path} is not a file; expected a calibration of {', '.join(READERS)}")
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = files.text_of(path, whole_lines=False)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text; expected a calibration of {', '.join(READERS)}") from error
     for name, marks in _MARKS.items():
@@ -77,9 +75,7 @@ def read_ocam(path: str | Path, fov_deg: float | None = None) -> Reading:
         path: The file: direct polynomial, inverse polynomial (unused), centre, affine part, image size (height, width).
         fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"{path} is not a file; expected a calibration file")
-    lines = [line.split() for line in Path(path).read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line.split() for line in files.text_of(path, whole_lines=False).splitlines() if line.strip() and not line.startswith("#")]
     try:
         direct, _, centre, affine, size = ([float(word) for word in line] for line in lines[:5])
         row, column = centre

@@ -35,9 +35,6 @@ from camera.detectors.scenes.scene import Truth, lens_row, random_scenes, truth_
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
 
-AWAY = 0.6
-"""A place this many sizes from the thing or more shows something else."""
-
 NEAR = 0.5
 """A finding within this many sizes of the thing is of it."""
 

@@ -8,7 +8,7 @@ so that the answer's uncertainty has them in it.
 
 Source: Gauss-Newton on a Markov chain, Bell, "The iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optim. 4(3), 1994.
 Convention: the latency is the keypoints' age beyond that of the poses that come with them. The camera's turn is a rotation vector
-in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as in `camera.mount.extrinsics_with_error`.
+in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as in `camera.keypoints.KeypointCamera.extrinsics`.
 """
 
 import math
