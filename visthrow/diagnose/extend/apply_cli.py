@@ -102,7 +102,7 @@ def _extend_setup(args: argparse.Namespace, report: dict) -> int:
 
 
 def _bear_out(report: dict, anyway: bool) -> None:
-    """Refuse what held-out flights deny; DiagnoseError: they do, and nobody wants it all the same."""
+    """Refuse what held-out flights deny. Raises DiagnoseError: they do, and nobody wants it all the same."""
     from visthrow.common.errors import DiagnoseError
 
     doubts = harm(report)
@@ -113,7 +113,7 @@ def _bear_out(report: dict, anyway: bool) -> None:
 def _made_with(report: dict, args: argparse.Namespace, option: str) -> str:
     """Name of the plant or config that was diagnosed: sizes are counted from there.
 
-    DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
+    Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
     """
     from visthrow.common.errors import DiagnoseError
 

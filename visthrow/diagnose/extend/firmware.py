@@ -21,8 +21,7 @@ def text(path: str | Path, base: str, experiment: Experiment, hover: float, dela
         hover: share of throttle in hover, 0 to 1, with the payload.
         delay: from a command to the mixer [s]; None: as the configuration has it.
 
-    Raises:
-        DiagnoseError: settings are missing. LogError: no blackbox.
+    Raises DiagnoseError: settings are missing; LogError: no blackbox.
     """
     settings, plant = read_blackbox(path)[0].header, plant_of(experiment)
     weight = 0.25 * plant.total_mass * GRAVITY

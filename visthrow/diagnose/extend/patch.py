@@ -21,7 +21,7 @@ from visthrow.task import Experiment, plant_of
 
 
 def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
-    """The experiment whose plant and sensors have these effects; ConfigError: an effect that the catalogue does not hold."""
+    """The experiment whose plant and sensors have these effects. Raises ConfigError: an effect that the catalogue does not hold."""
     base = generalised(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     found = apply(chosen(theta), base, theta)
     plant = specialised(found.plant, plant_of(experiment))
@@ -112,7 +112,7 @@ def with_scatter(
 
 
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
-    """All laws of the explanation of this rank, from 1, in the JSON that ``explain`` wrote; none for 0; DiagnoseError: it holds fewer."""
+    """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0. Raises DiagnoseError: it holds fewer."""
     explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
     if rank > len(explanations):
         raise DiagnoseError(f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws asks for number {rank}")
@@ -121,7 +121,7 @@ def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
-    """Sizes and covariance from the JSON that ``explain`` wrote; DiagnoseError: something is missing."""
+    """Sizes and covariance from the JSON that ``explain`` wrote. Raises DiagnoseError: something is missing."""
     try:
         theta = {str(name): float(size) for name, size in report["theta"].items()}
         covariance = [[float(x) for x in row] for row in report["covariance"]]
@@ -135,7 +135,7 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
 def of_setup(base: str, setup: Setup, report: Mapping[str, Any], path: str, provenance: Sequence[str]) -> str:
     """The TOML file of a setup of another model than the throw, extended by the sizes that a diagnosis of it found.
 
-    ``base``: path of the diagnosed setup, as ``base =`` is to name it; DiagnoseError: the diagnosis is of another model, or no diagnosis.
+    ``base``: path of the diagnosed setup, as ``base =`` is to name it. Raises DiagnoseError: no diagnosis, or one of another model.
     """
     theta, covariance = read(report, path)
     if [report.get("model", THROW)] != setup.named():
@@ -153,7 +153,7 @@ def of_setup(base: str, setup: Setup, report: Mapping[str, Any], path: str, prov
 def refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
     """Refuse effects that are none of the throw's, though they may bear the same name, and sizes that the throw's simulator cannot have.
 
-    DiagnoseError: an effect or its unit is none of the catalogue's; a size lies outside its bounds.
+    Raises DiagnoseError: an effect or its unit is none of the catalogue's; a size lies outside its bounds.
     """
     known = catalogue()
     strange = [name for name in theta if name not in known]

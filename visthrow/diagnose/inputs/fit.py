@@ -53,7 +53,7 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     """Fit effects of a model jointly.
 
     ``model``: linearisable; its windows' latent forces and noise levels are estimated on the way.
-    DiagnoseError: a name that the model does not have, or none.
+    Raises DiagnoseError: a name that the model does not have, or none.
     """
     from visthrow.diagnose.select.point import Problem, fitted, linearise
 
@@ -96,7 +96,7 @@ def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParam
     """A simulated vehicle with what was found; everything else as in ``base``.
 
     A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest thrust follows the map.
-    ``base``: vehicle that lends all other numbers; DiagnoseError: the setup's model is of no vehicle.
+    ``base``: vehicle that lends all other numbers. Raises DiagnoseError: the setup's model is of no vehicle.
     """
     size = dict(zip(found.names, map(float, found.theta)))
     if setup.flyer is not None:
@@ -147,7 +147,7 @@ def _of_stand(p: Any, size: Mapping[str, float], middle: float, base: VehiclePar
 def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequence[FlightLog], base: VehicleParams) -> list[Path]:
     """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance and provenance.
 
-    StorageError: the folder cannot be written.
+    Raises StorageError: the folder cannot be written.
 
     Returns:
         Their paths.

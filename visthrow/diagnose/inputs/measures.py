@@ -34,7 +34,7 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
     """The catalogue where some configured values were measured.
 
     ``measured``: effect -> deviation of the measurement that the configuration's value comes from, in its unit.
-    DiagnoseError: no effect of that name, or a deviation that is not above 0.
+    Raises DiagnoseError: no effect of that name, or a deviation that is not above 0.
     """
     known = [e.name for e in effects]
     for name, sd in measured.items():
@@ -52,7 +52,7 @@ def _narrow(effect: Effect, sd: float) -> Effect:
 
 
 def parsed(items: Sequence[str]) -> dict[str, float]:
-    """Read ``NAME=DEVIATION`` of the command line; DiagnoseError: something else."""
+    """Read ``NAME=DEVIATION`` of the command line. Raises DiagnoseError: something else."""
     out = {}
     for item in items:
         name, _, sd = item.partition("=")

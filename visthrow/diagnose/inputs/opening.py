@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     """Read the logs and build the model.
 
-    ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's own model.
+    Raises ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's own model.
     """
     from visthrow.diagnose.inputs import measures
 
@@ -124,7 +124,7 @@ def _only(model: Model, names: Sequence[str]) -> Model:
 
 
 def numbers(text: str) -> tuple[int, ...]:
-    """Flights named on the command line; DiagnoseError: something else than numbers between commas."""
+    """Flights named on the command line. Raises DiagnoseError: something else than numbers between commas."""
     try:
         return tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:

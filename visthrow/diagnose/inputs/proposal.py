@@ -62,7 +62,7 @@ def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
     """Propose a mapping of the columns of a table, or of the tables of a recording.
 
     ``source``: what messages call it; ``mass``: of the vehicle alone [kg], where it was weighed.
-    LogError: no column holds numbers that change.
+    Raises LogError: no column holds numbers that change.
     """
     numbers = {name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"}
     if not any(np.nanstd(cells) > 0.0 for cells in numbers.values() if np.any(np.isfinite(cells))):

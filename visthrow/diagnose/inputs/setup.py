@@ -24,7 +24,7 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Setup:
-    """File of ``configs/diagnose``; at most one of the models; ConfigError: more than one model."""
+    """File of ``configs/diagnose``; at most one of the models. Raises ConfigError: more than one model."""
 
     about: str  # whose logs these are
     table: TableMap | None = None  # of tables' columns; None: the logs say themselves what they hold
@@ -48,9 +48,7 @@ class Setup:
 def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
     """Make the model that a setup holds logs against.
 
-    Raises:
-        ConfigError: The setup has none.
-        LogError: The logs hold nothing that the model could be held against; the setup has effects that are none of the model's.
+    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect of the setup is none of the model's.
     """
     if not setup.named():
         raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
@@ -61,7 +59,7 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
 
 
 def load(name: str | Path) -> Setup:
-    """Load a setup by its name in ``configs/diagnose``, or a file; ConfigError: there is none, or it does not fill the schema."""
+    """Load a setup by its name in ``configs/diagnose``, or a file. Raises ConfigError: there is none, or it does not fill the schema."""
     from visthrow import config
 
     return config.load(Setup, config.find("diagnose", str(name)))
@@ -71,7 +69,7 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
     """Return what a setup, or the plant of an experiment, says of the vehicle.
 
     ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the setup has no flying model.
-    ConfigError: as :func:`load`.
+    Raises ConfigError: as :func:`load`.
     """
     flyer = load(name).flyer if name is not None else None
     if flyer is not None:
@@ -88,7 +86,7 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
 
 
 def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:
-    """Read logs, tables by the setup's mapping; ``name``: of a setup, or None; LogError, ConfigError: as the readers and :func:`load`."""
+    """Read logs, tables by the mapping of the setup ``name``. Raises LogError, ConfigError: as the readers and :func:`load`."""
     from visthrow.logs import read_all
 
     return read_all(paths, load(name).table if name is not None else None)

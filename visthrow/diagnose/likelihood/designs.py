@@ -108,7 +108,7 @@ def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int, devic
     """Reduce windows to their inner products, see :func:`visthrow.diagnose.likelihood.marginal.gram_of`.
 
     ``windows``: with finite residuals and derivatives; ``floors``: of the effects, shape (K,).
-    DiagnoseError: a window's arrays do not fit together, or hold NaN or infinity.
+    Raises DiagnoseError: a window's arrays do not fit together, or hold NaN or infinity.
     """
     if device == "cpu" or not windows or _correlated(windows):
         return each(lambda w: gram_of(w, floors, channels), windows)

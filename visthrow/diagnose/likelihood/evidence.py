@@ -51,7 +51,7 @@ class Priors:
 
     @staticmethod
     def of(effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]) -> "Priors":
-        """Read them off the catalogue; DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0."""
+        """Read them off the catalogue. Raises DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0."""
         for e in effects:
             if not (e.floor > 0.0 and e.prior_sd > 0.0 and e.bounds[0] <= 0.0 <= e.bounds[1]):
                 raise DiagnoseError(

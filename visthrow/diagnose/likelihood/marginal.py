@@ -130,7 +130,7 @@ def columns(window: Window, floors: np.ndarray) -> np.ndarray:
 def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
     """Reduce a window to its inner products.
 
-    DiagnoseError: the window's arrays do not fit together, or hold NaN or infinity.
+    Raises DiagnoseError: the window's arrays do not fit together, or hold NaN or infinity.
 
     Args:
         window: with finite residuals and derivatives.
@@ -142,7 +142,7 @@ def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
 
 
 def hidden_gram(window: Window, channels: int) -> Gram:
-    """The same of a window whose effects are not asked for; DiagnoseError: as :func:`gram_of`."""
+    """The same of a window whose effects are not asked for. Raises DiagnoseError: as :func:`gram_of`."""
     check(window, window.effects.shape[1], channels)
     return _inner_products(window, columns(replace(window, effects=window.effects[:, :0]), np.zeros(0)), channels)
 
@@ -192,7 +192,7 @@ def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float
 
 
 def check(window: Window, effects: int, channels: int) -> None:
-    """Refuse a window whose arrays do not fit together; DiagnoseError: they do not, or hold NaN or infinity."""
+    """Refuse a window whose arrays do not fit together. Raises DiagnoseError: they do not, or hold NaN or infinity."""
     n = len(window.residual)
     where = f"window of flight {window.flight}, phase {window.phase}"
     shapes = {"time": window.time.shape[:1], "channel": window.channel.shape, "sigma": window.sigma.shape,
@@ -303,7 +303,7 @@ class WindowStatistics(Share):
 def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
     """Add up windows by flight.
 
-    ``theta``: linearisation point in floors, shape (K,); DiagnoseError: information came out negative beyond rounding.
+    ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out negative beyond rounding.
     """
     flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
     size, count = len(theta), len(flights)

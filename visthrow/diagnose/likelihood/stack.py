@@ -161,12 +161,12 @@ class Stack:
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
 
-        DiagnoseError: the normal equations are not positive definite, which only broken derivatives can cause.
+        Raises DiagnoseError: the normal equations are not positive definite, which only broken derivatives can cause.
         """
         return self._in_order([part for (part,) in self._each(lambda batch: (_solved(_shape(batch, noise), batch).value,))])
 
     def fitted(self, noise: Noise) -> list[np.ndarray]:
-        """Most probable initial state and unit latent forces of each window, shape (D + L,); DiagnoseError: as :meth:`values`."""
+        """Most probable initial state and unit latent forces of each window, shape (D + L,). Raises DiagnoseError: as :meth:`values`."""
 
         def found(batch: _Batch) -> tuple[torch.Tensor]:
             at = _shape(batch, noise)
@@ -178,7 +178,7 @@ class Stack:
     def look(self, noise: Noise, first: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
 
-        ``first``: whether others may look at these levels as well, with other residuals; DiagnoseError: as :meth:`values`.
+        ``first``: whether others may look at these levels as well, with other residuals. Raises DiagnoseError: as :meth:`values`.
 
         Returns:
             Values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C).
@@ -190,7 +190,7 @@ class Stack:
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
         """What is left of the effects' columns of each window, or of those of latent forces and effects.
 
-        DiagnoseError: as :meth:`values`.
+        Raises DiagnoseError: as :meth:`values`.
         """
         return Integrals(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
 

@@ -46,7 +46,7 @@ class BallModel(NumericModel):
     """Free flights of a ball, one window each."""
 
     def __init__(self, logs: Sequence[FlightLog], params: BallParams) -> None:
-        """Cut the free flights out of the logs; LogError where there is none."""
+        """Cut the free flights out of the logs. Raises LogError where there is none."""
         self.params = params
         stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _flights(log, i, params)]
         super().__init__(effects_of("ball", params), (CHANNEL,), stretches)

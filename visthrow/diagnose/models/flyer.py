@@ -28,7 +28,7 @@ class FlyerModel(NumericModel):
     latent_step = 1e-2
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
-        """Cut the flights into windows; LogError where no log has the channels, or none flies."""
+        """Cut the flights into windows. Raises LogError where no log has the channels, or none flies."""
         self.params = params
         self.has_voltage = all("battery_voltage" in log for log in logs)
         channels = [params.position]

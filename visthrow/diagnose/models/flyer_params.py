@@ -32,7 +32,7 @@ class TorqueParams:
 
 @dataclass(frozen=True)
 class FlyerParams:
-    """The vehicle that is assumed before anything is found; ConfigError where torque has no motors' commands, or the map does not rise."""
+    """The vehicle that is assumed first. Raises ConfigError where torque has no motors' commands, or the map does not rise."""
 
     input: Literal["motor_command", "motor_speed", "thrust_command", "command"]  # channel of the commands
     position: str  # channel of the measured position

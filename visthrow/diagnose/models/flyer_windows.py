@@ -23,7 +23,7 @@ _IDLE = 0.3  # windows in which the thrust falls below this share of the weight 
 def stretches_of(logs: Sequence[FlightLog], params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:
     """Windows of all logs, at most ``most_windows``, spread evenly.
 
-    LogError where no log has the channels, or commands are of another size than carries the vehicle.
+    Raises LogError where no log has the channels, or commands are of another size than carries the vehicle.
     """
     needed = [params.position, params.attitude, params.input, *channels[1:]]
     usable = [(i, log) for i, log in enumerate(logs) if all(_holds(log, name) for name in needed)]

@@ -44,7 +44,7 @@ class GimbalModel(NumericModel):
     """Windows of the marker's positions in the camera's frame."""
 
     def __init__(self, logs: Sequence[FlightLog], params: GimbalParams) -> None:
-        """Cut the logs; LogError where none has poses of both bodies and the marker, or the marker is seen elsewhere than the payload."""
+        """Cut the logs. Raises LogError where none has both bodies and the marker, or the marker is not seen at the payload."""
         self.params = params
         self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
         stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params, self.camera)]

@@ -67,7 +67,7 @@ class NumericModel(ABC):
     ) -> None:
         """Take the catalogue, channels that residuals are taken of, windows, and channels that are there and drive the simulation.
 
-        An effect that needs any other channel cannot be seen. LogError where there is no window.
+        An effect that needs any other channel cannot be seen. Raises LogError where there is no window.
         """
         if not stretches:
             raise LogError(f"no stretch of these logs shows {', '.join(channels)} in a way that this model explains")
@@ -80,7 +80,7 @@ class NumericModel(ABC):
         self._base = np.zeros(len(self.effects))  # sizes that the model has before anything is found
 
     def extend(self, sizes: Mapping[str, float]) -> None:
-        """Give the model what a diagnosis found: sizes are counted, and bounded, from there; LogError for one outside its bounds."""
+        """Give the model what a diagnosis found: sizes are counted, and bounded, from there. Raises LogError for one outside its bounds."""
         base = self.size(sizes)
         for effect, size in zip(self.effects, base):
             if not effect.bounds[0] <= size <= effect.bounds[1]:
@@ -102,7 +102,7 @@ class NumericModel(ABC):
         return {}
 
     def size(self, theta: Mapping[str, float]) -> np.ndarray:
-        """Sizes of all effects in order, with those that the model has before, shape (K,); LogError for an effect that it does not know."""
+        """Sizes of all effects in order, with those it had before, shape (K,). Raises LogError for an effect that it does not know."""
         for name in theta:
             if name not in self.numbers:
                 raise LogError(f"no effect '{name}'; {suggest(name, self.numbers)}")

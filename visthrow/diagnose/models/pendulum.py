@@ -50,7 +50,7 @@ class PendulumModel(NumericModel):
     """Free swings, cut into windows."""
 
     def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
-        """Cut the logs; LogError where none holds an angle, or one holds angles that are no radians from where it hangs."""
+        """Cut the logs. Raises LogError where none holds an angle, or one holds angles that are no radians from where it hangs."""
         self.params = params
         stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)]
         self._steps = round(params.window / params.step)

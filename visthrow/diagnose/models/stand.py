@@ -36,7 +36,7 @@ class StandModel(NumericModel):
     """Static steps of tests on one stand; a test is a flight."""
 
     def __init__(self, logs: Sequence[FlightLog], params: StandParams) -> None:
-        """Take the settled steps of the logs; LogError where none has thrust, speed, voltage and current."""
+        """Take the settled steps of the logs. Raises LogError where none has thrust, speed, voltage and current."""
         self.params = params
         stretches = [s for i, log in enumerate(logs) if (s := _steps(log, i, params)) is not None]
         super().__init__(effects_of("stand", params), CHANNELS, stretches, ("rotor_speed", "supply_voltage"))

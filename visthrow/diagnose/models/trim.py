@@ -42,7 +42,7 @@ class TrimModel(NumericModel):
     """Means over windows of slow level flight."""
 
     def __init__(self, logs: Sequence[FlightLog], params: TrimParams) -> None:
-        """Cut the logs; LogError where none flies slowly with motor commands logged."""
+        """Cut the logs. Raises LogError where none flies slowly with motor commands logged."""
         self.params = params
         usable = [(i, log) for i, log in enumerate(logs) if params.command in log and params.position in log]
         stretches = [s for i, log in usable for s in _cut(log, i, params)]

@@ -42,7 +42,7 @@ SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wan
 
 @dataclass(frozen=True)
 class Limits:
-    """What vehicle and hall allow; DiagnoseError: one that is not above 0, or a ceiling below the floor."""
+    """What vehicle and hall allow. Raises DiagnoseError: one that is not above 0, or a ceiling below the floor."""
 
     half: tuple[float, float] = (2.5, 2.5)  # of the hall, from its middle, that the path stays in [m]
     lowest: float = 0.8  # [m]

@@ -56,7 +56,7 @@ def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[Fl
     """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it can.
 
     ``diagnosis``: for the sizes of what was found and the sensors' noise; ``made``: gives a setup's own model of some logs.
-    DiagnoseError: no vehicle flies in this model.
+    Raises DiagnoseError: no vehicle flies in this model.
     """
     whole = getattr(model, "whole", model)
     if isinstance(whole, ThrowModel):

@@ -63,7 +63,7 @@ class Aim:
     def __init__(self, diagnosis: Diagnosis, about: Sequence[str] = ()) -> None:
         """Take the classes to be separated, or else what could not be identified, or else every effect that can be seen.
 
-        ``about``: names of the effects to plan for; empty for all; DiagnoseError: an effect that the diagnosis does not know.
+        ``about``: names of the effects to plan for; empty for all. Raises DiagnoseError: an effect that the diagnosis does not know.
         """
         work = diagnosis.work
         self.diagnosis, self.base, self.priors = diagnosis, work.after, work.problem.priors

@@ -21,7 +21,7 @@ def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> 
     """Write a ``.rrd``: for each flight the measured paths, the ghosts of both models, and all residuals over time.
 
     ``logs``: in the order in which the model numbers them; a model that numbers them otherwise gets residuals alone.
-    StorageError: the place cannot be written.
+    Raises StorageError: the place cannot be written.
     """
     work = diagnosis.work
     with recording(path) as stream:

@@ -157,12 +157,7 @@ def sections(
 
 
 def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, title: str) -> list[Path]:
-    """Write ``report.html``, ``report.md`` and the pictures.
-
-    Raises:
-        StorageError: The place cannot be written.
-        ModuleNotFoundError: jinja2 is not installed.
-    """
+    """Write ``report.html``, ``report.md`` and the pictures. Raises ModuleNotFoundError: jinja2 is not installed."""
     from visthrow.view import page
 
     return page.write(Path(folder), title, sentence_of(diagnosis), made)

@@ -27,7 +27,7 @@ def explain(
 ) -> Diagnosis:
     """Say what the model gets wrong about its flights.
 
-    DiagnoseError: the model gives no window, or contradicts itself.
+    Raises DiagnoseError: the model gives no window, or contradicts itself.
 
     Args:
         model: a simulation of measured flights with its catalogue of effects.

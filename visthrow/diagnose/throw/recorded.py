@@ -103,7 +103,7 @@ def resolution(values: np.ndarray) -> float:
 
 
 def record_of(log: FlightLog, number: int = 0) -> Recorded:
-    """Take from a log what a replay needs; DiagnoseError: no commands, or no poses of the vehicle."""
+    """Take from a log what a replay needs. Raises DiagnoseError: no commands, or no poses of the vehicle."""
     missing = [name for name in ("command", "pos_w", "quat_wb") if measured(log, name) is None]
     if missing:
         raise DiagnoseError(
@@ -124,7 +124,7 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
 def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]:
     """Positions and attitudes of the same times: of common stamps, else attitudes between their samples.
 
-    DiagnoseError: neither has them.
+    Raises DiagnoseError: neither has them.
     """
     common, at_pos, at_quat = np.intersect1d(np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True)
     if len(common) >= 0.2 * min(len(pos.time), len(quat.time)) and len(common) >= 5:

@@ -71,7 +71,7 @@ class ThrowModel:
     ):
         """Cut the flights and find the windows' initial states.
 
-        DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
+        Raises DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
 
         Args:
             sensing: what is known of the sensors.
