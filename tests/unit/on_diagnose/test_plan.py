@@ -1,5 +1,7 @@
 """Plans: what to do in one session, and which truths are planned for."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -23,10 +25,11 @@ def test_a_session_holds_what_separates_more_than_what_stands_before_it():
 
 def test_a_member_that_is_far_behind_is_no_truth_to_plan_for(degenerate):
     """Flights that show only the other member promise what they show of it."""
-    names, priors = [f.name for f in degenerate.findings], degenerate.work.problem.priors
+    names, aim = [f.name for f in degenerate.findings], plan.Aim(degenerate)
     pair = names.index("effect_03"), names.index("effect_07")
     base, new = (np.diag(np.isin(np.arange(len(names)), which).astype(float)) for which in (pair, pair[:1]))
     for behind, planned in ((6.0, False), (0.5, True)):  # score of the other member
         score = np.zeros(len(names))
         score[list(pair)] = 6.0, behind
-        assert (plan._gap(degenerate, base, score, new, priors, pair) > plan.DECISIVE) == planned
+        aim.base = SimpleNamespace(information=base, score=score)
+        assert (aim._gap(pair, new) > plan.DECISIVE) == planned

@@ -54,7 +54,8 @@ def look(log: FlightLog) -> list[Row]:
     elif figures.get("idle"):
         text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
         rows.append(Row("excited", "", "bad", text, {"idle": 1}))
-    return rows + [_answer(question, log, figures) for question in QUESTIONS if _concerns(question, log)]
+    concern = [q for q in QUESTIONS if any(name in log for name in q.needs[0])]  # not things of which the log holds nothing at all
+    return rows + [_answer(question, log, figures) for question in concern]
 
 
 def _words(figures: dict) -> str:
@@ -64,11 +65,6 @@ def _words(figures: dict) -> str:
         "thrust_range": "of thrust (95 to 5 %, relative)", "voltage_range": "V of battery",
     }  # fmt: skip
     return ", ".join(f"{figures[key]:.3g} {word}" for key, word in units.items() if key in figures)
-
-
-def _concerns(question: Question, log: FlightLog) -> bool:
-    """Leave out questions about things of which the log holds nothing at all."""
-    return any(name in log for name in question.needs[0])
 
 
 def _answer(question: Question, log: FlightLog, figures: dict) -> Row:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -31,10 +31,6 @@ class Checked:
     def verdict(self) -> Verdict:
         """The worst row's; what cannot be answered is no fault of the log."""
         return worst([row for row in self.rows if row.topic != "answers"])
-
-    def as_dict(self) -> dict:
-        """For JSON."""
-        return {"log": self.name, "verdict": self.verdict, "rows": [asdict(row) for row in self.rows]}
 
 
 def check(logs: Sequence[FlightLog], known: Known = NOTHING) -> list[Checked]:

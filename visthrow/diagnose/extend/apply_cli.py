@@ -4,6 +4,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from visthrow import config
+from visthrow.common.errors import DiagnoseError
+
 DEFAULT_PLANTS = 64
 HARM = 0.02  # share by which a channel may get worse on held-out flights
 
@@ -42,8 +45,6 @@ def run(args: argparse.Namespace) -> int:
     """Write the file."""
     import json
 
-    from visthrow import config
-    from visthrow.common.errors import DiagnoseError
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.extend import firmware, patch
     from visthrow.diagnose.inputs.opening import DEFAULT_PLANT, THROW
@@ -103,8 +104,6 @@ def _extend_setup(args: argparse.Namespace, report: dict) -> int:
 
 def _bear_out(report: dict, anyway: bool) -> None:
     """Refuse what held-out flights deny. Raises DiagnoseError: they do, and nobody wants it all the same."""
-    from visthrow.common.errors import DiagnoseError
-
     doubts = harm(report)
     if doubts and not anyway:
         raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
@@ -115,8 +114,6 @@ def _made_with(report: dict, args: argparse.Namespace, option: str) -> str:
 
     Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
     """
-    from visthrow.common.errors import DiagnoseError
-
     told, asked = report.get(option), getattr(args, option)
     if not (told or asked):
         model = report.get("model", "throw")
@@ -129,7 +126,6 @@ def _made_with(report: dict, args: argparse.Namespace, option: str) -> str:
 
 def _diagnosed(plant: str, overrides: Sequence[str] = ()):
     """Name that another configuration finds the diagnosed one under, and what it says with overrides."""
-    from visthrow import config
     from visthrow.task import Experiment
 
     return _named("train", plant), config.load(Experiment, config.find("train", plant), overrides)
@@ -137,8 +133,6 @@ def _diagnosed(plant: str, overrides: Sequence[str] = ()):
 
 def _named(folder: str, name: str) -> str:
     """Path under which another configuration finds one."""
-    from visthrow import config
-
     path = config.find(folder, name)
     shipped = path.is_relative_to(config.configs_root())
     return path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())

@@ -1,6 +1,7 @@
 """``visthrow diagnose check``: whether logs can answer anything, before a model is asked."""
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from visthrow.common.arguments import add_out
@@ -36,13 +37,11 @@ def run(args: argparse.Namespace) -> int:
     for number, (log, checked) in enumerate(zip(logs, results), start=1):
         print(table(checked, args.all) + "\n")
         if not args.no_pictures:
-            draw(log, checked, Path(args.out) / f"{number:02d}-{_file_name(checked.name)}.png")
+            name = "".join(c if c.isalnum() or c in "-_." else "_" for c in checked.name)
+            draw(log, checked, Path(args.out) / f"{number:02d}-{name}.png")
     if not args.no_pictures:
         print(f"{len(logs)} picture(s) in {args.out}")
     if args.json:
-        write_json(args.json, {"logs": [checked.as_dict() for checked in results]})
+        rows = [{"log": c.name, "verdict": c.verdict, "rows": [asdict(row) for row in c.rows]} for c in results]
+        write_json(args.json, {"logs": rows})
     return 1 if any(checked.verdict == "bad" for checked in results) else 0
-
-
-def _file_name(text: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in text)

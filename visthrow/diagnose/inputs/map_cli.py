@@ -4,6 +4,8 @@ import argparse
 import json
 from pathlib import Path
 
+from visthrow.common.errors import LogError
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
@@ -20,7 +22,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, propose, print."""
-    from visthrow.common.errors import LogError
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.inputs.proposal import propose
     from visthrow.logs import table_of

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.diagnose.models.interface import Effect
 
@@ -42,13 +44,9 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
             raise DiagnoseError(f"no effect '{name}' that could have been measured; {suggest(name, known)}")
         if not sd > 0.0:
             raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected one above 0")
-    return tuple(_narrow(e, measured[e.name]) if e.name in measured else e for e in effects)
-
-
-def _narrow(effect: Effect, sd: float) -> Effect:
-    low, high = effect.bounds
-    bounds = (max(low, -WITHIN * sd), min(high, WITHIN * sd))
-    return replace(effect, bounds=bounds, prior_sd=min(effect.prior_sd, sd))
+    own = [(e, measured.get(e.name, np.inf)) for e in effects]
+    within = [(max(e.bounds[0], -WITHIN * sd), min(e.bounds[1], WITHIN * sd)) for e, sd in own]
+    return tuple(replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd)) for (e, sd), bounds in zip(own, within))
 
 
 def parsed(items: Sequence[str]) -> dict[str, float]:

@@ -43,28 +43,18 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     model, logs = _opened(args)
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
-    model.days = days_of(logs)
-    return model, logs
-
-
-def days_of(logs: Sequence[FlightLog]) -> tuple[int, ...]:
-    """Day of each flight, from 0: what its log says (``day`` in its metadata), else those of one folder are of one."""
+    # day of each flight, from 0: what its log says, else those of one folder are of one
     names = [str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs]
-    known = list(dict.fromkeys(names))
-    return tuple(map(known.index, names))
-
-
-def model_name(args: argparse.Namespace) -> str:
-    """Name of the model that the arguments ask for."""
-    from visthrow.diagnose.inputs import setup
-
-    own = setup.load(args.config).named() if args.config else []
-    return own[0] if own else THROW
+    model.days = tuple(map(list(dict.fromkeys(names)).index, names))
+    return model, logs
 
 
 def made_with(args: argparse.Namespace) -> dict[str, Any]:
     """Entries of a diagnosis' JSON that say what was diagnosed: ``apply`` builds on nothing else."""
-    return {"model": model_name(args), "plant": args.plant, "config": args.config, "overrides": args.overrides}
+    from visthrow.diagnose.inputs import setup
+
+    own = setup.load(args.config).named() if args.config else []
+    return {"model": own[0] if own else THROW, "plant": args.plant, "config": args.config, "overrides": args.overrides}
 
 
 def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:

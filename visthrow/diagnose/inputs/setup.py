@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel, FlyerParams
@@ -12,6 +13,7 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
+from visthrow.logs import read_all
 from visthrow.logs.check.rows import Known
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
@@ -48,7 +50,7 @@ class Setup:
 def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
     """Make the model that a setup holds logs against.
 
-    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect of the setup is none of the model's.
+    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect is none of the model's.
     """
     if not setup.named():
         raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
@@ -60,8 +62,6 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
 
 def load(name: str | Path) -> Setup:
     """Load a setup by its name in ``configs/diagnose``, or a file. Raises ConfigError: there is none, or it does not fill the schema."""
-    from visthrow import config
-
     return config.load(Setup, config.find("diagnose", str(name)))
 
 
@@ -77,7 +77,6 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
         return Known(length, flyer.total_mass, flyer.input, flyer.thrust_map)
     if plant is None:
         return Known()
-    from visthrow import config
     from visthrow.task import Experiment, plant_of
 
     trained = plant_of(config.load(Experiment, config.find("train", plant)))
@@ -87,6 +86,4 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
 
 def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:
     """Read logs, tables by the mapping of the setup ``name``. Raises LogError, ConfigError: as the readers and :func:`load`."""
-    from visthrow.logs import read_all
-
     return read_all(paths, load(name).table if name is not None else None)

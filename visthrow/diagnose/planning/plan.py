@@ -43,20 +43,6 @@ class Proposal:
     reference: str = ""  # file of its reference
 
 
-def pairs_of(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Members of classes, two by two: the named one against each partner."""
-    found = []
-    for f in diagnosis.findings:
-        if f.verdict == result.CLASS and f.name in diagnosis.theta:
-            found += [(f.name, partner) for partner in f.partners]
-    return found
-
-
-def unclear(diagnosis: Diagnosis) -> list[str]:
-    """Effects that the flights could not show."""
-    return [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
-
-
 class Aim:
     """What the flights to come are to settle, and what the information of one is worth for that."""
 
@@ -72,9 +58,11 @@ class Aim:
             if name not in self.names:
                 raise DiagnoseError(f"no effect '{name}' in this diagnosis; {suggest(name, self.names)}")
         number = self.names.index
-        self.pairs = [(number(a), number(b)) for a, b in pairs_of(diagnosis) if not about or {a, b} & set(about)]
+        classes = [f for f in diagnosis.findings if f.verdict == result.CLASS and f.name in diagnosis.theta]
+        self.pairs = [(number(f.name), number(other)) for f in classes for other in f.partners if not about or {f.name, other} & set(about)]
+        unclear = [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
         graded = [e.name for e, seen in zip(work.problem.model.effects, self.priors.visible) if seen and not e.switch]
-        self.vague = [] if self.pairs else [number(name) for name in about or unclear(diagnosis) or graded]
+        self.vague = [] if self.pairs else [number(name) for name in about or unclear or graded]
 
     def information(self, model: Model) -> np.ndarray:
         """Expected information of one simulated flight."""
@@ -96,7 +84,22 @@ class Aim:
                      len(self.vague))  # fmt: skip
 
     def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:
-        return _gap(self.diagnosis, self.base.information, self.base.score, new, self.priors, pair)
+        """Expected nats between two members after the new flight, with either as the truth; the smaller one.
+
+        A member that is already behind by more than a class allows is no truth to plan for.
+        """
+        information, score, priors, gaps = self.base.information, self.base.score, self.priors, []
+        rest = [j for j in self.diagnosis.work.active if j not in pair]
+        now = {j: log_evidence(information, score, priors, [*rest, j]) for j in pair}
+        for truth, other in (pair, pair[::-1]):
+            if now[truth] < now[other] - STRONG:
+                continue
+            theta = np.zeros(len(priors.floor))
+            for j in [*rest, truth]:
+                theta[j] = self.diagnosis.findings[j].estimate / priors.floor[j]
+            after, total = score + new @ theta, information + new
+            gaps.append(log_evidence(total, after, priors, [*rest, truth]) - log_evidence(total, after, priors, [*rest, other]))
+        return float(min(gaps))
 
     def _deviations(self, new: np.ndarray) -> np.ndarray:
         """Posterior deviation of each effect that is planned for, if it were named, with more information."""
@@ -179,36 +182,9 @@ def expected_information(
         expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
         part = integrals([gram], expected).shares([gram], expected)[0].information
         total[np.ix_(at, at)] += part[np.ix_(own, own)]
-    return total * np.outer(*[_ratio(model, names, priors)] * 2)
-
-
-def _ratio(model: Model, names: Sequence[str], priors: Priors) -> np.ndarray:
-    """The diagnosis' floors in the model's: both catalogues name the same effect, the floors may differ."""
-    floor = {e.name: e.floor for e in model.effects}
-    return np.array([priors.floor[i] / floor[name] if name in floor else 1.0 for i, name in enumerate(names)])
-
-
-def _gap(diagnosis: Diagnosis, information: np.ndarray, score: np.ndarray, new: np.ndarray, priors: Priors,
-         pair: tuple[int, int]) -> float:  # fmt: skip
-    """Expected nats between two members after the new flight, with either as the truth; the smaller one.
-
-    A member that is already behind by more than a class allows is no truth to plan for.
-    """
-    findings = {f.name: f for f in diagnosis.findings}
-    names = [f.name for f in diagnosis.findings]
-    rest = [j for j in diagnosis.work.active if j not in pair]
-    gaps = []
-    now = {j: log_evidence(information, score, priors, [*rest, j]) for j in pair}
-    for truth, other in (pair, pair[::-1]):
-        if now[truth] < now[other] - STRONG:
-            continue
-        theta = np.zeros(len(priors.floor))
-        for j in [*rest, truth]:
-            theta[j] = findings[names[j]].estimate / priors.floor[j]
-        after = score + new @ theta
-        total = information + new
-        gaps.append(log_evidence(total, after, priors, [*rest, truth]) - log_evidence(total, after, priors, [*rest, other]))
-    return float(min(gaps))
+    floor = {e.name: e.floor for e in model.effects}  # both catalogues name the same effect, the floors may differ
+    ratio = np.array([priors.floor[i] / floor[name] if name in floor else 1.0 for i, name in enumerate(names)])
+    return total * np.outer(ratio, ratio)
 
 
 def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from visthrow.common.arguments import add_out
+from visthrow.common.errors import DiagnoseError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +26,6 @@ def run(args: argparse.Namespace) -> int:
     """Search once, hide, print, write."""
     import dataclasses
 
-    from visthrow.common.errors import DiagnoseError
     from visthrow.common.storage import atomic_write, write_json
     from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.reporting import blind, pictures

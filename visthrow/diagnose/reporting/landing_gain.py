@@ -1,6 +1,6 @@
 """What named causes do to predicted landings, on throws that were held out where there are enough."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +43,8 @@ def landing_gain(
     flown = sorted({w.flight for w in work.after.windows})
     plain = model.landings({}, flown)
     named = model.landings(theta, flown) if theta else plain
-    held = joined([model.landings(trained[int(f)], [int(f)]) for f in plain.flights]) if trained else named
+    parts = [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]
+    held = Landings(*(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts))))
     good = np.isfinite(plain.errors) & np.isfinite(held.errors)
     if not good.any():
         return None
@@ -58,9 +59,3 @@ def landing_gain(
     return LandingGain(
         int(good.sum()), bool(trained), float(plain.errors[good].mean()), after.value, after.low, after.high, *released, moved, *off
     )
-
-
-def joined(parts: Sequence[Landings]) -> Landings:
-    """Landings of several sets of throws in one."""
-    names = ("flights", "measured", "predicted", "released")
-    return Landings(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

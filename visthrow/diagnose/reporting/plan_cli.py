@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from visthrow.common.arguments import add_out
+from visthrow.common.errors import DiagnoseError, suggest
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +31,6 @@ def run(args: argparse.Namespace) -> int:
     """Search, simulate the manoeuvres, optimise, rank, write."""
     import dataclasses
 
-    from visthrow.common.errors import DiagnoseError
     from visthrow.common.storage import atomic_write, write_json
     from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.planning import design, excitation, plan
@@ -73,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _limits(args: argparse.Namespace):
-    from visthrow.common.errors import DiagnoseError
     from visthrow.diagnose.planning.design import Limits
 
     try:
@@ -84,7 +83,6 @@ def _limits(args: argparse.Namespace):
 
 
 def _chosen(names: str | None):
-    from visthrow.common.errors import DiagnoseError, suggest
     from visthrow.diagnose.planning import manoeuvres
 
     known = {m.name: m for m in manoeuvres.catalogue()}

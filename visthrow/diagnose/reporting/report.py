@@ -13,7 +13,7 @@ from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain
 from visthrow.diagnose.reporting.landing_gain import LandingGain
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 
@@ -40,7 +40,11 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
 
 def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]]:
     """What was found, each with the word that it stands under."""
-    found = [(f.verdict, f.sentence + _moves(f, gain) + _next(f)) for f in diagnosis.findings if f.verdict in result.NAMED]
+    moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
+    moves = {name: f" It moves landings by {1e3 * size:.0f} mm." for name, size in moved.items()}
+    named = [f for f in diagnosis.findings if f.verdict in result.NAMED]
+    apart = {f.name: f" To tell them apart: {'; '.join(f.manoeuvres)}." for f in named if f.partners and f.manoeuvres}
+    found = [(f.verdict, f.sentence + moves.get(f.name, "") + apart.get(f.name, "")) for f in named]
     found += [("OR", line) for line in instead(diagnosis)]
     found += [("FOUND", m.sentence) for m in diagnosis.mistakes]
     found += [("VARIES", s.sentence) for s in diagnosis.scatter if s.found]
@@ -101,11 +105,6 @@ def instead(diagnosis: Diagnosis) -> list[str]:
     return lines
 
 
-def _moves(finding: Finding, gain: Gain | None) -> str:
-    moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
-    return f" It moves landings by {1e3 * moved[finding.name]:.0f} mm." if finding.name in moved else ""
-
-
 def to_json(
     diagnosis: Diagnosis, gain: Gain | None = None, blind: Blind | None = None, extra: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -136,10 +135,12 @@ def sections(
     if gain is not None:
         made.append(_gain(gain, diagnosis))
     if diagnosis.steps:
+        rows = tuple((", ".join(names) or "nothing", f"{behind:.1f}") for names, behind in diagnosis.sets)
+        alike = [Grid("Sets of causes that explain the flights as well", ("set", "nats behind"), rows)] if len(rows) > 1 else []
         text = Text("Nats of evidence that each candidate would bring, or a set in place of the names before; as a line what it "
                     "must exceed; marks: with the simulation run again (circle: taken, triangle: beaten).")  # fmt: skip
         made.append(Section("ladder", "Candidates", (text, Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates."),
-                                                     *_alternatives(diagnosis))))  # fmt: skip
+                                                     *alike)))  # fmt: skip
     if diagnosis.levels:
         made.append(_levels(diagnosis))
     if diagnosis.laws:
@@ -150,8 +151,7 @@ def sections(
             "confusion", pictures.confusion(diagnosis), "Correlation of the estimates with every effect free."),)))  # fmt: skip
     if blind is not None:
         made.append(_blind(blind, diagnosis))
-    following = _next_flights(diagnosis)
-    made += [following] if following is not None else []
+    made += _next_flights(diagnosis)
     made.append(_ground(diagnosis, step_check, about))
     return made
 
@@ -176,10 +176,6 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     return Section("verdict", "Verdict", tuple(parts))
 
 
-def _next(finding: Finding) -> str:
-    return f" To tell them apart: {'; '.join(finding.manoeuvres)}." if finding.partners and finding.manoeuvres else ""
-
-
 def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
     title = "Gain on flights that were not used"
     rows = []
@@ -198,13 +194,6 @@ def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
         return Section("gain", title, (grid,))
     caption = "Error over the time in the window." if gain.whole else "Error over the horizon of the prediction."
     return Section("gain", title, (grid, Picture("horizons", pictures.horizons(gain), caption)))
-
-
-def _alternatives(diagnosis: Diagnosis) -> tuple[Grid, ...]:
-    if len(diagnosis.sets) < 2:
-        return ()
-    rows = tuple((", ".join(names) or "nothing", f"{behind:.1f}") for names, behind in diagnosis.sets)
-    return (Grid("Sets of causes that explain the flights as well", ("set", "nats behind"), rows),)
 
 
 def _levels(diagnosis: Diagnosis) -> Section:
@@ -249,19 +238,18 @@ def _blind(blind: Blind, diagnosis: Diagnosis) -> Section:
     return Section("blind", "What these flights can detect", parts)
 
 
-def _next_flights(diagnosis: Diagnosis) -> Section | None:
-    """Manoeuvres that the catalogue names for what stays open; None where nothing does."""
+def _next_flights(diagnosis: Diagnosis) -> list[Section]:
+    """Manoeuvres that the catalogue names for what stays open."""
     open_ones = (result.CLASS, result.NOT_IDENTIFIABLE)
     serves: dict[str, list[str]] = {}
     for f in diagnosis.findings:
         for manoeuvre in f.manoeuvres if f.verdict in open_ones else ():
             serves.setdefault(manoeuvre, []).append(f.name)
-    if not serves:
-        return None
     ranked = sorted(serves.items(), key=lambda item: -len(item[1]))
     rows = tuple((manoeuvre, ", ".join(names)) for manoeuvre, names in ranked)
     note = "`visthrow diagnose plan` simulates them in these flights' model and ranks them by what they would tell."
-    return Section("plan", "What to fly next", (Grid("Manoeuvres", ("manoeuvre", "would show or separate"), rows, note),))
+    grid = Grid("Manoeuvres", ("manoeuvre", "would show or separate"), rows, note)
+    return [Section("plan", "What to fly next", (grid,))] if rows else []
 
 
 def _ground(diagnosis: Diagnosis, step_check: Mapping[str, float] | None, about: Mapping[str, Any] | None) -> Section:

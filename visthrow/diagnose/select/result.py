@@ -1,7 +1,7 @@
 """What a diagnosis says: one verdict for every effect, one overall, and the way that led there. Plain data, ready for JSON."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from visthrow.diagnose.select.scatter import Scatter
@@ -163,8 +163,6 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """All but ``work``, for JSON."""
-        fields = {name: value for name, value in vars(self).items() if name != "work"}
-        plain = {name: [asdict(v) for v in fields[name]] for name in ("findings", "steps", "levels", "laws", "scatter", "mistakes")}
-        plain["explanations"] = [[asdict(law) for law in laws] for laws in self.explanations]
-        held = None if self.held_out is None else asdict(self.held_out)
-        return {**fields, **plain, "held_out": held}
+        plain = asdict(replace(self, work=None))
+        del plain["work"]
+        return plain

@@ -49,12 +49,6 @@ class Mistake:
         return FlightLog({**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta)
 
 
-def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
-    """Logs of autopilots with commands made of their throttle, and what was made."""
-    mended, found = _from_throttle(logs, GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass))
-    return mended, tuple(found)
-
-
 def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     """What may be wrong with the commands of all logs, in the order in which it is put right; not weighed yet."""
     found: list[Mistake] = []
@@ -69,12 +63,13 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     return found if mistake is None else [*found, mistake]
 
 
-def _from_throttle(logs: Sequence[FlightLog], weight: float) -> tuple[list[FlightLog], list[Mistake]]:
-    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly.
+def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
+    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly, and what was made.
 
     Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h of full throttle. The slope
     s is fitted where an accelerometer tells the force and the throttle varies enough, else it is 1.
     """
+    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     made, shares = list(logs), []
     for i, log in enumerate(logs):
         if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
@@ -91,11 +86,11 @@ def _from_throttle(logs: Sequence[FlightLog], weight: float) -> tuple[list[Fligh
         made[i] = _between(FlightLog({**log.channels, "command": command}, log.meta), start, end)
         shares.append((hover, slope))
     if not shares:
-        return made, []
+        return made, ()
     hover, slope = np.median(shares, axis=0)
     cause = "Commanded thrust is a throttle, calibrated by the weight that it carries in flight"
     equation = f"thrust = {weight:.3f} N (1 + {slope:.2f} (throttle / {hover:.3f} - 1))"
-    return made, [Mistake("throttle", cause, equation, 0.0, len(shares))]
+    return made, (Mistake("throttle", cause, equation, 0.0, len(shares)),)
 
 
 def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
@@ -138,24 +133,23 @@ def _followed(log: FlightLog) -> relations.Relation | None:
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
         return None
-    command = log["command"]
-    time, rate = relations.rates_of(attitude.time[attitude.valid], np.asarray(attitude.values, dtype=float)[attitude.valid])
-    wanted = np.asarray(command.values, dtype=float)[command.valid, 1:]
+    time, rate = relations.rates_of(*attitude.samples())
+    asked, wanted = log["command"].samples()
+    wanted = wanted[:, 1:]
     if len(time) < 50 or len(wanted) < 20 or np.max(np.std(rate, axis=0)) < MOVES:
         return None
-    found = relations.relate(command.time[command.valid], wanted, time, rate)
+    found = relations.relate(asked, wanted, time, rate)
     return found if found is not None and found.axes_correlation > FOLLOWS else None
 
 
 def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
     """Exchanged or turned axes of the commanded rates, where all logs that say so say the same, and they are most."""
     clear = [r for r in relation if r.nats > 0.0]
-    names = {r.axes for r in clear}
-    if len(names) != 1 or 2 * len(clear) < len(relation):
+    if len({r.axes for r in clear}) != 1 or 2 * len(clear) < len(relation):
         return None
-    text = names.pop()
-    axes = text.split(",")
-    turned = sorted(axis[-1] for axis in axes) == [axis[-1] for axis in axes]
+    text = clear[0].axes
+    axes = [axis[-1] for axis in text.split(",")]
+    turned = sorted(axes) == axes
     name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
     change = np.eye(4)
     change[1:, 1:] = matrix_of(text)

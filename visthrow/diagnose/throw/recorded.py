@@ -74,7 +74,7 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
     channel = measured(log, name)
     if channel is None:
         return None
-    time, values = channel.time[channel.valid], np.asarray(channel.values, dtype=float)[channel.valid]
+    time, values = channel.samples()
     step = resolution(values)
     fresh = np.ones(len(time), dtype=bool)
     fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
@@ -110,14 +110,13 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
             f"flight {number} holds no {' and no '.join(missing)}; a replay needs command, pos_w and quat_wb; "
             f"it has {', '.join(sorted(log.channels))}"
         )
-    command, pos, quat = log["command"], _samples(log, "pos_w"), _samples(log, "quat_wb")
+    pos, quat, (landing, landing_point) = _samples(log, "pos_w"), _samples(log, "quat_wb"), _landing(log)
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _paired(pos, quat, number)
     return Recorded(
-        command.time[command.valid], np.asarray(command.values, dtype=float)[command.valid], _latch(log), _landing(log),
-        pos, quat, _payload(log), _samples(log, "rate_b"),
-        _voltage(log), _hanging(log), _landing_point(log),
+        *log["command"].samples(), _latch(log), landing, pos, quat, _payload(log, landing), _samples(log, "rate_b"),
+        _voltage(log), _hanging(log), landing_point,
     )  # fmt: skip
 
 
@@ -160,14 +159,16 @@ def _latch(log: FlightLog) -> float:
     if "release_command" not in log:
         return NEVER
     channel = log["release_command"]
-    asked = np.flatnonzero(channel.valid & (np.asarray(channel.values, dtype=float) > 0.5))
+    asked = np.flatnonzero(channel.valid & (channel.values > 0.5))
     return float(channel.time[asked[0]]) if len(asked) else NEVER
 
 
-def _landing(log: FlightLog) -> float:
+def _landing(log: FlightLog) -> tuple[float, np.ndarray | None]:
+    """Time and point of the payload's landing."""
     if "landing" in log and np.any(log["landing"].valid):
-        return float(log["landing"].time[log["landing"].valid][0])
-    return NEVER
+        time, points = log["landing"].samples()
+        return float(time[0]), points[0]
+    return NEVER, None
 
 
 def _voltage(log: FlightLog) -> float | None:
@@ -175,19 +176,13 @@ def _voltage(log: FlightLog) -> float | None:
     channel = measured(log, "battery_voltage")
     if channel is None:
         return None
-    time = channel.time[channel.valid]
-    return float(np.median(channel.values[channel.valid][time < time[0] + AT_START]))
+    time, volts = channel.samples()
+    return float(np.median(volts[time < time[0] + AT_START]))
 
 
-def _landing_point(log: FlightLog) -> np.ndarray | None:
-    if "landing" in log and np.any(log["landing"].valid):
-        return np.asarray(log["landing"].values[log["landing"].valid][0], dtype=float)
-    return None
-
-
-def _payload(log: FlightLog) -> Samples | None:
+def _payload(log: FlightLog, landing: float) -> Samples | None:
     samples = _samples(log, "payload_pos_w")
     if samples is None:
         return None
-    keep = samples.time < _landing(log) - 1e-3
+    keep = samples.time < landing - 1e-3
     return Samples(samples.time[keep], samples.values[keep], samples.sigma) if np.count_nonzero(keep) >= 5 else None
