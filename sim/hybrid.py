@@ -45,12 +45,8 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
     """
     if z.tether_variants < 1:
         raise ValueError(f"tether_variants {z.tether_variants}; expected 1 or more")
-    factors = (
-        [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
-    )
-    return [
-        dataclasses.replace(rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)) for f in factors
-    ]
+    factors = [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
+    return [dataclasses.replace(rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)) for f in factors]
 
 
 def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
@@ -68,10 +64,7 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
     )
     return [
         dataclasses.replace(
-            r,
-            payload_mass=r.payload_mass * float(m),
-            payload_inertia=r.payload_inertia * float(m),
-            payload_drag=r.payload_drag * float(d),
+            r, payload_mass=r.payload_mass * float(m), payload_inertia=r.payload_inertia * float(m), payload_drag=r.payload_drag * float(d)
         )
         for d in drags
         for m in masses

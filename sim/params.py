@@ -295,6 +295,16 @@ class RopeParams:
                 raise ValueError(f"rope.{name} is {getattr(self, name)}; expected a finite value")
 
     @property
+    def segment_length(self) -> float:
+        """Of each segment [m]."""
+        return self.length / self.segments
+
+    @property
+    def segment_mass(self) -> float:
+        """Of each segment [kg]."""
+        return self.rope_mass / self.segments
+
+    @property
     def hanging_mass(self) -> float:
         """Mass of rope and payload [kg]."""
         return self.rope_mass + self.payload_mass

@@ -10,10 +10,9 @@ import warp as wp
 
 from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
-from sim.kernels.quadrotor.queue import push, queue_depth, split_delay
+from sim.kernels.quadrotor.queue import held, push, queue_depth, split_delay
 from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration, blend, build_flow
 from sim.kernels.quadrotor.start import build_start
-from sim.kernels.step import SPEED_LIMIT
 from sim.kernels.structs import Types, extensions_of, kinds_of, pack, pack_vehicle, types
 from sim.params import GRAVITY, AirParams, VehicleParams
 
@@ -62,20 +61,13 @@ def build_quad_step(t: Types, flow, rate, motor_advance, integrator: str):
 
 def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions: frozenset[str]):
     """Step and reset kernels for one choice of blocks, and their structs of state and start arrays."""
-    real, vec3, vec4, Vehicle, Air, QuadState = t.real, t.vec3, t.vec4, t.Vehicle, t.Air, t.QuadState
+    real, vec3, vec4, Vehicle, Air = t.real, t.vec3, t.vec4, t.Vehicle, t.Air
     State = st.array_struct(t, "QuadArrays", FIELDS)
     Start = st.array_struct(t, "QuadStart", START_FIELDS)
     load, store = st.build_access(t, State)
     begin = build_start(t, vehicle, State)
     integrate = build_quad_step(t, *build_flow(t, vehicle, extensions), integrator)
-    limit = real(SPEED_LIMIT)
-
-    @wp.func
-    def sane(s: QuadState):
-        """Finite and below the speed limit; a comparison with NaN is false."""
-        total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * real(1.0e-3)
-        total += wp.abs(s.voltage) + wp.length(s.motor_speed) * real(1.0e-3) + wp.length(s.integral)
-        return total + wp.length(s.setpoint) + wp.length(s.gyro) + wp.abs(s.charge_used) < limit
+    limit = real(st.SPEED_LIMIT)
 
     @wp.kernel(module="unique", enable_backward=False)
     def quad_step_kernel(
@@ -98,24 +90,18 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions:
         g = vec3(real(0.0), real(0.0), -gravity)
         s = load(state, env)
         taken = push(state.queue, env, command[env])
-        depth = state.queue.shape[0]
         whole, switch = split_delay(p, period)
         tiny = real(1.0e-6)
         time = real(0.0)
         while time < period - tiny:
-            until = period
-            slot = whole
-            if time < switch - tiny:
-                until = wp.min(until, switch)
-                slot = whole + 1
+            active, until = held(state.queue, env, whole, switch, time, period)
             count = int(wp.ceil((until - time) / largest_step - real(1.0e-3)))
             h = (until - time) / real(float(count))
-            active = state.queue[wp.min(slot, depth - 1), env]
             for _k in range(count):
                 s = integrate(p, air, s, active, force_w[env], torque_b[env], g, h)
             time = until
         status = int(0)
-        if sane(s):
+        if st.size(s) < limit:  # false for NaN
             store(state, env, s)
         else:
             status = 1

@@ -25,8 +25,7 @@ class TorchViews:
         self.goal_w = wp.to_torch(sim.goal_w, requires_grad=False)
         self.state = {name: wp.to_torch(getattr(sim.state, name), requires_grad=False) for name in st.STATE_FIELDS}
         self.out, self.foreseen = (
-            {name: wp.to_torch(getattr(out, name), requires_grad=False) for name in st.OUTPUT_FIELDS}
-            for out in (sim.out, sim.foreseen)
+            {name: wp.to_torch(getattr(out, name), requires_grad=False) for name in st.OUTPUT_FIELDS} for out in (sim.out, sim.foreseen)
         )
 
 

@@ -196,8 +196,7 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
         unknown = [name for name in law.factors if name not in scalars]
         if law.block not in BLOCKS or unknown or law.vector not in vectors[law.block] or len(law.factors) > 2:
             raise ValueError(
-                f"law {law}; expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of "
-                f"{vectors.get(law.block, BLOCKS)}"
+                f"law {law}; expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of {vectors.get(law.block, BLOCKS)}"
             )
 
 

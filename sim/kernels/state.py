@@ -5,6 +5,7 @@ read neighbouring memory.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -52,14 +53,10 @@ OUTPUT_FIELDS = {
 def array_struct(t: Types, name: str, fields: dict[str, tuple[str, bool]]) -> type:
     """Warp struct that holds one array per field."""
     scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
-    return make_struct(
-        name, {k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1) for k, (kind, rows) in fields.items()}
-    )
+    return make_struct(name, {k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1) for k, (kind, rows) in fields.items()})
 
 
-def allocate(
-    t: Types, struct: type, fields: dict[str, tuple[str, bool]], count: int, rows: dict[str, int], device: str
-):
+def allocate(t: Types, struct: type, fields: dict[str, tuple[str, bool]], count: int, rows: dict[str, int], device: str):
     """Zeroed arrays of shape (E,), or (rows[name], E), in an instance of ``struct``."""
     scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
     out = struct()
@@ -92,6 +89,18 @@ def fetched(array: wp.array, rows: bool) -> np.ndarray:
     """Copy of a device array, environment first; ``rows``: it stands row first on the device."""
     value = array.numpy()  # on the CPU a view of the simulator's memory
     return np.array(np.swapaxes(value, 0, 1) if rows else value)
+
+
+SPEED_LIMIT = 1000.0  # of `size` [m/s], [rad/s]: beyond it a state is broken, not fast
+
+
+@wp.func
+def size(s: Any):
+    """Sum of the sizes of a vehicle's state, which is not below any limit where a part of it is NaN."""
+    milli = type(s.voltage)(1.0e-3)
+    total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * milli
+    total += wp.abs(s.voltage) + wp.length(s.motor_speed) * milli
+    return total + wp.length(s.setpoint) + wp.length(s.gyro) + wp.length(s.integral) + wp.abs(s.charge_used)
 
 
 def build_access(t: Types, State: type):

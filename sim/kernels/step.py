@@ -10,7 +10,7 @@ import warp as wp
 
 from sim.kernels import state as st
 from sim.kernels.laws import build_laws
-from sim.kernels.quadrotor.queue import push, split_delay
+from sim.kernels.quadrotor.queue import held, push, split_delay
 from sim.kernels.quadrotor.rigid_body import build_direct_flow, build_flow
 from sim.kernels.rope import release as rel
 from sim.kernels.rope.chain import build_chain
@@ -18,8 +18,6 @@ from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.payload import build_flight, build_payload
 from sim.kernels.structs import Types
 from sim.params import PlantParams
-
-SPEED_LIMIT = 1000.0  # [m/s], [rad/s]: beyond it a state is broken, not fast
 
 
 @dataclass(frozen=True)
@@ -62,17 +60,15 @@ def build_step(
     ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
     leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
-    vec3_limit = real(SPEED_LIMIT)
+    limit = real(st.SPEED_LIMIT)
 
     @wp.func
     def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
         """Finite and below the speed limit; a comparison with NaN is false."""
-        total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * real(1.0e-3)
-        total += wp.abs(s.voltage) + wp.length(s.motor_speed) * real(1.0e-3)
-        total += wp.length(s.setpoint) + wp.length(s.gyro) + wp.length(s.integral) + wp.abs(s.charge_used)
+        total = st.size(s)
         for i in range(L):
             total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
-        return total < vec3_limit
+        return total < limit
 
     @wp.func
     def load_rope(
@@ -157,7 +153,6 @@ def build_step(
         s = load(state, env)
 
         taken = push(state.queue, env, command[env])
-        depth = state.queue.shape[0]
         whole, switch = split_delay(p, period)
         timer = state.release_timer[env]
         attached = state.attached[env]
@@ -175,24 +170,17 @@ def build_step(
             separate(p, rope, r, air, s, n, u, gravity, out, env, time)
             attached = int(0)
         while time < period - tiny:
-            until = period
-            slot = whole
-            if time < switch - tiny:
-                until = wp.min(until, switch)
-                slot = whole + 1
+            active, until = held(state.queue, env, whole, switch, time, period)
             if attached != 0 and timer > time + tiny:
                 until = wp.min(until, timer)
             count = int(wp.ceil((until - time) / substep - real(1.0e-3)))
             h = (until - time) / real(float(count))
-            active = state.queue[wp.min(slot, depth - 1), env]
             for k in range(count):
                 if attached != 0:
                     rope = chain.stretched(natural, rope, stiffness, u, h)
                 now = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
-                    s, total, fell_back = coupled.step(
-                        p, rope, now, s, total, active, n, u, stiffness, g, gamma, max_turn, h
-                    )
+                    s, total, fell_back = coupled.step(p, rope, now, s, total, active, n, u, stiffness, g, gamma, max_turn, h)
                     if fell_back:
                         status = status | fallback
                 else:

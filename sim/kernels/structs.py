@@ -8,7 +8,6 @@ import dataclasses
 import typing
 from collections.abc import Iterable
 from functools import lru_cache
-from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -112,12 +111,6 @@ def _fill(row: np.void, value) -> None:
             row[f.name] = item
 
 
-def mixer_columns(rotors: P.RotorParams, torque_ratio: float) -> SimpleNamespace:
-    """Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each of shape (4,)."""
-    x, y, s = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
-    return SimpleNamespace(roll=y / (4 * np.mean(y**2)), pitch=-x / (4 * np.mean(x**2)), yaw=s / (4 * torque_ratio))
-
-
 def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
     """Kinds of controller, motor, battery and aerodynamics: what a kernel is built for."""
     return vehicle.controller.kind, vehicle.motor.kind, vehicle.battery.kind, vehicle.aero.kind
@@ -177,28 +170,21 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
         vehicles: one for all environments, or one each.
         kinds: of the blocks that the kernel was built for.
     """
-    rows = np.zeros(len(vehicles), dtype=_numpy_type(t.Vehicle))
+    rows = pack(t.Vehicle, *vehicles)
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
-            raise ValueError(
-                f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same blocks"
-            )
-        P.require_positive("vehicle.thrust", torque_ratio=vehicle.thrust.torque_ratio)  # the mixer divides by it
-        _fill(row, vehicle)
-        _place_rotors(row, vehicle)
-        columns = mixer_columns(vehicle.rotors, vehicle.thrust.torque_ratio)
-        for name in ("roll", "pitch", "yaw"):
-            row["mixer"][name] = getattr(columns, name)
+            raise ValueError(f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same blocks")
+        rotors, thrust = vehicle.rotors, vehicle.thrust
+        P.require_positive("vehicle.thrust", torque_ratio=thrust.torque_ratio)  # the mixer divides by it
+        # Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each of shape (4,).
+        x, y, spin = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
+        row["mixer"]["roll"], row["mixer"]["pitch"] = y / (4 * np.mean(y**2)), -x / (4 * np.mean(x**2))
+        row["mixer"]["yaw"] = spin / (4 * thrust.torque_ratio)
+        # Arms about the centre of mass, and the drag torque as the rotors have it, not as the controller knows it.
+        for name, com in zip("xyz", vehicle.body.com, strict=True):
+            row["rotors"][name] = np.asarray(getattr(rotors, name)) - com
+        row["thrust"]["torque_ratio"] = thrust.torque_ratio * thrust.torque_gain
     return rows
-
-
-def _place_rotors(row: np.void, vehicle: P.VehicleParams) -> None:
-    """Arms about the centre of mass, and the drag torque as the rotors have it, not as the controller knows it."""
-    com = np.asarray(vehicle.body.com)
-    row["rotors"]["x"] = np.asarray(vehicle.rotors.x) - com[0]
-    row["rotors"]["y"] = np.asarray(vehicle.rotors.y) - com[1]
-    row["rotors"]["z"] = vehicle.rotors.z - com[2]
-    row["thrust"]["torque_ratio"] = vehicle.thrust.torque_ratio * vehicle.thrust.torque_gain
 
 
 def pack(struct: type, *values) -> np.ndarray:
@@ -225,16 +211,11 @@ def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list
     coms = [v.body.com for v in vehicles]
     if len(set(coms)) > 1:
         if len(ropes) not in (1, len(vehicles)):
-            raise ValueError(
-                f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass; expected one rope, or one each"
-            )
+            raise ValueError(f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass; expected one rope, or one each")
         ropes = ropes * len(vehicles) if len(ropes) == 1 else ropes
     else:
         coms = coms[:1] * len(ropes)
-    return [
-        dataclasses.replace(rope, mount=tuple(m - c for m, c in zip(rope.mount, com)))
-        for rope, com in zip(ropes, coms, strict=True)
-    ]
+    return [dataclasses.replace(rope, mount=tuple(m - c for m, c in zip(rope.mount, com))) for rope, com in zip(ropes, coms, strict=True)]
 
 
 def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
@@ -242,20 +223,13 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
 
     The last rod carries the payload: its mass, centre and transverse inertia about its upper joint are combined here.
     """
-    rows = np.zeros(len(ropes), dtype=_numpy_type(t.Rope))
+    rows = pack(t.Rope, *ropes)
     for row, rope in zip(rows, ropes, strict=True):
-        length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
-        ball = length + rope.payload_offset
-        last_mass = mass + rope.payload_mass
+        length, mass = rope.segment_length, rope.segment_mass
+        ball, last_mass = length + rope.payload_offset, mass + rope.payload_mass
         row["segment_length"], row["segment_mass"], row["segment_inertia"] = length, mass, mass * length**2 / 3
         row["last_mass"], row["last_center"] = last_mass, (mass * length / 2 + rope.payload_mass * ball) / last_mass
-        row["last_inertia"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2
-        row["payload_offset"], row["payload_radius"] = rope.payload_offset, rope.payload_radius
-        row["payload_arm"], row["payload_mass"], row["payload_drag"] = ball, rope.payload_mass, rope.payload_drag
-        row["joint_damping"], row["mount"] = rope.joint_damping, rope.mount
-        row["mount_damping"], row["swing_damping"] = rope.mount_damping, rope.swing_damping
-        row["downwash"], row["compliance"] = rope.downwash, rope.compliance
-        row["payload_side"], row["payload_lift"] = rope.payload_side, rope.payload_lift
+        row["last_inertia"], row["payload_arm"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2, ball
         row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
         row["total_mass"] = rope.hanging_mass
     return rows

@@ -113,9 +113,7 @@ def betaflight(
     torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * setpoint_dot
     relative = voltage / vehicle.battery.reference_voltage
     f_max = gains.max_thrust * relative**2
-    thrusts, tilt_share, yaw_share = mixer(
-        command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
-    )
+    thrusts, tilt_share, yaw_share = mixer(command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max)
     integral_dot = np.array(gains.i_gain) * (setpoint - rate)
     growing = integral_dot * integral > 0.0
     full = np.abs(integral) >= np.array(gains.integral_limit)
@@ -223,12 +221,7 @@ def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarra
 
 
 def aerodynamics(
-    params: AeroParams,
-    arms: np.ndarray,
-    torque_ratio: float,
-    thrust: np.ndarray,
-    air_velocity_b: np.ndarray,
-    rate: np.ndarray,
+    params: AeroParams, arms: np.ndarray, torque_ratio: float, thrust: np.ndarray, air_velocity_b: np.ndarray, rate: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return what the relative air adds.
 
@@ -250,9 +243,7 @@ def aerodynamics(
     force = -np.array([params.drag_x, params.drag_y, params.drag_z]) * v
     force = force - params.parasitic * np.linalg.norm(v, axis=1, keepdims=True) * v
     hub = v[:, None, :] + cross(rate[:, None, :], arms)
-    thrust_change = thrust * (
-        -params.inflow * hub[..., 2] + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2)
-    )
+    thrust_change = thrust * (-params.inflow * hub[..., 2] + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2))
     torque_change = torque_ratio * thrust * (-params.torque_inflow * hub[..., 2])
     total = thrust.sum(axis=1)
     flapping = params.flapping * total[:, None] * np.stack((-v[:, 1], v[:, 0], np.zeros_like(total)), -1)

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from sim.reference.model import RopeModel, add_chain, add_vehicle, new_spec
+from sim.params import BodyParams, RopeParams
+from sim.reference.model import add_chain, add_vehicle, new_spec
 from sim.reference.state import Root
 
 ROPE_STEP = 5e-4
@@ -63,22 +64,23 @@ class MujocoBodies:
         self._batch.step(nstep=steps, stage=int(mujoco.mjtStage.mjSTAGE_POS))
 
 
-def rope_and_ball(rope: RopeModel) -> "mujoco.MjModel":
+def rope_and_ball(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
     """The batched simulator's own payload: a chain of rods with a ball at its end."""
-    spec = new_spec(rope.gravity)
-    add_chain(spec, rope, add_vehicle(spec, rope), list(rope.mount), "universal", 0.0, None, free_root=False)
+    spec = new_spec()
+    add_chain(spec, rope, add_vehicle(spec, body), list(rope.mount), "universal", 0.0, None, free_root=False)
     return spec.compile()
 
 
-def rope_and_box(rope: RopeModel, sides: Sequence[float]) -> "mujoco.MjModel":
+def rope_and_box(body: BodyParams, rope: RopeParams, sides: Sequence[float]) -> "mujoco.MjModel":
     """A box at the end of the chain, which swings about its upper face by a universal joint.
 
     Args:
+        body: Mass and inertia of the vehicle.
         rope: Masses and lengths; the payload's mass is the box's, its inertia and offset follow from the sides.
         sides: Of the box, homogeneous [m], shape (3,).
     """
-    spec = new_spec(rope.gravity)
-    last = add_chain(spec, rope, add_vehicle(spec, rope), list(rope.mount), "universal", 0.0, None, free_root=False, load=False)
+    spec = new_spec()
+    last = add_chain(spec, rope, add_vehicle(spec, body), list(rope.mount), "universal", 0.0, None, free_root=False, load=False)
     box = last.add_body(name="box", pos=[0.0, 0.0, -rope.segment_length])
     for name, axis in (("box_y", [0, 1, 0]), ("box_x", [1, 0, 0])):
         box.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis).damping[0] = rope.joint_damping
@@ -86,17 +88,18 @@ def rope_and_box(rope: RopeModel, sides: Sequence[float]) -> "mujoco.MjModel":
     return spec.compile()
 
 
-def two_cables(rope: RopeModel, sides: Sequence[float], apart: float, length: float) -> "mujoco.MjModel":
+def two_cables(body: BodyParams, rope: RopeParams, sides: Sequence[float], apart: float, length: float) -> "mujoco.MjModel":
     """A box on two cables without mass, side by side along the vehicle's x axis; a cable pulls or is slack.
 
     Args:
-        rope: Of it vehicle, mount and the payload's mass.
+        body: Mass and inertia of the vehicle.
+        rope: Of it mount and the payload's mass.
         sides: Of the box, homogeneous [m], shape (3,).
         apart: Distance of the cables, on the vehicle and on the box [m].
         length: Of each cable [m].
     """
-    spec = new_spec(rope.gravity, constraints=True)
-    vehicle, (x, y, z) = add_vehicle(spec, rope), rope.mount
+    spec = new_spec(constraints=True)
+    vehicle, (x, y, z) = add_vehicle(spec, body), rope.mount
     box = spec.worldbody.add_body(name="box", pos=[x, y, z - length - 0.5 * sides[2]])
     box.add_freejoint(name="box")
     _as_box(box, rope.payload_mass, sides, 0.0)

@@ -16,15 +16,9 @@ class ReferenceExtras:
 
     payload_drag: float = 0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
     wind_mean_w: Vector = (0.0, 0.0, 0.0)  # world frame [m/s]
-    wind_sigma_w: Vector = (
-        0.0,
-        0.0,
-        0.0,
-    )  # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
+    wind_sigma_w: Vector = (0.0, 0.0, 0.0)  # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
     wind_time_constant: float = 1.0  # of that process [s]
-    stretch_stiffness: float = (
-        0.0  # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
-    )
+    stretch_stiffness: float = 0.0  # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
     stretch_damping: float = 0.0  # [N s/m]
     extra_joint_damping: float = 0.0  # added to RopeParams.joint_damping [N m s]
     com_offset: Vector = (0.0, 0.0, 0.0)  # centre of mass from the frame's origin, body frame [m]

@@ -14,41 +14,14 @@ Joint damping acts on the relative rate of a universal joint, which lies in the 
 none here: ``sim.reference.plant`` applies it as a couple.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
 
-from sim.params import GRAVITY, RopeParams, VehicleParams
+from sim.params import GRAVITY, BodyParams, RopeParams
 
 AXIAL_INERTIA = 1e-12
 """Inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it must not matter."""
-
-
-@dataclass(frozen=True)
-class RopeModel:
-    """Masses and lengths of one quadrotor with one rope; the same quantities as ``sim.params``."""
-
-    mass: float  # of the quadrotor [kg]
-    inertia: tuple[float, float, float]  # [kg m^2]
-    mount: tuple[float, float, float]  # body frame [m]
-    segments: int
-    segment_length: float  # [m]
-    segment_mass: float  # [kg]
-    payload_mass: float  # [kg]
-    payload_inertia: float  # transverse, about the payload's centre [kg m^2]
-    payload_offset: float  # payload's centre past the end of the last segment [m]
-    joint_damping: float  # [N m s]
-    gravity: float = GRAVITY  # [m/s^2]
-
-    @staticmethod
-    def of(vehicle: VehicleParams, rope: RopeParams) -> "RopeModel":
-        """Return those of a vehicle and its rope."""
-        body, count = vehicle.body, rope.segments
-        return RopeModel(
-            body.mass, body.inertia, rope.mount, count, rope.length / count, rope.rope_mass / count, rope.payload_mass,
-            rope.payload_inertia, rope.payload_offset, rope.joint_damping,
-        )  # fmt: skip
 
 
 def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]) -> None:
@@ -58,20 +31,18 @@ def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia:
     body.explicitinertial = True
 
 
-def _rod_inertial(
-    rope: RopeModel, last: bool, with_payload: bool, axial: float
-) -> tuple[float, float, tuple[float, float, float]]:
-    """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included on the last rod."""
+def _rod_inertial(rope: RopeParams, loaded: bool) -> tuple[float, float, tuple[float, float, float]]:
+    """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included on the loaded one."""
     mass, length = rope.segment_mass, rope.segment_length
     about_centre = mass * length**2 / 12.0
-    if not (last and with_payload):
-        return mass, -length / 2, (about_centre, about_centre, axial)
+    if not loaded:
+        return mass, -length / 2, (about_centre, about_centre, AXIAL_INERTIA)
     reach = length + rope.payload_offset
     total = mass + rope.payload_mass
     centre = (mass * length / 2 + rope.payload_mass * reach) / total
     transverse = about_centre + rope.payload_inertia
     transverse += mass * (centre - length / 2) ** 2 + rope.payload_mass * (reach - centre) ** 2
-    return total, -centre, (transverse, transverse, axial)
+    return total, -centre, (transverse, transverse, AXIAL_INERTIA)
 
 
 def _add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float) -> None:
@@ -84,21 +55,21 @@ def _add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float,
         joint.armature = armature
 
 
-def new_spec(gravity: float, constraints: bool = False) -> "mujoco.MjSpec":
+def new_spec(constraints: bool = False) -> "mujoco.MjSpec":
     """An empty model without contacts, and without other constraints unless they are asked for."""
     spec = mujoco.MjSpec()
-    spec.option.gravity = [0.0, 0.0, -gravity]
+    spec.option.gravity = [0.0, 0.0, -GRAVITY]
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     if not constraints:
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     return spec
 
 
-def add_vehicle(spec: "mujoco.MjSpec", rope: RopeModel) -> "mujoco.MjsBody":
+def add_vehicle(spec: "mujoco.MjSpec", body: BodyParams) -> "mujoco.MjsBody":
     """The quadrotor on a free joint, with actuators for force and torque in its own frame."""
     vehicle = spec.worldbody.add_body(name="vehicle")
     vehicle.add_freejoint(name="root")
-    _set_inertial(vehicle, rope.mass, 0.0, rope.inertia)
+    _set_inertial(vehicle, body.mass, 0.0, body.inertia)
     vehicle.add_site(name="centre")
     # Forces in the body frame as actuators on a site: MuJoCo turns them with the body in every stage of RK4, an
     # applied world force it would hold for the whole step.
@@ -110,7 +81,8 @@ def add_vehicle(spec: "mujoco.MjSpec", rope: RopeModel) -> "mujoco.MjsBody":
 
 
 def build_attached(
-    rope: RopeModel,
+    body: BodyParams,
+    rope: RopeParams,
     joints: Literal["universal", "ball"] = "universal",
     armature: float = 0.0,
     stretch: tuple[float, float] | None = None,
@@ -118,6 +90,7 @@ def build_attached(
     """Build the quadrotor with its rope.
 
     Args:
+        body: mass and inertia of the quadrotor.
         rope: masses and lengths.
         joints: kind of the rope's joints.
         armature: reflected inertia added to every hinge [kg m^2]; 0 is the physical model.
@@ -126,22 +99,21 @@ def build_attached(
     Returns:
         Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
     """
-    spec = new_spec(rope.gravity)
-    parent, anchor = add_vehicle(spec, rope), list(rope.mount)
-    add_chain(spec, rope, parent, anchor, joints, armature, stretch, free_root=False)
+    spec = new_spec()
+    add_chain(spec, rope, add_vehicle(spec, body), list(rope.mount), joints, armature, stretch, free_root=False)
     return spec.compile()
 
 
-def build_free(rope: RopeModel, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
+def build_free(rope: RopeParams, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
     """Build the rope and the payload alone: first rod on a free joint, ball joints below."""
-    spec = new_spec(rope.gravity)
+    spec = new_spec()
     add_chain(spec, rope, spec.worldbody, [0.0, 0.0, 0.0], "ball", 0.0, stretch, free_root=True)
     return spec.compile()
 
 
 def add_chain(
     spec: "mujoco.MjSpec",
-    rope: RopeModel,
+    rope: RopeParams,
     parent: "mujoco.MjsBody",
     anchor: list[float],
     joints: str,
@@ -153,7 +125,7 @@ def add_chain(
     """Rods, the last with the payload (``load``) or without; returns the last body. See :func:`build_attached`."""
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)
-        mass, centre, inertia = _rod_inertial(rope, i == rope.segments - 1, load and stretch is None, AXIAL_INERTIA)
+        mass, centre, inertia = _rod_inertial(rope, i == rope.segments - 1 and load and stretch is None)
         if joints == "ball":
             # Without twist in the joints the axial inertia enters nothing; this one keeps the mass matrix well scaled.
             inertia = (inertia[0], inertia[1], inertia[0])

@@ -11,7 +11,6 @@ import numpy as np
 from sim.params import GRAVITY, PlantParams
 from sim.reference import blocks
 from sim.reference.extras import ReferenceExtras
-from sim.reference.model import RopeModel
 from sim.reference.quadrotor import BLOCKS, BODY, VehicleErrors, initial_blocks, rigid_body_rates, vehicle_rates
 from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
@@ -56,12 +55,7 @@ class ReferencePlant:
     """
 
     def __init__(
-        self,
-        params: PlantParams,
-        extras: ReferenceExtras = ReferenceExtras(),
-        seed: int = 0,
-        count: int = 1,
-        step: float = 5e-4,
+        self, params: PlantParams, extras: ReferenceExtras = ReferenceExtras(), seed: int = 0, count: int = 1, step: float = 5e-4
     ) -> None:
         if not step > 0.0:
             raise ValueError(f"plant: step is {step} s, expected more than 0")
@@ -109,16 +103,12 @@ class ReferencePlant:
         rotation = rotation_from_quat(values["quat_wb"])
         offset_w = turned(rotation, self._errors.com_offset)
         offset_vel = turned(rotation, cross(values["rate_b"], self._errors.com_offset))
-        body = np.hstack(
-            (values["pos_w"] + offset_w, values["quat_wb"], values["vel_w"] + offset_vel, values["rate_b"])
-        )
+        body = np.hstack((values["pos_w"] + offset_w, values["quat_wb"], values["vel_w"] + offset_vel, values["rate_b"]))
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
         n = values["cable_dir_w"] / np.linalg.norm(values["cable_dir_w"], axis=-1, keepdims=True)
         n_dot = values["cable_vel_w"] - np.sum(values["cable_vel_w"] * n, -1, keepdims=True) * n
-        self._state = np.hstack(
-            (body, block, np.zeros((count, 6)), n.reshape(count, -1), n_dot.reshape(count, -1), np.zeros((count, 2)))
-        )
+        self._state = np.hstack((body, block, np.zeros((count, 6)), n.reshape(count, -1), n_dot.reshape(count, -1), np.zeros((count, 2))))
         if self._ropes.stretch is not None:
             self._state[:, -2] = self._payload_mass * GRAVITY / self.extras.stretch_stiffness
         hover = np.zeros((count, 4))
@@ -144,27 +134,20 @@ class ReferencePlant:
         self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * rng.standard_normal((count, 3))
         self._next_wind = self._wind
         # Compiling a model takes milliseconds; without these draws the ropes of the last episode serve on.
-        if self._ropes is not None and not (
-            extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)
-        ):
+        if self._ropes is not None and not (extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)):
             return
-        base = RopeModel.of(vehicle, rope)
-        base = replace(base, joint_damping=base.joint_damping + extras.extra_joint_damping)
-        models = [
+        damping = rope.joint_damping + extras.extra_joint_damping
+        ropes = [
             replace(
-                base,
-                mount=tuple(np.array(rope.mount) - com[i]),
-                segment_length=length[i] / rope.segments,
-                payload_mass=self._payload_mass[i],
-                payload_inertia=rope.payload_inertia * self._payload_mass[i] / rope.payload_mass,
+                rope, mount=tuple(np.array(rope.mount) - com[i]), length=length[i], payload_mass=mass, joint_damping=damping,
+                payload_inertia=rope.payload_inertia * mass / rope.payload_mass,
             )
-            for i in range(count)
-        ]
+            for i, mass in enumerate(self._payload_mass)
+        ]  # fmt: skip
         stretch = (extras.stretch_stiffness, extras.stretch_damping) if extras.stretch_stiffness > 0.0 else None
-        self._ropes = RopeDynamics(models, stretch, rope.mount_damping)
+        self._ropes = RopeDynamics(vehicle.body, ropes, stretch, rope.mount_damping)
         # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d / (m l^2).
-        damping = base.joint_damping + rope.mount_damping
-        fastest = 48.0 * damping / (base.segment_mass * float(np.min(length) / rope.segments) ** 2)
+        fastest = 48.0 * (damping + rope.mount_damping) / (rope.segment_mass * float(np.min(length) / rope.segments) ** 2)
         self._step = min(self.step_size, LARGEST_DECAY / fastest) if fastest > 0.0 else self.step_size
 
     @property
@@ -263,9 +246,7 @@ class ReferencePlant:
         self._latched = self._latched | tripped
         decay = np.exp(-period / extras.wind_time_constant)
         mean, sigma = self._mean_wind, np.array(extras.wind_sigma_w)
-        self._next_wind = (
-            mean + decay * (self._wind - mean) + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
-        )
+        self._next_wind = mean + decay * (self._wind - mean) + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
         self._advance(start, end)
         self._wind, self.time = self._next_wind, end
         self._prune(end)
@@ -274,10 +255,7 @@ class ReferencePlant:
         """Integrate one period, from event to event in each environment."""
         sample = end - self.extras.mocap_latency % (end - start)
         times, commands = np.array(self._queue_times), np.array(self._queue_commands)
-        edges = [
-            [start, *[t for t in (*times[1:, e], self._separation[e], sample) if start < t < end], end]
-            for e in range(self.count)
-        ]
+        edges = [[start, *[t for t in (*times[1:, e], self._separation[e], sample) if start < t < end], end] for e in range(self.count)]
         steps = segments_of_period(edges, self._step)
         clock = np.full(self.count, start)
         for column in steps.T:
@@ -288,9 +266,7 @@ class ReferencePlant:
             share = ((middle - start) / (end - start))[:, None]
             wind_w = self._wind + share * (self._next_wind - self._wind)
             before = self._state
-            self._state = halving_rk4(
-                lambda x, h: self._rates(x, command, wind_w, h > 0.0), before, column, *self._rope_columns
-            )
+            self._state = halving_rk4(lambda x, h: self._rates(x, command, wind_w, h > 0.0), before, column, *self._rope_columns)
             self._normalise()
             self._land(before, clock, column)
             clock = clock + column
@@ -320,9 +296,7 @@ class ReferencePlant:
         if not np.any(flying):
             return
         height = self.params.release.landing_height
-        ends = [
-            self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:] for state in (before, self._state)
-        ]
+        ends = [self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:] for state in (before, self._state)]
         for e in np.flatnonzero(flying & (ends[1][0][:, 2] <= height)):
             share, point = crossing(ends[0][0][e], ends[0][1][e], ends[1][0][e], ends[1][1][e], step[e], height)
             self._landed[e] = True

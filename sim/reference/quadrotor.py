@@ -96,18 +96,14 @@ def vehicle_rates(
     if vehicle.controller.kind == "geometric":
         setpoint = blocks.geometric(vehicle, command, rate_b)
     elif vehicle.controller.kind == "motor_mixing":
-        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.motor_mixing(
-            vehicle, state[:, 0:9], command, rate_b, voltage
-        )
+        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.motor_mixing(vehicle, state[:, 0:9], command, rate_b, voltage)
     else:
         setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.betaflight(
             vehicle, state[:, 0:3], state[:, 3:6], state[:, 6:9], command, rate_b, voltage
         )
     speed = setpoint if vehicle.motor.kind == "instant" else state[:, 9:13]
     rates[:, 9:13] = blocks.motor(vehicle.motor, speed, setpoint)
-    thrust, torque = blocks.thrust_map(
-        vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain
-    )
+    thrust, torque = blocks.thrust_map(vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain)
     thrust, torque = (np.reshape(near_ground, (-1, 1)) * part for part in (thrust, torque))
     rates[:, 13], rates[:, 14] = blocks.battery(vehicle.battery, used, voltage, speed, torque)
     arms = rotor_arms(vehicle, errors)

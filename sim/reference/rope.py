@@ -7,24 +7,27 @@ stays zero, and the state holds no angle that could be singular. What comes back
 Joint damping is applied as couples ``-d (w_i - w_(i-1))`` between neighbours. A rod takes the part across its axis.
 """
 
-import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from sim.reference.model import RopeModel, build_attached, build_free
+from sim.params import BodyParams, RopeParams
+from sim.reference.model import build_attached, build_free
 from sim.reference.rotations import cross, quat_wxyz_from_matrix, rotation_from_direction, turned, turned_back
 
 
 class RopeDynamics:
-    """Ropes of E environments, each with its own masses and lengths. Raises ValueError: models with different numbers of segments.
+    """Ropes of E environments, each with its own masses and lengths. Raises ValueError: different numbers of segments.
 
     Args:
-        ropes: one model an environment, all with the same number of segments.
+        body: of all vehicles.
+        ropes: one an environment, all with the same number of segments.
         stretch: stiffness [N/m] and damping [N s/m] between last segment and payload, or None.
         mount_damping: of the uppermost joint besides the ropes' own while it is on the vehicle [N m s].
     """
 
-    def __init__(self, ropes: list[RopeModel], stretch: tuple[float, float] | None = None, mount_damping: float = 0.0) -> None:
+    def __init__(
+        self, body: BodyParams, ropes: list[RopeParams], stretch: tuple[float, float] | None = None, mount_damping: float = 0.0
+    ) -> None:
         self.segments = ropes[0].segments
         if any(rope.segments != self.segments for rope in ropes):
             raise ValueError(f"ropes have {sorted({rope.segments for rope in ropes})} segments, expected one number")
@@ -34,7 +37,7 @@ class RopeDynamics:
         self.mount = np.array([rope.mount for rope in ropes])
         self.damping = np.array([rope.joint_damping for rope in ropes])
         self.mount_damping = mount_damping
-        self._attached_models = [build_attached(rope, "ball", stretch=stretch) for rope in ropes]
+        self._attached_models = [build_attached(body, rope, "ball", stretch=stretch) for rope in ropes]
         self._free_models = [build_free(rope, stretch=stretch) for rope in ropes]
         self._attached = Batch(self._attached_models[0], self.count, nthread=1)
         self._attached.set_models(self._attached_models)
@@ -45,9 +48,7 @@ class RopeDynamics:
         # The payload is the last body; with stretch it is its own, else its force acts on the last rod by its arm.
         self._centre = np.array([-model.body_ipos[-1, 2] for model in self._attached_models])
 
-    def _rod_couples(
-        self, ids: np.ndarray, rates: np.ndarray, n: np.ndarray, above: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _rod_couples(self, ids: np.ndarray, rates: np.ndarray, n: np.ndarray, above: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Damping couples on the rods [N m], shape (e, L, 3), and the one on the body above, shape (e, 3)."""
         relative = np.diff(rates, axis=1, prepend=rates[:, :1] if above is None else above[:, None])
         couples = -self.damping[ids][:, None, None] * relative
@@ -70,13 +71,7 @@ class RopeDynamics:
         return applied
 
     def _unpack(
-        self,
-        alpha: np.ndarray,
-        frames: np.ndarray,
-        qacc: np.ndarray,
-        local: np.ndarray,
-        rates: np.ndarray,
-        n: np.ndarray,
+        self, alpha: np.ndarray, frames: np.ndarray, qacc: np.ndarray, local: np.ndarray, rates: np.ndarray, n: np.ndarray
     ) -> np.ndarray:
         """Second derivatives of the directions from relative angular accelerations, shape (e, L, 3)."""
         relative = turned(frames, qacc) + cross(rates, turned(frames, local))
@@ -118,11 +113,7 @@ class RopeDynamics:
         parents = np.concatenate((rotation[:, None], frames[:, :-1]), 1)
         local = turned_back(frames, np.diff(rates, axis=1, prepend=above[:, None]))
         joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames).reshape(len(ids), -1)
-        qpos = [
-            body[:, 0:3],
-            body[:, [6, 3, 4, 5]] / np.linalg.norm(body[:, 3:7], axis=1, keepdims=True),
-            joints,
-        ]
+        qpos = [body[:, 0:3], body[:, [6, 3, 4, 5]] / np.linalg.norm(body[:, 3:7], axis=1, keepdims=True), joints]
         qvel = [body[:, 7:13], local.reshape(len(ids), -1)]
         applied = self._applied(self._attached, ids, 2, n, couples, force_w)
         applied[:, 1, :3] = wrench[0]
@@ -153,11 +144,7 @@ class RopeDynamics:
         applied = self._applied(self._free, ids, 1, n, couples, force_w)
         qacc = self._forward(self._free, ids, qpos, qvel, rope, applied)
         relative = qacc[:, 3 : 3 + 3 * self.segments].reshape(len(ids), -1, 3)
-        return (
-            qacc[:, :3],
-            self._unpack(np.zeros((len(ids), 3)), frames, relative, local, rates, n),
-            self._elongation(qacc),
-        )
+        return (qacc[:, :3], self._unpack(np.zeros((len(ids), 3)), frames, relative, local, rates, n), self._elongation(qacc))
 
     def _elongation(self, qacc: np.ndarray) -> np.ndarray:
         return np.zeros(len(qacc)) if self.stretch is None else qacc[:, -1]
@@ -179,9 +166,7 @@ class RopeDynamics:
         batch.forward(ids)
         return batch.qacc[ids]
 
-    def points(
-        self, root_pos: np.ndarray, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def points(self, root_pos: np.ndarray, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mount, joints and end of the rope [m], shape (E, L+1, 3), and position and velocity of the payload.
 
         Args:
@@ -196,11 +181,3 @@ class RopeDynamics:
         pos = points[:, -1] + reach * n[:, -1]
         vel = root_vel + np.sum(length * n_dot, axis=1) + reach * n_dot[:, -1] + elongation_dot[:, None] * n[:, -1]
         return points, pos, vel
-
-
-def energy(model: "mujoco.MjModel", data: "mujoco.MjData") -> float:
-    """Return kinetic and potential energy of a MuJoCo state [J]."""
-    mujoco.mj_forward(model, data)
-    mujoco.mj_energyPos(model, data)
-    mujoco.mj_energyVel(model, data)
-    return float(data.energy[0] + data.energy[1])

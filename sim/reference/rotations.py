@@ -36,9 +36,7 @@ def quat_dot(quat: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
     """Return the time derivative of quaternions xyzw under a body rate [rad/s], ``1/2 q (rate, 0)``."""
     x, y, z, w = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
     a, b, c = rate_b[..., 0], rate_b[..., 1], rate_b[..., 2]
-    return 0.5 * np.stack(
-        (w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a, -x * a - y * b - z * c), -1
-    )
+    return 0.5 * np.stack((w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a, -x * a - y * b - z * c), -1)
 
 
 def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
@@ -65,12 +63,7 @@ def quat_wxyz_from_matrix(matrix: np.ndarray) -> np.ndarray:
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    rows = (
-        (1 + xx + yy + zz, wx, wy, wz),
-        (wx, 1 + xx - yy - zz, xy, xz),
-        (wy, xy, 1 - xx + yy - zz, yz),
-        (wz, xz, yz, 1 - xx - yy + zz),
-    )
+    rows = ((1 + xx + yy + zz, wx, wy, wz), (wx, 1 + xx - yy - zz, xy, xz), (wy, xy, 1 - xx + yy - zz, yz), (wz, xz, yz, 1 - xx - yy + zz))
     products = np.empty((*m.shape[:-2], 4, 4))
     for i, row in enumerate(rows):
         for j, product in enumerate(row):

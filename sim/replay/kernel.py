@@ -366,9 +366,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 old_pay = pay
                 old_pay_vel = pay_vel
                 if mode == attached_code:
-                    s, total, fell_back = coupled.step(
-                        p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h
-                    )
+                    s, total, fell_back = coupled.step(p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h)
                     pos1, vel1 = coupled.payload(rope, s, n, u)
                     pay = pos1
                     pay_vel = vel1
@@ -386,9 +384,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                         ball.pos = flown_pos
                         ball.vel = flown_vel
                         if r.rope_tail > real(0.0):
-                            root, root_vel = loose_step(
-                                rope, pushed, ball.root, ball.root_vel, n, u, stiffness, g, gamma, max_turn, h
-                            )
+                            root, root_vel = loose_step(rope, pushed, ball.root, ball.root_vel, n, u, stiffness, g, gamma, max_turn, h)
                             tail_pos, tail_vel = chain.payload(rope, root, root_vel, n, u)
                             ball.root = root
                             ball.root_vel = root_vel
@@ -402,9 +398,7 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 k.t1 = t0 + h
                 k.h = h
                 last = j == count - 1 and until >= end - tiny
-                at = sample(
-                    p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane
-                )
+                at = sample(p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane)
                 for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
                     marks[e] = sample(
                         p, sensings[lanes.plant[e]], data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last,

@@ -109,12 +109,7 @@ class Replay:
         self._plants: dict[str, list[wp.array]] = {}
 
     def run(
-        self,
-        starts: Mapping[str, np.ndarray],
-        recording: Recording,
-        lanes: Mapping[str, np.ndarray],
-        knot_spacing: float,
-        knots: int = 1,
+        self, starts: Mapping[str, np.ndarray], recording: Recording, lanes: Mapping[str, np.ndarray], knot_spacing: float, knots: int = 1
     ) -> Replayed:
         """Fly all lanes.
 

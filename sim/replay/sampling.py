@@ -68,9 +68,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
                 break
             s = (time - k.t0) / span
             pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
-            q = blend_quat(
-                a.quat_wb, quat_rate(a.quat_wb, a.rate_b), b.quat_wb, quat_rate(b.quat_wb, b.rate_b), s, span
-            )
+            q = blend_quat(a.quat_wb, quat_rate(a.quat_wb, a.rate_b), b.quat_wb, quat_rate(b.quat_wb, b.rate_b), s, span)
             seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
             out[2 * next.vehicle, lane] = seen
             out[2 * next.vehicle + 1, lane] = turn

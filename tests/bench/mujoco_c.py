@@ -9,7 +9,7 @@ from collections.abc import Callable
 import mujoco
 
 from sim.reference.model import build_attached
-from tests.oracle.start import initial_data, rope_from_scene
+from tests.oracle.start import initial_data, vehicle_and_rope
 from tests.plants import SCENES
 from tests.scenes import Scene, load_scene
 
@@ -37,7 +37,7 @@ def started(scene: Scene, step: float, integrator: str, armature: float) -> tupl
         scene: the rope and its start.
         step: [s]. integrator: RK4 or implicitfast. armature: of the hinges [kg m^2].
     """
-    model = build_attached(rope_from_scene(scene), "universal", armature)
+    model = build_attached(*vehicle_and_rope(scene), "universal", armature)
     model.opt.timestep, model.opt.integrator = step, getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     data, first = initial_data(model, scene), scene.schedule[0]
     data.ctrl[:] = (*first.force_b, *first.torque_b)

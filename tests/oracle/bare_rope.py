@@ -8,7 +8,7 @@ import numpy as np
 from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned
 from sim.reference.stepping import halving_rk4
-from tests.oracle.start import rope_from_scene
+from tests.oracle.start import vehicle_and_rope
 from tests.scenes import Scene, wrench_at
 
 
@@ -22,7 +22,8 @@ class BareScene:
 
     def __init__(self, scene: Scene, step: float = 2.5e-4) -> None:
         self.scene, self.step_size, self.time = scene, step, 0.0
-        self._ropes = RopeDynamics([rope_from_scene(scene)])
+        vehicle, rope = vehicle_and_rope(scene)
+        self._ropes = RopeDynamics(vehicle, [rope])
         body = np.concatenate((scene.pos_w, scene.quat_wb, scene.vel_w, scene.rate_b))
         self._state = np.concatenate((body, scene.cable_dir_w().ravel(), scene.cable_vel_w().ravel()))[None]
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from sim.reference.model import build_attached
-from tests.oracle.start import CONVERGED_STEP, initial_data, rope_from_scene
+from tests.oracle.start import CONVERGED_STEP, initial_data, vehicle_and_rope
 from tests.scenes import Scene
 
 
@@ -91,7 +91,7 @@ def converged(
     """
     if joints != "universal":
         raise ValueError(f"oracle: joints {joints!r}, expected 'universal'; ball joints are run by sim.reference.plant")
-    model = build_attached(rope_from_scene(scene), joints, armature)
+    model = build_attached(*vehicle_and_rope(scene), joints, armature)
     model.opt.timestep = step
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     data = initial_data(model, scene)

@@ -3,27 +3,18 @@
 import mujoco
 import numpy as np
 
-from sim.reference.model import RopeModel
+from sim.params import BodyParams, RopeParams
 from tests.scenes import Scene
+from tests.simulators import scene_plant
 
 CONVERGED_STEP = 20e-6
 """Step of a converged run [s]: half of it moves the ball of both scenes by less than a micrometre."""
 
 
-def rope_from_scene(scene: Scene) -> RopeModel:
+def vehicle_and_rope(scene: Scene) -> tuple[BodyParams, RopeParams]:
     """Return the masses and lengths of a scene."""
-    return RopeModel(
-        mass=scene.mass,
-        inertia=scene.inertia,
-        mount=scene.mount,
-        segments=scene.segments,
-        segment_length=scene.segment_length,
-        segment_mass=scene.segment_mass,
-        payload_mass=scene.ball_mass,
-        payload_inertia=scene.ball_inertia,
-        payload_offset=scene.ball_offset,
-        joint_damping=scene.joint_damping,
-    )
+    plant = scene_plant(scene, 2e-3, "float64")
+    return plant.vehicle.body, plant.rope
 
 
 def matrix_from_quat(quat: np.ndarray) -> np.ndarray:

@@ -1,6 +1,5 @@
 """The hybrid's seam: two solvers behind one interface on the hard throw; a box and two cables fly; closed forms of each."""
 
-import dataclasses
 import time
 
 import mujoco
@@ -8,16 +7,17 @@ import numpy as np
 import pytest
 import warp as wp
 
+from sim.params import GRAVITY, BodyParams
 from sim.reference.bodies import CABLE_STEP, MujocoBodies, rope_and_ball, rope_and_box, two_cables
 from sim.seam import FusedChain, SeamSim
-from tests.oracle.start import initial_data, rope_from_scene
+from tests.oracle.start import initial_data, vehicle_and_rope
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
 from tests.simulators import scene_plant
 from visthrow.onboard.hover import HoverController, HoverParams
 
 SCENE = load_scene(SCENES / "hard_throw.toml")
-ROPE = rope_from_scene(SCENE)
+BODY, ROPE = vehicle_and_rope(SCENE)
 AGREE = 1e-3
 """A thirtieth of the landing error that a policy is to reach [m]; measured 0.14 mm of the ball, 0.19 mm of the vehicle."""
 SIDES = (0.08, 0.06, 0.05)
@@ -33,7 +33,7 @@ def fused(interval: float = 0.002, device: str = "cpu") -> FusedChain:
 
 
 def in_mujoco(step: float) -> MujocoBodies:
-    bodies = MujocoBodies(rope_and_ball(ROPE), step=step)
+    bodies = MujocoBodies(rope_and_ball(BODY, ROPE), step=step)
     data = initial_data(bodies.model, SCENE)
     bodies.place(data.qpos, data.qvel)
     return bodies
@@ -99,7 +99,7 @@ def test_mujoco_warp_ends_the_hard_throw_there_too(capsys, device):
     fused_chain = fused(device=device)
     ours, seconds, ends = hard_throw(fused_chain), {}, {}
     for step in (5e-4, 2.5e-4):
-        bodies = WarpBodies(rope_and_ball(ROPE), step, device)
+        bodies = WarpBodies(rope_and_ball(BODY, ROPE), step, device)
         data = initial_data(bodies.model, SCENE)
         bodies.place(data.qpos, data.qvel)
         bodies.advance(np.zeros((1, 3)), np.zeros((1, 3)), 0.002)  # compiles
@@ -137,9 +137,9 @@ def hovered(bodies, seconds: float = 3.0) -> np.ndarray:
 @pytest.mark.parametrize("payload", ["ball", "box", "two cables"])
 def test_other_payloads_fly_behind_the_same_seam(payload):
     build = {
-        "ball": lambda: MujocoBodies(rope_and_ball(ROPE)),
-        "box": lambda: MujocoBodies(rope_and_box(ROPE, SIDES)),
-        "two cables": lambda: MujocoBodies(two_cables(ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP),
+        "ball": lambda: MujocoBodies(rope_and_ball(BODY, ROPE)),
+        "box": lambda: MujocoBodies(rope_and_box(BODY, ROPE, SIDES)),
+        "two cables": lambda: MujocoBodies(two_cables(BODY, ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP),
     }
     below = {"ball": 0.33 + SCENE.ball_offset, "box": 0.33 + 0.5 * SIDES[2], "two cables": 0.33 + 0.5 * SIDES[2]}
     bodies = build[payload]()
@@ -150,13 +150,13 @@ def test_other_payloads_fly_behind_the_same_seam(payload):
 
 def test_two_cables_turn_as_a_bifilar_pendulum():
     """omega^2 = m g d^2 / (4 I L) for a small turn about the vertical, the mount held still by its own inertia."""
-    heavy = dataclasses.replace(ROPE, inertia=(1e3, 1e3, 1e3), mass=1e4)
+    heavy = BodyParams(1e4, (1e3, 1e3, 1e3))
     apart, length, turn = 0.06, 0.33, 0.05
-    bodies = MujocoBodies(two_cables(heavy, SIDES, apart, length), step=CABLE_STEP)
+    bodies = MujocoBodies(two_cables(heavy, ROPE, SIDES, apart, length), step=CABLE_STEP)
     qpos, qvel = bodies.model.qpos0.copy(), np.zeros(bodies.model.nv)
     qpos[10:14] = np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)
     bodies.place(qpos, qvel)
-    hold = np.array([[0.0, 0.0, bodies.total_mass * heavy.gravity]])
+    hold = np.array([[0.0, 0.0, bodies.total_mass * GRAVITY]])
     angles = []
     for _ in range(1000):
         bodies.advance(hold, np.zeros((1, 3)), 0.002)
@@ -165,14 +165,14 @@ def test_two_cables_turn_as_a_bifilar_pendulum():
     crossings = np.flatnonzero(np.diff(np.sign(angles)) != 0)
     half_period = 0.002 * float(np.diff(crossings).mean())
     inertia = ROPE.payload_mass / 12.0 * (SIDES[0] ** 2 + SIDES[1] ** 2)
-    expected = np.sqrt(ROPE.payload_mass * heavy.gravity * apart**2 / (4.0 * inertia * length))
+    expected = np.sqrt(ROPE.payload_mass * GRAVITY * apart**2 / (4.0 * inertia * length))
     assert np.pi / half_period == pytest.approx(expected, rel=0.02)
 
 
 def test_a_cable_pulls_or_is_slack():
     """In free fall together with the vehicle nothing is stretched; under thrust the cables are as long as they are."""
-    bodies = MujocoBodies(two_cables(ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP)
-    lift = np.array([[0.0, 0.0, 1.5 * bodies.total_mass * ROPE.gravity]])
+    bodies = MujocoBodies(two_cables(BODY, ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP)
+    lift = np.array([[0.0, 0.0, 1.5 * bodies.total_mass * GRAVITY]])
     bodies.advance(lift, np.zeros((1, 3)), 0.2)
     np.testing.assert_allclose(bodies.tendon_length[0], 0.33, atol=2e-3)
     bodies.advance(-0.5 * lift, np.zeros((1, 3)), 0.05)
@@ -193,7 +193,7 @@ def test_what_the_seam_costs(capsys):
     """Prints environment steps a second of both solvers in one run; the fused chain is the faster one."""
     found = {}
     for name, make in (("fused", lambda: FusedChain(scene_plant(SCENE, 2e-3, "float32"), 256)),
-                       ("mujoco", lambda: MujocoBodies(rope_and_ball(ROPE), 256))):  # fmt: skip
+                       ("mujoco", lambda: MujocoBodies(rope_and_ball(BODY, ROPE), 256))):  # fmt: skip
         bodies, lift = make(), np.array([[0.0, 0.0, 2.7]])
         bodies.advance(lift, np.zeros((1, 3)), 0.002)
         best = 0.0

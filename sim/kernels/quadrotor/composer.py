@@ -6,9 +6,7 @@ import warp as wp
 
 
 @wp.func
-def compose(
-    p: Any, rate_b: Any, thrust: Any, torque: Any, motor_speed: Any, motor_rate: Any, aero_force: Any, aero_torque: Any
-):
+def compose(p: Any, rate_b: Any, thrust: Any, torque: Any, motor_speed: Any, motor_rate: Any, aero_force: Any, aero_torque: Any):
     """Net force [N] and torque [N m] on the vehicle, body frame, about the centre of mass, without gravity.
 
     The rotors' gyroscopic torque ``-w x h e_z`` is perpendicular to the rate and does no work.

@@ -68,9 +68,7 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
 
 
 @wp.func
-def rate_controller_betaflight(
-    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
-):
+def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
     """PID with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
 
     Returns:
@@ -81,12 +79,7 @@ def rate_controller_betaflight(
     setpoint_rate = (rate_command - setpoint) / c.setpoint_time_constant
     gyro_rate = (rate_b - gyro) / c.gyro_time_constant
     error = setpoint - rate_b
-    torque = (
-        wp.cw_mul(c.p_gain, error)
-        + integral
-        - wp.cw_mul(c.d_gain, gyro_rate)
-        + wp.cw_mul(c.feedforward_gain, setpoint_rate)
-    )
+    torque = wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
     ratio = voltage / p.battery.reference_voltage
     f, share, yaw_share = mix(p, command[0], torque, c.max_thrust * ratio * ratio)
     integral_rate = wp.cw_mul(c.i_gain, error)
@@ -105,9 +98,7 @@ def rate_controller_betaflight(
 
 
 @wp.func
-def rate_controller_motor_mixing(
-    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
-):
+def rate_controller_motor_mixing(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
     """PID whose output is added to motor commands, with iterm_relax, as Betaflight's firmware has them.
 
     Returns:
@@ -125,12 +116,7 @@ def rate_controller_motor_mixing(
             integral_rate[i] = integral_rate[i] * wp.max(one - wp.abs(asked[i] - setpoint[i]) / c.relax_threshold, zero)
         if integral_rate[i] * integral[i] > zero and wp.abs(integral[i]) >= c.integral_limit[i]:
             integral_rate[i] = zero
-    torque = (
-        wp.cw_mul(c.p_gain, error)
-        + integral
-        - wp.cw_mul(c.d_gain, gyro_rate)
-        + wp.cw_mul(c.feedforward_gain, setpoint_rate)
-    )
+    torque = wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
     two, quarter = type(voltage)(2.0), type(voltage)(0.25)
     idle = wp.sqrt(c.min_thrust / c.max_thrust)
     share = p.mixer.roll * torque[0] + p.mixer.pitch * torque[1] + p.mixer.yaw * torque[2]

@@ -30,6 +30,17 @@ def split_delay(p: Any, period: Any):
 
 
 @wp.func
+def held(queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: Any, period: Any):
+    """The command that acts at a time of a control period [s], and until when [s]; ``whole`` and ``switch`` are of `split_delay`."""
+    slot = whole
+    until = period
+    if time < switch - type(period)(1.0e-6):
+        slot = whole + 1
+        until = wp.min(period, switch)
+    return queue[wp.min(slot, queue.shape[0] - 1), env], until
+
+
+@wp.func
 def push(queue: wp.array2d(dtype=Any), env: int, command: Any):
     """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one.
 

@@ -97,9 +97,7 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
         out = Flow()
-        target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
-            p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
-        )
+        target, integral_rate, setpoint_rate, gyro_rate = rate_controller(p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage)
         speed, speed_rate = motor_rate(p, s.motor_speed, target)
         f = rotor_thrust(p, speed, s.voltage)
         if wp.static("ground_effect" in extensions):
@@ -108,9 +106,7 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
         through_air = s.vel_w - air.wind_w if wp.static("wind" in extensions) else s.vel_w
         vel_b = wp.quat_rotate_inv(s.quat_wb, through_air)
         aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)
-        force, torque = composer.compose(
-            p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque
-        )
+        force, torque = composer.compose(p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque)
         if wp.static("push" in extensions):
             force += wp.quat_rotate_inv(s.quat_wb, air.push_w)
             torque += air.twist_b

@@ -215,9 +215,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 h2 = s11 * g2 - s12 * g1
                 b = b - with_load(i, f, real(1.0), load) - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
                 d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
-                o = o - vec3(
-                    b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2]
-                )
+                o = o - vec3(b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2])
                 c1[i] = q1
                 c2[i] = q2
                 hs[i] = vec2(h1, h2)
@@ -304,9 +302,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         return total
 
     @wp.func
-    def fall_back(
-        n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), h: real, n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3)
-    ):
+    def fall_back(n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), h: real, n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3)):
         """Advance n and u by the first stage alone, linearly implicit Euler; the stiffness stays."""
         for i in range(L):
             new_u = u[i] + h * k1[i]

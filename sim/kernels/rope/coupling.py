@@ -20,9 +20,7 @@ def build_root(t: Types):
     real = t.real
 
     @wp.func
-    def root(
-        p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3
-    ):
+    def root(p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3):
         r = rope.mount
         rot = wp.quat_to_matrix(s.quat_wb)
         inv_mass = real(1.0) / p.body.mass
@@ -43,9 +41,7 @@ def build_root(t: Types):
     return root
 
 
-def build_coupled_step(
-    t: Types, flow, rate, motor_advance, chain: SimpleNamespace, payload: SimpleNamespace, extensions: frozenset[str]
-):
+def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespace, payload: SimpleNamespace, extensions: frozenset[str]):
     """One step of h seconds of vehicle and chain.
 
     The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The velocity of the root
@@ -141,9 +137,7 @@ def build_coupled_step(
         d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs)
         torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)
-        relative = chain.down_second(
-            rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1
-        )
+        relative = chain.down_second(rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1)
         r2 = rate(p, s2, f2, acc_w, alpha_b)
         out = advance(s, blend(r1, half, r2, half), h)
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
@@ -169,6 +163,4 @@ def build_coupled_step(
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
         return out
 
-    return SimpleNamespace(
-        step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum, payload=payload_state
-    )
+    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum, payload=payload_state)

@@ -49,9 +49,7 @@ def build_loose_step(t: Types, chain, payload):
         turn = wp.cross(n2[0], u[0] + h * k1[0])
         d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, turn, gravity, load2, gamma, h, c1, c2, hs)
         acc = free_root(d, o, b)
-        relative = chain.down_second(
-            rope, n, u, stiffness, acc, vec3(), gravity, load2, gamma, h, c1, c2, hs, n2, k1
-        )
+        relative = chain.down_second(rope, n, u, stiffness, acc, vec3(), gravity, load2, gamma, h, c1, c2, hs, n2, k1)
         vel = (total + h * weight + (half * h) * (load1 + load2) - relative) / rope.total_mass
         return pos_w + (half * h) * (vel_w + vel), vel
 

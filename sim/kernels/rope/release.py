@@ -154,9 +154,7 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
         return time + share
 
     @wp.func
-    def drag_clearance(
-        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int
-    ):
+    def drag_clearance(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int):
         least = wp.length(pos_w - vehicle_w)
         pos = pos_w
         vel = vel_w
