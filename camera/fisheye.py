@@ -50,16 +50,11 @@ class Fisheye:
         self._bounds = (-0.5 - slack, params.width - 0.5 + slack, -0.5 - slack, params.height - 0.5 + slack)
         left, right, top, bottom = self._bounds
         self.circle_inside_image = (
-            params.cx - reach_x >= left
-            and params.cx + reach_x <= right
-            and params.cy - reach_y >= top
-            and params.cy + reach_y <= bottom
+            params.cx - reach_x >= left and params.cx + reach_x <= right and params.cy - reach_y >= top and params.cy + reach_y <= bottom
         )
         self._constants: dict[tuple[torch.device, torch.dtype], tuple[torch.Tensor, torch.Tensor]] = {}
 
-    def angle(
-        self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def angle(self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Angle off the optical axis of points.
 
         Args:

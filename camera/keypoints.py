@@ -48,9 +48,7 @@ class KeypointCamera:
         self._identity = torch.eye(2, device=device, dtype=dtype)
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
-    def extrinsics(
-        self, rotation_error: torch.Tensor, position_error: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def extrinsics(self, rotation_error: torch.Tensor, position_error: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Extrinsics with an error per environment: ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
 
         Args:

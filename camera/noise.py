@@ -51,9 +51,7 @@ def apply_noise(
     return torch.where(mistaken.unsqueeze(-1), 2.0 * draw.wrong[..., 1:] - 1.0, points), seen | mistaken
 
 
-def apply_latency(
-    history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def apply_latency(history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints as they were ``latency`` steps ago.
 
     Args:

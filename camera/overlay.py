@@ -11,13 +11,10 @@ from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
 
 # BGR, OpenCV's order.
 GREEN, RED, WHITE, GREY = (80, 200, 60), (60, 60, 230), (255, 255, 255), (150, 150, 150)
-SHIFT = 4
-"""Fractional bits of the coordinates that OpenCV draws with: lines lie where the numbers say, to 1/16 px."""
+SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with: lines lie where the numbers say, to 1/16 px
 
 
-def draw_overlay(
-    camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.Tensor, image: np.ndarray | None = None
-) -> np.ndarray:
+def draw_overlay(camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.Tensor, image: np.ndarray | None = None) -> np.ndarray:
     """Draw keypoints, field of view and body axes.
 
     Goal corners are joined to a green square and the payload's edge midpoints to a red box; where one of a group is
@@ -98,6 +95,4 @@ def _draw_body_axes(canvas, camera: KeypointCamera, thick: int) -> None:
         start, end = (tuple(round(c) for c in q) for q in (centre, tip))
         cv2.arrowedLine(canvas, start, end, WHITE, thick, cv2.LINE_AA, 0, 0.14)
         corner = tuple(round(c) for c in tip + 0.02 * min(canvas.shape[:2]))
-        cv2.putText(
-            canvas, name, corner, cv2.FONT_HERSHEY_SIMPLEX, min(canvas.shape[:2]) / 1100, WHITE, thick, cv2.LINE_AA
-        )
+        cv2.putText(canvas, name, corner, cv2.FONT_HERSHEY_SIMPLEX, min(canvas.shape[:2]) / 1100, WHITE, thick, cv2.LINE_AA)

@@ -38,9 +38,7 @@ def view_rotation(view: ViewParams) -> torch.Tensor:
 def view_focal(view: ViewParams) -> float:
     """Focal length of a view [px]. Raises ValueError: the field of view is not one of a pinhole."""
     if not 0.0 < view.fov_deg < 180.0:
-        raise ValueError(
-            f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a pinhole has"
-        )
+        raise ValueError(f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a pinhole has")
     return view.width / 2.0 / math.tan(math.radians(view.fov_deg) / 2.0)
 
 
@@ -67,8 +65,6 @@ def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tens
 
     Args:
         frames: Shape (B, C, H, W) of the lens's size.
-        lens: The lens.
-        view: The view.
 
     Returns:
         Shape (B, C, view.height, view.width), black where the fisheye sees nothing.

@@ -128,9 +128,7 @@ def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.nd
     return cv2.cornerSubPix(grey, start, (half, half), (-1, -1), criteria).reshape(-1, 2).astype(np.float64)
 
 
-def calibrate_from_boards(
-    images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0
-) -> tuple[FisheyeParams, BoardReport]:
+def calibrate_from_boards(images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0) -> tuple[FisheyeParams, BoardReport]:
     """Calibrate a fisheye from pictures of a board.
 
     OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the polynomial found there

@@ -11,8 +11,7 @@ import numpy as np
 
 from camera.params import FisheyeParams, monotonic_limit
 
-GRID = 64
-"""Pixels along each side of the grid on which a foreign model is sampled."""
+GRID = 64  # pixels along each side of the grid on which a foreign model is sampled
 
 
 @dataclass(frozen=True)
@@ -122,9 +121,7 @@ def fit_rays(
     if fov_deg is not None:
         valid &= theta <= math.radians(fov_deg) / 2.0
     if np.count_nonzero(valid) < 50:
-        raise ValueError(
-            f"{model} model sees {np.count_nonzero(valid)} of {len(pixels)} pixels of the grid; expected 50"
-        )
+        raise ValueError(f"{model} model sees {np.count_nonzero(valid)} of {len(pixels)} pixels of the grid; expected 50")
     theta, pixels = theta[valid], pixels[valid]
     centre = np.array(centre_px)
     direction = rays[valid, :2] / np.maximum(np.sin(theta), 1e-12)[:, None]

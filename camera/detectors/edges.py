@@ -10,33 +10,21 @@ import torch
 
 from camera.fisheye import Fisheye
 
-LEAST_AREA = 14
-"""Blobs smaller than this are noise [px]."""
-MOST_PAIRED = 12
-"""Largest blobs that are looked at in pairs."""
-OUTSIDE = 3.0
-"""How far beyond the goal's side its edge is looked for at least [px]."""
-ANGLES = 64
-"""Directions in which a ball's edge is looked for."""
-STEP = 0.25
-"""Between two samples across an edge [px]."""
-MOST_BENT = 0.12
-"""RMS of the goal's edge from its line, over the side."""
-LEAST_RIM = 0.05
-"""By which the goal's rim is brighter than what lies beyond, of that: blurred over its width by far frames."""
-OVEREXPOSED = 245.0
-"""Above this a pixel says nothing of how bright it is, of 255."""
-OUTER = 0.65
-"""Quantile of an outline's distance from its axis about which points are kept."""
+LEAST_AREA = 14  # blobs smaller than this are noise [px]
+MOST_PAIRED = 12  # largest blobs that are looked at in pairs
+OUTSIDE = 3.0  # how far beyond the goal's side its edge is looked for at least [px]
+ANGLES = 64  # directions in which a ball's edge is looked for
+STEP = 0.25  # between two samples across an edge [px]
+MOST_BENT = 0.12  # RMS of the goal's edge from its line, over the side
+LEAST_RIM = 0.05  # by which the goal's rim is brighter than what lies beyond, of that: blurred over its width by far frames
+OVEREXPOSED = 245.0  # above this a pixel says nothing of how bright it is, of 255
+OUTER = 0.65  # quantile of an outline's distance from its axis about which points are kept
 RIM_LEVEL = 0.42
 """Share of the fall at which a ball ends: below a half, as it darkens towards its rim; set on rendered balls, where the mean error
 of the half-angle then vanishes."""
-BLUR_WIDTH = 1.75
-"""Half of the widest edge of a frame that is fit to be used [px]."""
-ALONG = 24
-"""Samples along a side of the goal."""
-LEAST_LEVEL = 8.0
-"""Colour inside an edge that is too faint to have one, of 255."""
+BLUR_WIDTH = 1.75  # half of the widest edge of a frame that is fit to be used [px]
+ALONG = 24  # samples along a side of the goal
+LEAST_LEVEL = 8.0  # colour inside an edge that is too faint to have one, of 255
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ from camera.detectors.scenes.scene import Truth, lens_row, random_scenes, truth_
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
 
-NEAR = 0.5
-"""A finding within this many sizes of the thing is of it."""
+NEAR = 0.5  # a finding within this many sizes of the thing is of it
 
 
 @dataclass(frozen=True)

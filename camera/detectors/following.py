@@ -14,8 +14,7 @@ from camera.detectors.contours import GATE, BallSeen, Known, Seen
 READ = 0.01
 """Of a direction in the world, about each axis: of the attitude, with which a detection is turned there, and of the detection [rad]."""
 
-TURNS = {"ball": 4.0, "goal": 1.0}
-"""Rate of what was seen once, about each axis [rad/s]."""
+TURNS = {"ball": 4.0, "goal": 1.0}  # rate of what was seen once, about each axis [rad/s]
 
 DRIVEN = 8.0
 """Of a direction's acceleration in each frame, about each axis, beyond a pendulum's [rad/s^2]. Set on 20 throws of the training simulator;
@@ -24,8 +23,7 @@ on 10 of the realistic reference plant five blind frames are 2.7 deg off (rms), 
 THRUST = 14.0
 """Specific thrust of the vehicle [m/s^2]: median of throws of `vision`, which have 10 to 25; a hover has 12.5. The rest is in `DRIVEN`."""
 
-STILL = 0.05, 0.2
-"""Of a ball that is said to hang still: direction [rad] and its rate [rad/s]."""
+STILL = 0.05, 0.2  # of a ball that is said to hang still: direction [rad] and its rate [rad/s]
 
 LOST = 0.04
 """Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by as much in a frame of a throw, and of

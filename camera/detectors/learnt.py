@@ -23,21 +23,17 @@ from camera.fisheye import Fisheye
 SHIPPED = Path(__file__).parent / "learnt.npz"
 FORMAT = 1
 
-CELL = 16
-"""Side of a cell of the grid [px of the frame]."""
+CELL = 16  # side of a cell of the grid [px of the frame]
 
 KINDS = ("ball", "goal")
-PATCH = {"ball": 40, "goal": 56}
-"""Side of a patch [px]."""
+PATCH = {"ball": 40, "goal": 56}  # side of a patch [px]
 
 REACH = {"ball": 2.2, "goal": 1.9}
 """Half side of a patch over the size: the ball's half-angle, the mean angle from the square's middle to its corners."""
 
-LEAST_REACH = {"ball": 0.05, "goal": 0.05}
-"""Half side of a patch at least, as a tangent: what is far is looked at with its surroundings."""
+LEAST_REACH = {"ball": 0.05, "goal": 0.05}  # half side of a patch at least, as a tangent: what is far is looked at with its surroundings
 
-PLACES = 3
-"""Of a kind that are looked at closely."""
+PLACES = 3  # of a kind that are looked at closely
 
 LEAST_PROBABILITY = 0.5
 

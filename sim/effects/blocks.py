@@ -8,12 +8,9 @@ from typing import Any
 from sim.effects.setting import AERODYNAMICS, Setting
 from sim.params import GRAVITY
 
-SEGMENTS = 15
-"""Segments of a rope that turns out to be flexible (the paper, Sec. III-B)."""
-RELAX = 1.0 / (2.0 * math.pi * 15.0)
-"""Time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]."""
-LONGEST_OFFSET = 0.12
-"""Length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves something."""
+SEGMENTS = 15  # segments of a rope that turns out to be flexible (the paper, Sec. III-B)
+RELAX = 1.0 / (2.0 * math.pi * 15.0)  # time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
+LONGEST_OFFSET = 0.12  # length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves something
 
 
 def _vehicle(setting: Setting, **parts: dict[str, Any]) -> Setting:

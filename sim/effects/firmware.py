@@ -13,8 +13,7 @@ from sim.params import ControllerParams, VehicleParams
 P_SCALE, I_SCALE, D_SCALE, F_SCALE, MIXER_SCALE = 0.032029, 0.244381, 0.000529, 0.013754, 1000.0
 """Output of a gain of 1 for an error of 1 deg/s, 1 deg, 1 deg/s^2, feedforward of 1 deg/s^2; output that is all of a motor's command."""
 
-YAW_I = 2.5
-"""Times the setting, about yaw (pid_init.c, pidInitConfig)."""
+YAW_I = 2.5  # times the setting, about yaw (pid_init.c, pidInitConfig)
 
 DEGREE = math.degrees(1.0)
 

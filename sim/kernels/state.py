@@ -12,18 +12,14 @@ import warp as wp
 
 from sim.kernels.structs import QUAD_STATE, Types, make_struct
 
-LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
-"""Attitude of a level vehicle, xyzw."""
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])  # attitude of a level vehicle, xyzw
 
 NONFINITE = 1
 """Status bit: a state became non-finite or faster than any physical one; the environment was put back to its last good state.
 Or the command was not finite, and the last one was held."""
-FALLBACK = 2
-"""Status bit: a rod turned faster than a substep resolves; the first-order stage was kept there."""
-COLLISION = 4
-"""Status bit: the payload came closer to the vehicle than both radii."""
-ROPE_IN_ROTOR = 8
-"""Status bit: a joint of the rope passed through a propeller disc."""
+FALLBACK = 2  # status bit: a rod turned faster than a substep resolves; the first-order stage was kept there
+COLLISION = 4  # status bit: the payload came closer to the vehicle than both radii
+ROPE_IN_ROTOR = 8  # status bit: a joint of the rope passed through a propeller disc
 
 QUAD_FIELDS = {name: (kind, False) for name, kind in QUAD_STATE.items()}  # name: (type, also by row)
 

@@ -161,14 +161,9 @@ def extensions_of(
 
 
 def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]) -> np.ndarray:
-    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``.
+    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``, for a kernel of blocks of these kinds.
 
     Raises ValueError: other kinds of blocks, or rotors without torque, which no mixer can command yaw with.
-
-    Args:
-        t: types of the wanted precision.
-        vehicles: one for all environments, or one each.
-        kinds: of the blocks that the kernel was built for.
     """
     rows = pack(t.Vehicle, *vehicles)
     for row, vehicle in zip(rows, vehicles, strict=True):

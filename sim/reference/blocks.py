@@ -20,8 +20,7 @@ from sim.params import (
 )
 from sim.reference.rotations import cross
 
-TIME_TOLERANCE = 1e-10
-"""Times closer than this are one event [s]; a control period of 20 ms has no finer structure."""
+TIME_TOLERANCE = 1e-10  # times closer than this are one event [s]; a control period of 20 ms has no finer structure
 
 
 def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> np.ndarray:

@@ -20,8 +20,7 @@ import mujoco
 
 from sim.params import GRAVITY, BodyParams, RopeParams
 
-AXIAL_INERTIA = 1e-12
-"""Inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it must not matter."""
+AXIAL_INERTIA = 1e-12  # inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it must not matter
 
 
 def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]) -> None:

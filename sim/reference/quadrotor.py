@@ -8,10 +8,8 @@ from sim.params import GRAVITY, VehicleParams
 from sim.reference import blocks
 from sim.reference.rotations import cross, quat_dot
 
-BODY = 13
-"""Columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate 10:13 (body)."""
-BLOCKS = 15
-"""Columns of the blocks: set-point 0:3, gyro 3:6, integral 6:9, motor speed 9:13, used fraction 13, voltage 14."""
+BODY = 13  # columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate 10:13 (body)
+BLOCKS = 15  # columns of the blocks: set-point 0:3, gyro 3:6, integral 6:9, motor speed 9:13, used fraction 13, voltage 14
 
 
 @dataclass(frozen=True)

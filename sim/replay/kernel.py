@@ -21,11 +21,9 @@ from sim.kernels.structs import EXTENSIONS, Types, make_struct
 from sim.params import LawParams, SensingParams, VehicleParams
 from sim.replay.sampling import build_sampling
 
-EVERYTHING = frozenset(EXTENSIONS)
-"""The replay has every extension built in, so that lanes may differ in all of them."""
+EVERYTHING = frozenset(EXTENSIONS)  # the replay has every extension built in, so that lanes may differ in all of them
 
-ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2
-"""How the payload starts: on the rope, flying, or not there."""
+ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2  # how the payload starts: on the rope, flying, or not there
 
 STATE_FIELDS = st.QUAD_FIELDS | {
     "cable_dir_w": ("vec3", True),
@@ -37,8 +35,7 @@ STATE_FIELDS = st.QUAD_FIELDS | {
     "slack_last": ("real", False),  # and when it last came taut again; before the window's start if it did not
 }
 
-SLACK = 0.15
-"""Share of the payload's weight below which the rope counts as slack: its shape is then anyone's guess."""
+SLACK = 0.15  # share of the payload's weight below which the rope counts as slack: its shape is then anyone's guess
 
 WINDOW_FIELDS = {
     "start": ("real", False),  # [s], clock of the flight
@@ -109,14 +106,7 @@ class ReplayKernel:
 
 
 def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()) -> ReplayKernel:
-    """Compose the kernel.
-
-    Args:
-        t: types of the wanted precision.
-        vehicle: its kinds are read here.
-        segments: of the rope.
-        laws: of the plant; their coefficients are read at run time.
-    """
+    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws; numbers are read at run time."""
     real, vec3 = t.real, t.vec3
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = segments

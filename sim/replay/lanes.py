@@ -56,8 +56,7 @@ _BUILDS: dict = {}
 
 PIECES = 4  # of the lanes for each core of a CPU
 
-FEW = 32
-"""Lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes some 50 times as long."""
+FEW = 32  # lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes some 50 times as long
 
 
 class Replay:

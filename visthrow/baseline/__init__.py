@@ -4,5 +4,4 @@ The paper's Sec. IV-A. ``pendulum`` is the model, ``spline`` and ``plan`` make t
 model and on the plants, ``front`` has the settings of the sweep, ``thrower`` the throws as units of work.
 """
 
-NAME = "baseline"
-"""What compare calls it beside the policies."""
+NAME = "baseline"  # what compare calls it beside the policies

@@ -25,12 +25,10 @@ from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, 
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
 
-FINE = 4
-"""Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one."""
+FINE = 4  # Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one
 
 
-SENT = 8
-"""Commands on their way that the controller looks back at; more than any delay holds."""
+SENT = 8  # commands on their way that the controller looks back at; more than any delay holds
 
 TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
 """Share of a measurement in the estimate of payload position and velocity, cable direction and rate, and attitude."""

@@ -20,11 +20,9 @@ import numpy as np
 from sim.params import GRAVITY, PlantParams
 
 STATES, INPUTS = 16, 4
-POS, VEL, DIR, RATE, QUAT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 16)
-"""Parts of the state."""
+POS, VEL, DIR, RATE, QUAT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 16)  # parts of the state
 
-_TINY = 1e-30
-"""Complex step: so small that the derivative has no truncation error."""
+_TINY = 1e-30  # complex step: so small that the derivative has no truncation error
 
 
 @dataclass(frozen=True)
@@ -98,9 +96,7 @@ def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float,
     return np.moveaxis(columns, 0, -1)
 
 
-def linearise(
-    model: Pendulum, state: np.ndarray, control: np.ndarray, period: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def linearise(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex steps, exact to rounding.
 
     Returns:

@@ -14,8 +14,7 @@ from visthrow.baseline.spline import PlanParams, Spline, flat_reference, optimis
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import FlightLog
 
-START_HEIGHT = 0.95
-"""Height of the payload in hover (the paper, Sec. IV-A) [m]."""
+START_HEIGHT = 0.95  # height of the payload in hover (the paper, Sec. IV-A) [m]
 
 POLICY_RELEASES = {1.5: (1.107, 2.270), 2.0: (1.127, 2.935), 2.5: (1.146, 3.602)}
 """Target [m] -> height [m] and speed [m/s] at separation of the shipped state policy in the training simulator; mean of

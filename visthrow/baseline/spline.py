@@ -24,11 +24,9 @@ from visthrow.baseline.pendulum import Pendulum
 from visthrow.common.errors import VisthrowError
 
 SEGMENTS, ORDER = 4, 8
-SMOOTH = 6
-"""Derivatives 0 to 5 agree where two segments meet, and are given at the start."""
+SMOOTH = 6  # derivatives 0 to 5 agree where two segments meet, and are given at the start
 
-END = 5
-"""Derivatives 0 to 4 are given at the release."""
+END = 5  # derivatives 0 to 4 are given at the release
 
 SAMPLES, DENSE = 30, 300
 """Samples of a segment, for penalties and energy: while improving a path, and to judge it, as thrust has narrow peaks."""
@@ -48,17 +46,13 @@ the segments grow so uneven that the path rings."""
 MOST_UNEVEN = float(np.log(2.0))
 """That logarithm past which the penalty acts: a segment of a few milliseconds would slip between the samples."""
 
-STIFF = 6.0
-"""Factor on what the thrust's vertical part lacks [1/N]: past zero the vehicle turns over and the path is lost."""
+STIFF = 6.0  # factor on what the thrust's vertical part lacks [1/N]: past zero the vehicle turns over and the path is lost
 
-DIFFERENCE = 1e-6
-"""Step of the objective's slopes, in m and in logarithms of time."""
+DIFFERENCE = 1e-6  # step of the objective's slopes, in m and in logarithms of time
 
-EVALUATIONS = 100
-"""Evaluations of the objective at each duration, which starts from the path of the one before."""
+EVALUATIONS = 100  # evaluations of the objective at each duration, which starts from the path of the one before
 
-HOPELESS = 2.0
-"""Ratio of objectives at which shortening ends."""
+HOPELESS = 2.0  # ratio of objectives at which shortening ends
 
 
 @dataclass(frozen=True)
@@ -116,8 +110,7 @@ def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
     return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
 
 
-BEGINS, ENDS = _rows(np.array([0.0, 1.0]))
-"""The same where a segment begins and where it ends, in units of its time."""
+BEGINS, ENDS = _rows(np.array([0.0, 1.0]))  # the same where a segment begins and where it ends, in units of its time
 
 
 @lru_cache(maxsize=4)
@@ -158,9 +151,7 @@ def _coefficients(start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, vel
     return np.linalg.solve(matrix, right).reshape(count, SEGMENTS, ORDER, -1)
 
 
-def residuals(
-    unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES
-) -> dict[str, np.ndarray]:
+def residuals(unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES) -> dict[str, np.ndarray]:
     """Objective of B planar paths (along the throw, up) as sums of squares.
 
     Args:

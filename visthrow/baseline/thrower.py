@@ -19,8 +19,7 @@ from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
 from visthrow.training import device
 
-OWN = "pendulum"
-"""The controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`."""
+OWN = "pendulum"  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
 
 MADE_UP = {
     "none": "nothing made up for",
@@ -30,8 +29,7 @@ MADE_UP = {
 """Compensations that are compared, of :data:`visthrow.baseline.fly.COMPENSATIONS`."""
 
 
-BOUNDS = ("payload and thrust", "payload")
-"""What plans bound: ours, and the payload alone as the paper's do."""
+BOUNDS = ("payload and thrust", "payload")  # what plans bound: ours, and the payload alone as the paper's do
 
 
 def title_of(plant: str, compensation: str) -> str:

@@ -9,8 +9,7 @@ from visthrow.common.arguments import add_common, add_out
 from visthrow.common.workers import status
 
 TARGETS = (1.5, 2.0, 2.5)
-POLICY_THROWS = 100
-"""Throws of each learnt policy for its point on the front."""
+POLICY_THROWS = 100  # throws of each learnt policy for its point on the front
 
 TITLE = "Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}"
 NOTE = (

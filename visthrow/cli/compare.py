@@ -151,9 +151,7 @@ def check(targets: Sequence[float], throws: int) -> None:
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
 
 
-def throw_hybrid(
-    loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, calibrate: bool = False
-) -> list[list]:
+def throw_hybrid(loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, calibrate: bool = False) -> list[list]:
     """Throw in the training simulator, after a calibration in the hover where asked; for each policy a `Throws` a target."""
     from visthrow.throws.calibrated import calibrated_start
     from visthrow.training.env import ThrowEnv

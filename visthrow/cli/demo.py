@@ -9,11 +9,9 @@ from visthrow.common.arguments import add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 
-THROWS = 100
-"""At each of compare's targets in the training simulator, for each policy; ``--throws`` asks for another number."""
+THROWS = 100  # at each of compare's targets in the training simulator, for each policy; ``--throws`` asks for another number
 
-REFERENCE_THROWS, REFERENCE_TARGETS = 6, (2.0,)
-"""On the reference plant, for each policy; one such throw costs seconds."""
+REFERENCE_THROWS, REFERENCE_TARGETS = 6, (2.0,)  # on the reference plant, for each policy; one such throw costs seconds
 
 SEED = 0
 

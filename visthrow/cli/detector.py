@@ -37,18 +37,15 @@ LEVELS[OTHER_LENS] = LEVELS["all, half"]
 BENT = {"fx": 232.0, "fy": 232.0, "k1": 0.05, "k2": -0.006, "fov_deg": 145.0}
 """A lens beyond those of the training: longer by 1.4, where they reach 1.35, and bent outwards by 0.05, where they reach 0.02."""
 
-HIT = 4.0
-"""A detection whose points are off by more than this on average is of something else [px]."""
+HIT = 4.0  # a detection whose points are off by more than this on average is of something else [px]
 
 KNOWN = ("nothing", "pose", "track")
 """What detectors are told besides the picture: nothing; attitude and height; also where the ball was a frame ago, and how far it can
 be while it hangs. The runner tells all of it."""
 
-TRACK_ERROR = math.radians(4.0)
-"""Of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s."""
+TRACK_ERROR = math.radians(4.0)  # of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s
 
-TOGETHER = 20
-"""Throws in one process at a time."""
+TOGETHER = 20  # throws in one process at a time
 
 CHECKPOINT, WEIGHTS = "checkpoint.pt", "learnt.npz"
 

@@ -9,14 +9,11 @@ from visthrow.common.arguments import add_out
 from visthrow.common.errors import StorageError, VisthrowError
 
 TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
-UNITS = "throws"
-"""Folder of single results, in the output folder."""
+UNITS = "throws"  # folder of single results, in the output folder
 
-QUICK_LIST = "quick"
-"""List of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and ``gap`` made."""
+QUICK_LIST = "quick"  # list of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and ``gap`` made
 
-NO_REFERENCE = ('runs.shipped.throws=["own"]',)
-"""Changes of the quick list where MuJoCo is not installed."""
+NO_REFERENCE = ('runs.shipped.throws=["own"]',)  # changes of the quick list where MuJoCo is not installed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -139,9 +136,7 @@ def sections(found) -> list:
         trade.front_section(found), gap.section(found), beyond.section(found), beyond.training_section(found),
         beyond.origin_section(found),
     ]  # fmt: skip
-    return [
-        replace(s, parts=(*s.parts, *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p))) for s in made
-    ]
+    return [replace(s, parts=(*s.parts, *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p))) for s in made]
 
 
 def summary(found) -> str:

@@ -18,8 +18,7 @@ PACKAGES = ("numpy", "torch", "warp-lang", "rsl-rl-lib", "tensordict", "kornia",
             "scipy", "mujoco-core")  # fmt: skip
 """Distributions whose version can change a figure."""
 
-COMMIT_VARIABLE = "VISTHROW_COMMIT"
-"""Names the commit where a copy of the tree runs without its history (a cluster node, a container)."""
+COMMIT_VARIABLE = "VISTHROW_COMMIT"  # names the commit where a copy of the tree runs without its history (a cluster node, a container)
 
 _FOLDERS = re.compile(r"(?<![\w.~-])(?:~|[A-Za-z]:)?[/\\](?:[^\s/\\=,;:]+[/\\])*")
 

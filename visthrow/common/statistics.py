@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DRAWS = 4000
-"""Bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width."""
+DRAWS = 4000  # bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
 
 LEVEL = 0.95
 

@@ -6,8 +6,7 @@ Source: Okabe and Ito, Color Universal Design, 2008, for the eight colours.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of compared things, in order."""
 
-MARKERS = ("o", "^", "s", "D", "v", "P")
-"""Beside the colour, so that it never stands alone."""
+MARKERS = ("o", "^", "s", "D", "v", "P")  # beside the colour, so that it never stands alone
 
 INK, QUIET, FAINT = "#222222", "#767676", "#D9D9D9"
 VEHICLE, ROPE, PAYLOAD, GOAL = "#3A3F47", "#8A6D3B", "#D55E00", "#009E73"

@@ -16,8 +16,7 @@ from typing import Any
 
 from visthrow.common.errors import VisthrowError
 
-LOOK = 0.5
-"""Between two looks at the progress [s]."""
+LOOK = 0.5  # between two looks at the progress [s]
 
 
 def status(text: str) -> None:

@@ -10,10 +10,8 @@ from typing import Any, Literal, Union
 
 from visthrow.common.errors import ConfigError, suggest
 
-NONE_WORD = "none"
-"""TOML has no null: this string stands for None wherever a field is optional."""
-BASE_KEY = "base"
-"""Names what lies under a file (another file) or under a table among like ones (a sibling)."""
+NONE_WORD = "none"  # TOML has no null: this string stands for None wherever a field is optional
+BASE_KEY = "base"  # names what lies under a file (another file) or under a table among like ones (a sibling)
 
 
 @dataclass

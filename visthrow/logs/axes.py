@@ -8,8 +8,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-OURS = "x,y,z"
-"""Axes that are ours already."""
+OURS = "x,y,z"  # axes that are ours already
 _AXIS = re.compile(r"[+-]?[xyz]")
 
 
@@ -47,7 +46,5 @@ EVERY = tuple(
     for order in permutations("xyz") for signs in product(("", "-"), repeat=3)
 )  # fmt: skip
 """All 48 sets."""
-TURNS = tuple(axes for axes in EVERY if not is_mirror(axes))
-"""The 24 that are turns."""
-MATRICES = np.array([matrix_of(axes) for axes in EVERY])
-"""Matrix of each of :data:`EVERY`, shape (48, 3, 3)."""
+TURNS = tuple(axes for axes in EVERY if not is_mirror(axes))  # the 24 that are turns
+MATRICES = np.array([matrix_of(axes) for axes in EVERY])  # matrix of each of :data:`EVERY`, shape (48, 3, 3)

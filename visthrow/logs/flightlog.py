@@ -69,9 +69,7 @@ class Channel:
         values = np.asarray(self.values)
         valid = np.ones(len(time), dtype=bool) if self.valid is None else np.asarray(self.valid, dtype=bool)
         if time.ndim != 1 or values.ndim < 1 or valid.shape != time.shape or len(values) != len(time):
-            raise LogError(
-                f"got time {time.shape}, values {values.shape}, validity {valid.shape}; expected (T,), (T, ...), (T,)"
-            )
+            raise LogError(f"got time {time.shape}, values {values.shape}, validity {valid.shape}; expected (T,), (T, ...), (T,)")
         if not np.all(np.isfinite(time)):
             raise LogError(f"time stamp {int(np.argmin(np.isfinite(time)))} is not finite")
         late = np.flatnonzero(np.diff(time) <= 0.0)
@@ -176,9 +174,7 @@ class FlightLog:
             if version != FORMAT_VERSION:
                 raise LogError(f"format version {version}; this program reads version {FORMAT_VERSION}")
             channels = {
-                name: Channel(
-                    arrays[f"{name}/time"], arrays[f"{name}/values"], of["unit"], of["frame"], arrays[f"{name}/valid"]
-                )
+                name: Channel(arrays[f"{name}/time"], arrays[f"{name}/values"], of["unit"], of["frame"], arrays[f"{name}/valid"])
                 for name, of in units.items()
             }
             return FlightLog(channels, meta)
@@ -192,11 +188,7 @@ class FlightRecorder:
     """Collects samples one by one and becomes a ``FlightLog``; what it is given is copied."""
 
     def __init__(self, meta: Mapping[str, Any] | None = None) -> None:
-        """Start empty.
-
-        Args:
-            meta: Metadata of the flight.
-        """
+        """Start empty, with metadata of the flight."""
         self.meta = dict(meta or {})
         self._samples: dict[str, list[tuple[float, np.ndarray, bool]]] = {}
         self._units: dict[str, tuple[str, str]] = {}

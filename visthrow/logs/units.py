@@ -4,8 +4,7 @@ import math
 
 from visthrow.common.errors import ConfigError, suggest
 
-G = 9.80665
-"""Standard gravity [m/s^2]: what a datasheet's g and gram-force mean; not the local one."""
+G = 9.80665  # standard gravity [m/s^2]: what a datasheet's g and gram-force mean; not the local one
 
 UNITS = {
     "s": ("s", 1.0), "ms": ("s", 1e-3), "us": ("s", 1e-6), "ns": ("s", 1e-9), "min": ("s", 60.0),

@@ -65,9 +65,7 @@ def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
     return mean + velocity * (time[:, None] - sums[:, 1:2] / total) * (sums[:, :1] > 0.0)
 
 
-def measured_goal(
-    layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None
-) -> tuple[Tensor, Tensor]:
+def measured_goal(layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None) -> tuple[Tensor, Tensor]:
     """Goal in the world as one frame shows it.
 
     Args:

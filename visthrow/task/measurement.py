@@ -12,11 +12,9 @@ import numpy as np
 from sim.params import RandomizationParams
 from visthrow import config
 
-TARGETS = (1.5, 2.0, 2.5)
-"""Targets along x [m]; the last lies outside the training distribution."""
+TARGETS = (1.5, 2.0, 2.5)  # targets along x [m]; the last lies outside the training distribution
 
-LANDED = 0.95
-"""Share of throws that must land before their mean error says anything of a policy."""
+LANDED = 0.95  # share of throws that must land before their mean error says anything of a policy
 
 
 def pilots_hover() -> RandomizationParams:

@@ -22,8 +22,7 @@ from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
 
-SETTLE = 3.0
-"""After the sway, until the swing that it leaves has died down [s]."""
+SETTLE = 3.0  # after the sway, until the swing that it leaves has died down [s]
 
 
 def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | None = None) -> Callable[[ThrowEnv], TensorDict]:
@@ -68,9 +67,7 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
         env.carry(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device))
     time, pos, quat, vel, rates, thrust, points, valid = (np.stack(column, 1) for column in zip(*rows))
     goal = env.views.goal_w.cpu().numpy()
-    return [
-        Hovered(time[i], pos[i], quat[i], vel[i], rates[i], thrust[i], points[i], valid[i], goal[i]) for i in range(env.num_envs)
-    ]
+    return [Hovered(time[i], pos[i], quat[i], vel[i], rates[i], thrust[i], points[i], valid[i], goal[i]) for i in range(env.num_envs)]
 
 
 def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:

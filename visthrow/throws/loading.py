@@ -23,9 +23,7 @@ class Loaded:
     departures: dict[str, Any] = field(default_factory=dict)  # where that breaks the contract by allowance: dotted key -> value flown with
 
 
-def load_policy(
-    name: str | Path, config_name: str | None = None, overrides: Iterable[str] = (), allow: Collection[str] = ()
-) -> Loaded:
+def load_policy(name: str | Path, config_name: str | None = None, overrides: Iterable[str] = (), allow: Collection[str] = ()) -> Loaded:
     """Load a policy and the experiment that it was trained in, or another one that fits its contract.
 
     Raises PolicyError: no such policy, or it does not carry its config and none was named; MismatchError: the config breaks the policy's

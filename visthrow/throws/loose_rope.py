@@ -14,12 +14,10 @@ import numpy as np
 from sim.params import GRAVITY
 
 STEP = 1e-3  # [s]
-ITERATIONS = 4
-"""Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and converge at once."""
+ITERATIONS = 4  # Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and converge at once
 
 SINKING_STEP = 4e-3  # [s]
-SINKING_DAMPING = 6.0
-"""Damping of the rope on the ground [1/s]; a picture's taste, no measurement."""
+SINKING_DAMPING = 6.0  # damping of the rope on the ground [1/s]; a picture's taste, no measurement
 
 
 class LooseRope:

@@ -32,8 +32,7 @@ def known_plant(name: str) -> str:
     return name
 
 
-BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
-"""State arrays of bodies and ropes."""
+BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")  # state arrays of bodies and ropes
 
 
 class Plant(Protocol):

@@ -27,14 +27,11 @@ from visthrow.training.device import cores
 if TYPE_CHECKING:
     from visthrow.view.eyes import Eyes
 
-BATCH = 100
-"""Throws that share one plant: about 23 s of one core a batch and 1 s a throw."""
+BATCH = 100  # throws that share one plant: about 23 s of one core a batch and 1 s a throw
 
-HOVER_TIME = 1.6
-"""Before the policy takes over [s]; a whole number of control periods."""
+HOVER_TIME = 1.6  # before the policy takes over [s]; a whole number of control periods
 
-THROW_TIME = 1.3
-"""Time of most throws until the landing, for the line of progress [s]."""
+THROW_TIME = 1.3  # time of most throws until the landing, for the line of progress [s]
 
 FIELDS = ("success", "landing_w", "error", "duration", "clearance", "smoothness")
 

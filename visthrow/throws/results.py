@@ -22,14 +22,12 @@ from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import done
 
-PROTOCOL = 1
-"""Goes up when the same unit would come out otherwise: an older result is then no longer used."""
+PROTOCOL = 1  # goes up when the same unit would come out otherwise: an older result is then no longer used
 
 RECORDS = Path(__file__).resolve().parents[1] / "evidence" / "records"
 """Committed records: ``throws`` (packed results), ``training`` (runs), ``findings`` (text)."""
 
-DIGITS = 4
-"""After the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by."""
+DIGITS = 4  # after the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by
 
 
 @dataclass(frozen=True)

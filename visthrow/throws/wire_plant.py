@@ -17,8 +17,7 @@ MECHANISM = 0.06
 """From the trip of the latch to separation behind a firmware [s]: a quick servo, so that the firmware's own delay has room
 within the lag that the policies were trained with."""
 
-CARRIED = 0.8
-"""Share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all where it stands too high."""
+CARRIED = 0.8  # share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all where it stands too high
 
 
 class WirePlant:

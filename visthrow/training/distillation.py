@@ -27,11 +27,9 @@ from visthrow.training.ranks import Ranks
 SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
 """Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal and payload offsets [m]."""
 
-AVERAGED = 100
-"""Gradient steps that the exported weights are a mean of, at most."""
+AVERAGED = 100  # gradient steps that the exported weights are a mean of, at most
 
-WATCHED = 50
-"""Iterations in which the observations' mean and spread are taken; from there they stand still."""
+WATCHED = 50  # iterations in which the observations' mean and spread are taken; from there they stand still
 
 
 class Network(nn.Module):

@@ -29,8 +29,7 @@ from visthrow.training.device import rounded_products
 RESULTS = ("episodes", "released", "landing_error", "duration")
 """Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
 
-POSE = ob.VEHICLE + 3
-"""Width of a pose sample: vehicle's part of a frame and the payload's position."""
+POSE = ob.VEHICLE + 3  # width of a pose sample: vehicle's part of a frame and the payload's position
 
 
 class ThrowEnv(VecEnv):
@@ -354,8 +353,7 @@ class ThrowEnv(VecEnv):
             memory["answers"].copy_(hist.push(memory["answers"], ob.answer(measured, memory["previous"]), fresh))
             answers = memory["answers"][:, 1:]
         actor, history = ob.observe(
-            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places, answers,
-            self._setup,
+            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places, answers, self._setup
         )
         memory["history"].copy_(history)
         observed = {"actor": actor, "critic": self._privileged(actor, vehicle, payload, time, fresh)}

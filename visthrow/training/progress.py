@@ -17,14 +17,11 @@ COLUMNS = (
     "rollout_s", "learning_s", "wall_s", "error_2m", "duration_2m", "landed_2m",
 )  # fmt: skip
 
-REDRAWN = 0.5
-"""Between two pictures [s]."""
+REDRAWN = 0.5  # between two pictures [s]
 
-CURVE, SCATTER = (56, 10), (22, 10)
-"""Width and height of the two plots, in characters."""
+CURVE, SCATTER = (56, 10), (22, 10)  # width and height of the two plots, in characters
 
-REACH = 0.3
-"""Half of the square about the target that the scatter shows [m]."""
+REACH = 0.3  # half of the square about the target that the scatter shows [m]
 
 
 class TrainLog:

@@ -10,8 +10,7 @@ import torch
 from rsl_rl.utils import reduce_gradients_in_buckets
 from torch import Tensor, distributed, nn
 
-BUCKET_MB = 64.0
-"""Gradients that are averaged at once [MB]."""
+BUCKET_MB = 64.0  # gradients that are averaged at once [MB]
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, f
 
 EVALUATION_TARGET = 2.0  # [m]
 
-EVALUATION_SHARE = 0.05
-"""Of the wall time that evaluations may take where their number is left to the command."""
+EVALUATION_SHARE = 0.05  # of the wall time that evaluations may take where their number is left to the command
 
 
 @dataclass(frozen=True)

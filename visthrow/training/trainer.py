@@ -23,11 +23,9 @@ from visthrow.training.ranks import Ranks
 CHECKPOINT, POLICY, SUMMARY, EVALUATION = "checkpoint.pt", "policy.npz", "summary.json", "evaluation.json"
 """Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its end, and of one that did not."""
 
-ADAPTATION = 'ppo="ppo/adapt.toml"'
-"""Override that puts the schedule of a training from a policy in the place of the configuration's own."""
+ADAPTATION = 'ppo="ppo/adapt.toml"'  # override that puts the schedule of a training from a policy in the place of the configuration's own
 
-EVALUATED = 200
-"""Throws of an evaluation."""
+EVALUATED = 200  # throws of an evaluation
 
 TASK = ("observation", "action", "control_period")
 """Parts of a policy's contract that its network cannot do without; plant, camera and release may differ from its training's."""

@@ -20,17 +20,13 @@ from camera.params import CameraParams
 from visthrow.common.storage import atomic_write
 from visthrow.onboard.observations import rotation_from_quat
 
-HANGING = (0.2, 0.6)
-"""Distance of a hanging ball from the lens [m]."""
+HANGING = (0.2, 0.6)  # distance of a hanging ball from the lens [m]
 
-SURE = 0.5
-"""Share of the looks in a hover in which ball and goal must be found."""
+SURE = 0.5  # share of the looks in a hover in which ball and goal must be found
 
-BY = ("learnt", "contours")
-"""Detectors."""
+BY = ("learnt", "contours")  # detectors
 
-THINGS = ("ball", "goal")
-"""What they look for."""
+THINGS = ("ball", "goal")  # what they look for
 
 
 class Eyes:

@@ -10,11 +10,9 @@ from visthrow.common import style
 from visthrow.common.statistics import Interval, pareto
 from visthrow.view.parts import png_of
 
-WIDTH = 9.2
-"""Width of a picture over the whole page [inch]."""
+WIDTH = 9.2  # width of a picture over the whole page [inch]
 
-CIRCLES = (0.1, 0.2, 0.4)
-"""About the target, in scatter panels [m]."""
+CIRCLES = (0.1, 0.2, 0.4)  # about the target, in scatter panels [m]
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 
-IMAGE_PERIOD = 0.04
-"""Between two pictures of the image plane [s]."""
+IMAGE_PERIOD = 0.04  # between two pictures of the image plane [s]
 
 _NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
 

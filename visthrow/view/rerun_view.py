@@ -209,8 +209,7 @@ def _plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
     stream.log("camera/invalid", rr.Points2D.from_fields(radii=1.2, colors=[[170, 170, 170]]), static=True)
 
 
-GROUPS = {"goal": [60, 200, 80], "payload": [230, 60, 60]}
-"""Keypoints and their colours."""
+GROUPS = {"goal": [60, 200, 80], "payload": [230, 60, 60]}  # keypoints and their colours
 
 
 def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
@@ -262,8 +261,7 @@ def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
     return [curve for curve in curves if curve[1] in log]
 
 
-MILLISECONDS = ("age", "tick")
-"""Groups whose channels, in seconds, are drawn in milliseconds."""
+MILLISECONDS = ("age", "tick")  # groups whose channels, in seconds, are drawn in milliseconds
 
 
 def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:

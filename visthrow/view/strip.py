@@ -18,8 +18,7 @@ from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
 GROUND = 0.13  # of it seen below z = 0 [m]
-WIDTH, LEFT, PANEL, GAP = 13.6, 0.62, 3.06, 0.22
-"""Widths of the picture, its left margin, a panel, and the gap between two [inch]."""
+WIDTH, LEFT, PANEL, GAP = 13.6, 0.62, 3.06, 0.22  # widths of the picture, its left margin, a panel, and the gap between two [inch]
 
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]
@@ -89,8 +88,7 @@ def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
     paths = [
-        of.values[(of.time >= times["policy_start"]) & (of.time <= times["landing"] + 0.02)]
-        for of in (log["pos_w"], log["payload_pos_w"])
+        of.values[(of.time >= times["policy_start"]) & (of.time <= times["landing"] + 0.02)] for of in (log["pos_w"], log["payload_pos_w"])
     ]
     x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
     top = max(path[:, 2].max() for path in paths)

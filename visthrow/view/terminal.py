@@ -3,8 +3,7 @@
 import math
 from collections.abc import Sequence
 
-RISES = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0)
-"""Values that an axis may end at [m]."""
+RISES = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0)  # values that an axis may end at [m]
 
 
 def curve(rows: Sequence[tuple[str, Sequence[tuple[float, float]]]], width: int, height: int, unit: str) -> list[str]:
@@ -41,9 +40,7 @@ def scatter(points: Sequence[tuple[float, float]], reach: float, width: int, hei
         row = min(max(int((1.0 - up / reach) * height / 2.0), 0), height - 1)
         counts[row][column] += 1
     middle = (height // 2, width // 2)
-    cells = [
-        "".join(str(min(n, 9)) if n else "+" if (i, j) == middle else " " for j, n in enumerate(row)) for i, row in enumerate(counts)
-    ]
+    cells = ["".join(str(min(n, 9)) if n else "+" if (i, j) == middle else " " for j, n in enumerate(row)) for i, row in enumerate(counts)]
     edge = f"+{'-' * width}+"
     return [edge, *(f"|{row}|" for row in cells), edge]
 

@@ -9,8 +9,7 @@ import warp as wp
 
 from camera.detectors.scenes import textures
 
-LENS_STEPS = wp.constant(12)
-"""Newton's steps to the angle of a pixel; the lens is monotonic."""
+LENS_STEPS = wp.constant(12)  # Newton's steps to the angle of a pixel; the lens is monotonic
 
 MIPS = wp.constant(textures.MIPS)
 SIZE = wp.constant(textures.SIZE)

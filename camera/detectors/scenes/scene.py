@@ -12,8 +12,7 @@ from camera.keypoints import ball_extremes_c, goal_corners_w
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
 
-THINGS = 10
-"""Most things on the ground and about the hall."""
+THINGS = 10  # most things on the ground and about the hall
 
 
 @dataclass(frozen=True)

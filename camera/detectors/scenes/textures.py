@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-SIZE, MIPS = 512, 7
-"""Side of the finest level [px], and the number of levels, each half as large."""
+SIZE, MIPS = 512, 7  # side of the finest level [px], and the number of levels, each half as large
 
 TRAINING = ("brick", "gravel", "coffee", "motorcycle_left", "rocket", "color", "coins")
 HELD_OUT = ("grass", "chelsea", "motorcycle_right", "astronaut", "moon")

@@ -43,9 +43,7 @@ class Recorder:
             raise StorageError(f"{self.folder} holds a run already; name another folder with --out")
         source = find_policy(params.policy)
         data = source.read_bytes()
-        provenance.write_run_folder(
-            self.folder, config.dumps(params), policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest()
-        )
+        provenance.write_run_folder(self.folder, config.dumps(params), policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest())
         atomic_write(self.folder / POLICY, data)
         self._writers = {name: Writer(self.folder / name) for name in (POSES, TICKS)}
 

@@ -73,11 +73,7 @@ def needed(params: BetaflightParams) -> dict[str, str]:
     }
     out |= {name: str(value) for name, value in GAINS.items()} | FOR_THUMBS
     for i, axis in enumerate(("roll", "pitch", "yaw")):
-        out |= {
-            f"{axis}_rc_rate": str(rates.rc_rates[i]),
-            f"{axis}_srate": str(rates.rates[i]),
-            f"{axis}_expo": str(rates.expo[i]),
-        }
+        out |= {f"{axis}_rc_rate": str(rates.rc_rates[i]), f"{axis}_srate": str(rates.rates[i]), f"{axis}_expo": str(rates.expo[i])}
     if params.arm_channel:
         out["aux 0"] = f"0 {params.arm_channel - 1} 1700 2100 0 0"
     else:  # a receiver has all channels; the switch of MSP OVERRIDE is on AUX 2

@@ -102,7 +102,6 @@ class Eyes:
         ball = None if seen.ball is None else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
         return Detection(stamp, corners, ball)
 
-
     def poll(self, now: float) -> list[Detection]:
         """Return detections that have come by a time [s]; never waits."""
         raise NotImplementedError

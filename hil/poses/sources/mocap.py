@@ -176,8 +176,7 @@ def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
     names = {body.name: body.body for body in bodies}
     if not names or len(names) != len(bodies) or len(set(names.values())) != len(bodies):
         raise SourceError(
-            f"source.bodies {[(b.body, b.name) for b in bodies]}; expected each body once, with a name of its own. "
-            f"{suggest('', BODIES)}"
+            f"source.bodies {[(b.body, b.name) for b in bodies]}; expected each body once, with a name of its own. {suggest('', BODIES)}"
         )
     return names
 

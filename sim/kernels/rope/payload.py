@@ -6,8 +6,7 @@ import warp as wp
 
 from sim.kernels.structs import Types
 
-LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})
-"""Extensions that push at the payload."""
+LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})  # extensions that push at the payload
 
 
 def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):

@@ -12,8 +12,7 @@ from sim.kernels.structs import Types
 
 FLIGHT_STEP = 0.02
 """Largest step of a flight under drag [s]: RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it)."""
-FLIGHT_STEPS = 500
-"""Steps after which a payload that has not come down counts as one that never will."""
+FLIGHT_STEPS = 500  # steps after which a payload that has not come down counts as one that never will
 
 
 @wp.func

@@ -13,8 +13,7 @@ from visthrow.evidence.bench import records
 from visthrow.evidence.bench.records import Report, Table, rate
 from visthrow.training.device import device_name, rounded_products
 
-WARM_UP = 3
-"""Iterations before measuring: the first runs eagerly, the second captures the CUDA graph."""
+WARM_UP = 3  # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
 
 PARTS = {
     "simulation": "the fused kernel",

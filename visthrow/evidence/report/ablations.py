@@ -10,20 +10,17 @@ from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER_ABLATIONS
 
-TARGET = 2.0
-"""Target of Table V [m]."""
+TARGET = 2.0  # target of Table V [m]
 
 PAPER_FOUR = tuple(name for name in PAPER_ABLATIONS if name != "full")
-PAPER_THROWS, PAPER_FULL_THROWS = 5, 10
-"""Number of throws of each ablation and of the full model (the paper's figure of landing points)."""
+PAPER_THROWS, PAPER_FULL_THROWS = 5, 10  # number of throws of each ablation and of the full model (the paper's figure of landing points)
 
 NOTE = (
     "Scatter: root mean square distance from the mean landing point of all trainings; what is left of the error is bias. "
     "The paper's interval is ours, from its deviations and numbers of throws."
 )
 
-FURTHER = ("no_delay", "no_battery", "no_release_lag")
-"""What the paper leaves out."""
+FURTHER = ("no_delay", "no_battery", "no_release_lag")  # what the paper leaves out
 
 TITLES = {
     "full": "full model", "no_aerodynamics": "no aerodynamics", "no_motor_lag": "no motor lag",
@@ -32,8 +29,7 @@ TITLES = {
 }  # fmt: skip
 """Variant -> its name in tables."""
 
-PLANTS = ("reference-realistic", "reference")
-"""Where ablated policies fly without retraining; the first is the stand-in for a vehicle."""
+PLANTS = ("reference-realistic", "reference")  # where ablated policies fly without retraining; the first is the stand-in for a vehicle
 
 SHORT_LAYOUT = {"state": "state policies", "vision": "vision policies"}
 

@@ -14,8 +14,7 @@ from visthrow.view.parts import Grid, Picture, Section, Text
 
 TARGET = 2.0
 SPEED_KEY = "task.target.speed"
-MOVING_BAR, PAYLOAD_BAR = 0.12, 0.10
-"""Mean errors that were asked for: targets that move at 0.5 m/s; payloads that vary, both at 2.0 m [m]."""
+MOVING_BAR, PAYLOAD_BAR = 0.12, 0.10  # mean errors that were asked for: targets that move at 0.5 m/s; payloads that vary, both at 2.0 m [m]
 
 VARIANTS = ("moving", "payload", "drag", "far")
 TITLES = {
@@ -96,8 +95,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
                 label = f"{policy}, {TITLES['full']}" if policy in SHIPPED else policy
                 lines.append(figures.Line(label, [x for x, _ in points], [st.mean(r.of("error")) for _, r in points], len(lines)))
             rows += [
-                (policy, SHORT[plant], f"{speed:g}", str(len(r.good)), landed(r), st.mean(r.of("error")).text())
-                for speed, r in points
+                (policy, SHORT[plant], f"{speed:g}", str(len(r.good)), landed(r), st.mean(r.of("error")).text()) for speed, r in points
             ]
     made: list = []
     if lines:

@@ -11,11 +11,9 @@ import numpy as np
 from visthrow.common.errors import StorageError
 from visthrow.throws.results import PROTOCOL, RECORDS, Result, join, load_all
 
-SHIPPED = ("state", "vision")
-"""The paper's two policies, as they come with the package."""
+SHIPPED = ("state", "vision")  # the paper's two policies, as they come with the package
 
-ANY = object()
-"""Any departures."""
+ANY = object()  # any departures
 
 
 @dataclass(frozen=True)

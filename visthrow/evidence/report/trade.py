@@ -16,8 +16,7 @@ from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER
 
-DRAWS = 800
-"""Bootstrap samples of a hypervolume."""
+DRAWS = 800  # bootstrap samples of a hypervolume
 
 KINDS = (("both", BOUNDS[0]), ("both", BOUNDS[1]), ("delay", BOUNDS[0]))
 PANELS = (
@@ -208,9 +207,7 @@ def _policy_sum(title: str, name: str, result: Result) -> tuple[str, ...]:
             f"{result.of('duration').mean():.3f}", f"{result.of('error').mean():.3f}", text, "-")  # fmt: skip
 
 
-def _verdicts(
-    title: str, label: str, found: Sequence[Result], policies: Sequence[tuple[str, Result]], policies_on: str
-) -> list[str]:
+def _verdicts(title: str, label: str, found: Sequence[Result], policies: Sequence[tuple[str, Result]], policies_on: str) -> list[str]:
     """Whether the issue's claim holds: no setting as accurate and as fast, and at each setting's accuracy the policy faster."""
     points, said = points_of(found), []
     for name, result in policies:

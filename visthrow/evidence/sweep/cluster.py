@@ -10,11 +10,9 @@ from visthrow.common.errors import ConfigError
 from visthrow.evidence.sweep.pool import Task
 from visthrow.evidence.sweep.work import EXIT_STOPPED
 
-SLACK = 5
-"""Minutes that a job is granted beyond its piece: start of the process, last checkpoint."""
+SLACK = 5  # minutes that a job is granted beyond its piece: start of the process, last checkpoint
 
-LOST_AT_MOST = 3
-"""Times that a task's job may vanish (preempted, out of time, its node down) before the task counts as failed."""
+LOST_AT_MOST = 3  # times that a task's job may vanish (preempted, out of time, its node down) before the task counts as failed
 
 
 class Job:

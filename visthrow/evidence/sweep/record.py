@@ -10,8 +10,7 @@ from visthrow.evidence.sweep.units import PROGRESS, SUMMARY, Source, Work, throw
 from visthrow.evidence.sweep.work import PIECES, held, lock_of
 from visthrow.throws import results
 
-CURVE_POINTS = 60
-"""Points of a run's learning curve in the record."""
+CURVE_POINTS = 60  # points of a run's learning curve in the record
 
 
 def status(work: Work, out: Path) -> tuple[list[str], bool]:

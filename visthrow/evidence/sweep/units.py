@@ -20,8 +20,7 @@ from visthrow.task import Experiment
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import batches
 
-FULL = {"state": "state", "vision": "vision_ideal"}
-"""Layout -> the training config whose variants are compared with it."""
+FULL = {"state": "state", "vision": "vision_ideal"}  # layout -> the training config whose variants are compared with it
 
 POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
 

@@ -22,8 +22,7 @@ from visthrow.evidence.sweep.units import Source, ThrowUnit, Work, throws_folder
 from visthrow.throws import results
 from visthrow.throws.loading import Loaded, load_policy
 
-PIECES = "pieces"
-"""Folder of a run with one file a piece."""
+PIECES = "pieces"  # folder of a run with one file a piece
 
 EXIT_STOPPED, EXIT_BUSY = 130, 75
 

@@ -11,8 +11,7 @@ from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, Known, Row
 from visthrow.logs.flightlog import FlightLog
 
-MOVES = 0.05
-"""Below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared."""
+MOVES = 0.05  # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared
 
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST, _FARTHEST = 60.0, 2000.0  # of vehicles that throw [m/s], [m]
@@ -33,12 +32,7 @@ _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave 
 
 
 def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
-    """Return the findings of all checks of what moves how.
-
-    Args:
-        log: Of one flight.
-        known: What the model says of the vehicle.
-    """
+    """Return the findings of all checks of what moves how in one flight."""
     rows = list(_plausible(log))
     for prefix in _PREFIXES:
         pos, vel, quat = f"{prefix}pos_w", f"{prefix}vel_w", f"{prefix}quat_wb"
@@ -277,9 +271,7 @@ def _pushed(found: relations.Relation, acc: np.ndarray, pushed: np.ndarray, both
     return rows
 
 
-def _exchanged(
-    time: np.ndarray, acc: np.ndarray, pushed: np.ndarray, turn: Rotation, delay: float, both: str, sensed: bool
-) -> Row | None:
+def _exchanged(time: np.ndarray, acc: np.ndarray, pushed: np.ndarray, turn: Rotation, delay: float, both: str, sensed: bool) -> Row | None:
     """Which exchange of axes, of the path or of the accelerometer, or which turn of the attitude, makes both fit."""
     inside = (time + delay > time[0]) & (time + delay < time[-1])
     acc, turn = acc[inside], turn[inside]

@@ -8,13 +8,11 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.rotations import continuous
 from visthrow.logs.axes import EVERY, MATRICES
 
-REACH = 0.4
-"""Largest delay looked for [s]."""
+REACH = 0.4  # largest delay looked for [s]
 _NEAR = 0.25  # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
 _LONGEST_GRID = 60_000  # samples; longer stretches are thinned
 
-INDEPENDENT = 0.1
-"""Samples of a flight this far apart [s] count as independent where evidence is weighed."""
+INDEPENDENT = 0.1  # samples of a flight this far apart [s] count as independent where evidence is weighed
 
 UNITS = {
     180 / np.pi: "one is in degrees", np.pi / 180: "one is in degrees", 1000.0: "one is in thousandths",

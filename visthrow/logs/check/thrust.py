@@ -11,8 +11,7 @@ INPUTS = ("command", "thrust_command", "throttle", "motor_speed", "motor_command
 ROTORS = ("motor_speed", "motor_command", "motor_output", "pwm")
 NAMES = ("front left", "front right", "rear left", "rear right")
 
-UNITS = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
-"""Units of a thrust, in newtons."""
+UNITS = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}  # units of a thrust, in newtons
 _UNIT = 0.25  # of the logarithm of a ratio from a unit's
 _SPAN = 0.1  # over which both forces are averaged: vibration goes [s]
 _VARIES = 0.003  # of the mean, that a force must vary by before it says whether it follows
@@ -27,12 +26,7 @@ _UNEVEN = 0.4  # of the logarithm of a rotor over the others: an arm's weight or
 
 
 def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
-    """Return the findings about thrust and rotors.
-
-    Args:
-        log: Of one flight.
-        known: What the model says of the vehicle.
-    """
+    """Return the findings about thrust and rotors in one flight."""
     return [*_force(log, known), *_rotors(log), *_turning(log)]
 
 
@@ -190,9 +184,7 @@ def _turning(log: FlightLog) -> list[Row]:
         return []
     time_d, turning = relations.derivative(time_w, rate, 0.03)
     front_left, front_right, rear_left, rear_right = motors.T
-    torque = np.column_stack(
-        [front_left + rear_left - front_right - rear_right, rear_left + rear_right - front_left - front_right]
-    )
+    torque = np.column_stack([front_left + rear_left - front_right - rear_right, rear_left + rear_right - front_left - front_right])
     if len(time_d) < 50 or np.max(np.std(torque, axis=0)) <= 0.0:
         return []
     rows = []

@@ -15,8 +15,7 @@ from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.messages import Messages, read_dataflash, read_telemetry, read_ulog
 from visthrow.logs.readers.table import make_channel
 
-NED = "x,-y,-z"
-"""Our axes in the autopilot's, world and body alike."""
+NED = "x,-y,-z"  # our axes in the autopilot's, world and body alike
 
 
 def _t(message: str, fields: str, channel: str, unit: str, kind: str = "vector", **more) -> tuple[str, ChannelMap]:
@@ -82,11 +81,7 @@ TELEMETRY = (
 SWEEP, SWEEP_AXES = ("SIDS", "SIDD"), 7
 """Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it sweeps rates of roll, pitch, yaw."""
 
-READERS = {
-    ".ulg": (read_ulog, ULOG),
-    ".bin": (read_dataflash, DATAFLASH),
-    ".tlog": (read_telemetry, TELEMETRY),
-}
+READERS = {".ulg": (read_ulog, ULOG), ".bin": (read_dataflash, DATAFLASH), ".tlog": (read_telemetry, TELEMETRY)}
 """Ending -> reader of the messages, and what they tell."""
 
 

@@ -25,8 +25,7 @@ from visthrow.common.extras import load_extra
 Fields = dict[str, np.ndarray]
 """Field -> values, shape (T,); ``time`` is when it was measured and ``arrival`` when it was written, both [s]."""
 
-MOST_RETURNS = 8
-"""Times that a reader may step back to one and the same byte; one that is led astray by a damaged length does so for ever."""
+MOST_RETURNS = 8  # times that a reader may step back to one and the same byte; one that is led astray by a damaged length does so for ever
 
 _HEAD = b"\xa3\x95"  # of every DataFlash message; whatever begins otherwise would be searched byte by byte
 _INSTANCE = ("I", "C")  # fields of DataFlash that number sensors and estimator cores

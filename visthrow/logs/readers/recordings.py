@@ -20,8 +20,7 @@ from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 from visthrow.logs.readers.table import Table
 
-WIDEST = 32
-"""A matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal."""
+WIDEST = 32  # a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal
 _CARD = 0xBC
 _CARD_TYPES = set("BbHhIiQqfdeL?")
 

@@ -22,8 +22,7 @@ Table = dict[str, np.ndarray]
 """Column -> values; numbers as float64 (NaN where the cell is empty), anything else as text."""
 
 _EXPORTED = re.compile(r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:, (?P<frame>world|body|camera|image|mocap))?\]")
-_LARGEST = 1e100
-"""No number of a flight is as large, in whatever unit; its square is still a number."""
+_LARGEST = 1e100  # no number of a flight is as large, in whatever unit; its square is still a number
 _SNIFFED = 65536  # characters in which separators are looked for
 _COMMA = re.compile(r"\d,\d")
 _WORDS = {"True": 1.0, "False": 0.0}
@@ -136,12 +135,9 @@ def _text(value: object) -> str:
 
 
 def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
-    """Make flight logs of a table. Raises LogError: a column is missing or holds no numbers, or nothing is left after splitting.
+    """Make flight logs of a table, which messages call its ``source``.
 
-    Args:
-        table: From :func:`read_table`.
-        mapping: Of its columns.
-        source: What messages call the table.
+    Raises LogError: a column is missing or holds no numbers, or nothing is left after splitting.
     """
     count = len(next(iter(table.values())))
     parts = _parts(table, mapping, count, source)

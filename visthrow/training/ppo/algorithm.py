@@ -15,8 +15,7 @@ from visthrow.training.ppo.network import CapturableGaussian, Network
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
 
-WARM_UP_RATE = 2e-3
-"""Learning rate of a critic that learns alone; nothing that it moves is flown."""
+WARM_UP_RATE = 2e-3  # learning rate of a critic that learns alone; nothing that it moves is flown
 
 
 def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:

@@ -8,8 +8,7 @@ import warp as wp
 
 from sim.kernels import runtime  # noqa: F401  starts Warp
 
-LOWEST, HIGHEST = wp.constant(1e-5), wp.constant(1e-2)
-"""Range of the adaptive learning rate."""
+LOWEST, HIGHEST = wp.constant(1e-5), wp.constant(1e-2)  # range of the adaptive learning rate
 
 VALUE, SURROGATE, MOVED = wp.constant(0), wp.constant(1), wp.constant(2)
 """Columns of ``parts``: two losses, A squares of how far the mean moved in spreads, A derivatives by log spreads."""

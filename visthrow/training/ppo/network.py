@@ -15,11 +15,9 @@ from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
-ALIGNED = 16
-"""Columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes or multiples."""
+ALIGNED = 16  # columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes or multiples
 
-SEEN = 10**8
-"""Observations that a policy's normaliser counts for when it is taken up: about those of its training, which no file tells."""
+SEEN = 10**8  # observations that a policy's normaliser counts for when it is taken up: about those of its training, which no file tells
 
 
 def normalizer_state(mean: Tensor, std: Tensor) -> dict[str, Tensor]:

@@ -29,12 +29,10 @@ from visthrow.common.storage import atomic_write
 from visthrow.view.camera import BOARD
 
 BLUE, YELLOW = (230, 120, 40), (60, 210, 240)
-SAMPLES = 16
-"""Rays a pixel of a rendered frame."""
+SAMPLES = 16  # rays a pixel of a rendered frame
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-SIGNIFICANT = 1e-3
-"""Chance at which a better fit by the eight free numbers of a lens counts as noise (F test)."""
+SIGNIFICANT = 1e-3  # chance at which a better fit by the eight free numbers of a lens counts as noise (F test)
 
 
 def board_of(words: list[str] | None) -> BoardParams:

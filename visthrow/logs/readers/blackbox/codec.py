@@ -8,8 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = 0, 1, 3, 6, 7, 8, 9, 10
-_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
-"""Encoding -> largest number of fields packed together."""
+_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}  # encoding -> largest number of fields packed together
 
 _LONGEST_VB = 5  # bytes of a 32-bit number, seven bits a byte
 
@@ -116,14 +115,9 @@ DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
 
 
 def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Callable[[Reader, int], list[int]], int, int]]:
-    """Group the fields of a frame as they are packed.
+    """Return decoder, first field and number of fields of each group of fields that are packed together, by the encoding of each field.
 
-    Args:
-        encodings: Of each field.
-        skipped: Fields that take no bytes at all (those counted up by one).
-
-    Returns:
-        Decoder, first field and number of fields of each group.
+    ``skipped`` fields take no bytes at all (those counted up by one).
     """
     groups, i = [], 0
     while i < len(encodings):
