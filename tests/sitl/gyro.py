@@ -23,7 +23,7 @@ from hil.params import HilParams
 from tests.sitl.landings import BASE, DELAY
 from tests.sitl.test_betaflight import program
 from visthrow import config
-from visthrow.diagnose.extend import firmware
+from visthrow.diagnose.extend import patch
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs import read
 from visthrow.logs.flightlog import FlightLog
@@ -79,7 +79,7 @@ def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
     """Mean square of what windows leave of the gyro, in deviations of the recording's step, shape (3,)."""
     path, hover = config.find("train", BASE), config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     file = folder / "settings.toml"
-    file.write_text(firmware.text(box, str(path), config.load(Experiment, path), hover, DELAY))
+    file.write_text(patch.with_firmware(box, str(path), config.load(Experiment, path), hover, DELAY))
     model = ThrowModel([log.measured() for log in logs], plant_of(config.load(Experiment, file)), only=["cmd_delay"])
     squares = []
     for w in model.windows({}):

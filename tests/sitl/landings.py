@@ -17,7 +17,7 @@ import numpy as np
 
 from hil.params import HilParams
 from visthrow import config
-from visthrow.diagnose.extend import firmware
+from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import opening
 from visthrow.task import Experiment
 
@@ -44,7 +44,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         plant = Path(name) / "settings.toml"
         path = config.find("train", BASE)
-        plant.write_text(firmware.text(boxes[0], str(path), config.load(Experiment, path), hover, DELAY))
+        plant.write_text(patch.with_firmware(boxes[0], str(path), config.load(Experiment, path), hover, DELAY))
         found = {"before": errors(logs, BASE), "settings": errors(logs, str(plant))}
         if args.diagnosis:
             found["named"] = errors(logs, str(plant), json.loads(args.diagnosis.read_text())["theta"])

@@ -32,9 +32,7 @@ def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -
 
     Third differences of a motion that is smooth over four samples vanish; those of white noise have 20 times its variance.
     ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: which third differences count.
-
-    Returns:
-        Sigma in the values' unit, shape () or (D,).
+    Returns sigma in the values' unit, shape () or (D,).
 
     Source: Rousseeuw and Croux 1993 for the median absolute deviation.
     """
@@ -45,8 +43,7 @@ def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -
 def noise(channel: Channel) -> np.ndarray:
     """Standard deviation of the sensor's noise, from third differences of evenly spaced samples.
 
-    Returns:
-        One value a component, in the channel's unit; NaN where there are too few samples.
+    Returns one value a component, in the channel's unit; NaN where there are too few samples.
     """
     values = channel.values.reshape(len(channel.values), -1).astype(float)
     steps = np.diff(channel.time)

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     import json
 
     from visthrow.common.storage import atomic_write
-    from visthrow.diagnose.extend import firmware, patch
+    from visthrow.diagnose.extend import patch
     from visthrow.diagnose.inputs.opening import DEFAULT_PLANT, THROW
     from visthrow.logs import BLACKBOX
     from visthrow.task import Experiment
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         if args.hover is None:
             raise DiagnoseError("a blackbox without --hover; expected the share of throttle in hover, such as --hover 0.36")
         base, experiment = _diagnosed(args.plant or DEFAULT_PLANT)
-        atomic_write(args.out, firmware.text(args.diagnosis, base, experiment, args.hover, args.delay))
+        atomic_write(args.out, patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay))
         config.load(Experiment, Path(args.out))
         print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
         return 0

@@ -2,14 +2,16 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sim.effects.effect import apply
+from sim.effects.firmware import calibrated_voltage, controller_of, left_out
 from sim.effects.setting import Setting, generalised, specialised
 from sim.kernels.laws import check_laws
-from sim.params import LawParams
+from sim.params import GRAVITY, LawParams
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
@@ -17,6 +19,7 @@ from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.select.scatter import variances
+from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, plant_of
 
 
@@ -130,6 +133,31 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
     return theta, covariance
+
+
+def with_firmware(path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None = None) -> str:
+    """A configuration that flies the firmware's controller.
+
+    Args:
+        path: of the blackbox, whose header tells the settings.
+        base: name of the configuration below. experiment: what it says.
+        hover: share of throttle in hover, 0 to 1, with the payload.
+        delay: from a command to the mixer [s]; None: as the configuration has it.
+
+    Raises DiagnoseError: settings are missing; LogError: no blackbox.
+    """
+    settings, plant = read_blackbox(path)[0].header, plant_of(experiment)
+    weight = 0.25 * plant.total_mass * GRAVITY
+    try:
+        voltage = calibrated_voltage(plant.vehicle, settings, weight, hover)
+        controller = controller_of(plant.vehicle, settings, weight, voltage)
+    except ValueError as error:
+        raise DiagnoseError(f"{path}: {error}") from error
+    changed = differences(dataclasses.asdict(plant.vehicle.controller), dataclasses.asdict(controller))
+    lines = [f"# Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()} in {Path(path).name}."]
+    lines += [f"# Not in the block: {words}." for words in left_out(settings)]
+    vehicle = {"controller": changed} | ({} if delay is None else {"queue": {"delay": delay}})
+    return "\n".join([*lines, dumps({"base": base, "vehicle": vehicle})])
 
 
 def of_setup(base: str, setup: Setup, report: Mapping[str, Any], path: str, provenance: Sequence[str]) -> str:

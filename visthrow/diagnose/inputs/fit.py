@@ -147,10 +147,7 @@ def _of_stand(p: Any, size: Mapping[str, float], middle: float, base: VehiclePar
 def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequence[FlightLog], base: VehicleParams) -> list[Path]:
     """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance and provenance.
 
-    Raises StorageError: the folder cannot be written.
-
-    Returns:
-        Their paths.
+    Returns their paths. Raises StorageError: the folder cannot be written.
     """
     from visthrow.common.storage import atomic_write, write_json
 

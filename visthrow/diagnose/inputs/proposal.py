@@ -7,6 +7,7 @@ payload keeps its distance. What none of them tells becomes a question.
 
 import re
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -201,9 +202,9 @@ class _Chooser:
     def _open(self, size: int) -> list[Group]:
         return [g for g in self.groups if id(g) not in self.taken and g.values.shape[1] == size and not _TARGET.search(g.stem)]
 
-    def _take(self, name: str, group: Group, entry: ChannelMap, why: str) -> None:
-        """Make a channel of a group, unless its units contradict what the name stands for."""
-        values = group.values
+    def _take(self, name: str, group: Group, unit: str, why: str, **more: Any) -> None:
+        """Make a channel of a group, unless its units contradict what the name stands for; ``more``: of its :class:`ChannelMap`."""
+        entry, values = ChannelMap(name, group.columns, unit, **more), group.values
         if np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5:
             entry, why = replace(entry, held=True), why + "; its values are held between measurements"
         try:
@@ -231,19 +232,17 @@ class _Chooser:
                 continue
             order = "xyzw" if group.columns[0] == sorted(group.columns)[1] or group.columns[-1].lower().find("w") >= 0 else "wxyz"
             frame = "" if name == "quat_wb" else "camera" if name == "marker_quat_c" else "world"
-            entry = ChannelMap(name, group.columns, "1", "quaternion", order, frame=frame)
-            self._take(name, group, entry, "four columns of length 1")
+            self._take(name, group, "1", "four columns of length 1", kind="quaternion", order=order, frame=frame)
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g)]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
         moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
-        groups = [g for g in groups if not self._derived(g, moving)]
+        groups = [g for g in groups if all(other is g or self._relation(other, g, _FIRMLY) is None for other in moving)]  # no derivatives
         for group in [g for g in groups if "cam" in g.stem.lower()]:
             unit = self._length_unit(group)
             if unit and "marker_pos_c" not in self.made:
-                entry = ChannelMap("marker_pos_c", group.columns, unit, frame="camera")
-                self._take("marker_pos_c", group, entry, "three columns that move smoothly; their name speaks of a camera")
+                self._take("marker_pos_c", group, unit, "three columns that move smoothly; their name speaks of a camera", frame="camera")
         paths = [(g, unit) for g in groups if "cam" not in g.stem.lower() and (unit := self._length_unit(g))]
         pay = self._payload(paths)
         vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[0]]
@@ -253,13 +252,13 @@ class _Chooser:
                          if n not in self.made), "")  # fmt: skip
             if name:
                 wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
-                entry = ChannelMap(name, group.columns, unit, frame="" if name == "pos_w" else "world")
-                self._take(name, group, entry, f"three columns that move smoothly, by {wide:.3g} {unit} (sd)")
+                why = f"three columns that move smoothly, by {wide:.3g} {unit} (sd)"
+                self._take(name, group, unit, why, frame="" if name == "pos_w" else "world")
         if len(vehicles) > 1:
             listed = "; ".join(", ".join(g.columns) for g, _ in vehicles)
             self.found.questions.append(f"several positions ({listed}): which is the vehicle's, and by which sensor? The first is taken")
         if pay is not None:
-            self._take("payload_pos_w", pay[0], ChannelMap("payload_pos_w", pay[0].columns, pay[1]), pay[2])
+            self._take("payload_pos_w", *pay)
 
     def _length_unit(self, group: Group) -> str:
         """Unit of a position: as named, else that in which it is no faster and wider than a room; "" where none fits."""
@@ -298,10 +297,6 @@ class _Chooser:
         moves, steps = np.std(values, axis=0), np.std(np.diff(values, axis=0), axis=0)
         return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
 
-    def _derived(self, group: Group, groups: list[Group]) -> bool:
-        """Whether a group is the derivative of another one."""
-        return any(other is not group and self._relation(other, group, _FIRMLY) is not None for other in groups)
-
     def _relation(self, path: Group, rate: Group, least: float) -> relations.Relation | None:
         time, values = self.time, path.values
         good = np.isfinite(time) & np.all(np.isfinite(values), axis=1)
@@ -326,9 +321,8 @@ class _Chooser:
             size = UNITS[entry.unit][1] / relation.scale
             unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
             own = name.replace("pos", "vel")
-            frame = "world" if own == "est_vel_w" else ""
             why = f"the derivative of {name}, correlation {relation.correlation:.2f}, {relation.scale:.3g} of its unit a second"
-            self._take(own, group, ChannelMap(own, group.columns, unit, frame=frame), why)
+            self._take(own, group, unit, why, frame="world" if own == "est_vel_w" else "")
 
     def _angles(self) -> None:
         for group in self._open(3):
@@ -339,8 +333,7 @@ class _Chooser:
             if largest < 7.0 and not group.unit:
                 listed = ", ".join(group.columns)
                 self.found.questions.append(f"angles {listed} reach {largest:.3g}: radians are taken; small ones may be degrees")
-            entry = ChannelMap("quat_wb", group.columns, unit, "euler")
-            self._take("quat_wb", group, entry, f"roll, pitch, yaw up to {largest:.3g} {unit}")
+            self._take("quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler")
 
     def _rates(self) -> None:
         attitude = self.made.get("quat_wb", (None, None))[1]
@@ -366,22 +359,21 @@ class _Chooser:
         if score > _BELONGS:
             unit = "deg/s" if times > 7.0 else "rad/s"
             why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
-        self._take("rate_b", group, ChannelMap("rate_b", group.columns, unit), why)
+        self._take("rate_b", group, unit, why)
 
     def _forces(self) -> None:
         for group in self._open(3):
             size = float(np.nanmedian(np.linalg.norm(group.values, axis=1)))
             unit = next((u for u in ("m/s^2", "g", "mg") if 0.8 < size * UNITS[u][1] / physics.GRAVITY < 1.25), "")
             if unit and self._hinted(group, "acc_b") and "acc_b" not in self.made:
-                entry = ChannelMap("acc_b", group.columns, unit, frame="body")
-                self._take("acc_b", group, entry, f"a middle size of {size:.3g}: gravity in {unit}")
+                self._take("acc_b", group, unit, f"a middle size of {size:.3g}: gravity in {unit}", frame="body")
 
     def _inputs(self) -> None:
         for group in self._open(4):
             if group.stem == "motor" and "motor_command" not in self.made:
                 high = float(np.nanpercentile(group.values, 99))
                 unit = "1/65535" if high > 5000.0 else "1/1000" if high > 150.0 else "%" if high > 2.0 else "1"
-                self._take("motor_command", group, ChannelMap("motor_command", group.columns, unit), f"four motors up to {high:.5g}")
+                self._take("motor_command", group, unit, f"four motors up to {high:.5g}")
                 self.found.questions.append(
                     f"motors {', '.join(group.columns)}: order them front left, front right, rear left, rear right "
                     "(Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are they commands, or speeds?"
@@ -393,14 +385,13 @@ class _Chooser:
                 units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
                 unit = next((u for u in units if 2.5 < middle * UNITS[u][1] < 60.0), "")
                 if unit:
-                    entry = ChannelMap("battery_voltage", group.columns, unit)
-                    self._take("battery_voltage", group, entry, f"a middle of {middle:.4g}: a pack in {unit}")
+                    self._take("battery_voltage", group, unit, f"a middle of {middle:.4g}: a pack in {unit}")
             elif re.search(r"theta|angle", stem) and "angle" not in self.made and not self.made.keys() & {"quat_wb"}:
                 unit = group.unit if group.unit in ("deg", "rad") else "rad"
-                self._take("angle", group, ChannelMap("angle", group.columns, unit), f"an angle, by its name; a middle of {middle:.3g}")
+                self._take("angle", group, unit, f"an angle, by its name; a middle of {middle:.3g}")
             elif re.search(r"thrust", stem) and "thrust_command" not in self.made:
                 unit = group.unit if group.unit in ("N", "gf") else "N"
-                self._take("thrust_command", group, ChannelMap("thrust_command", group.columns, unit), f"a middle of {middle:.4g}")
+                self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
                 self.found.questions.append(f"thrust '{group.stem}': newtons of all motors together, as taken?")
 
 

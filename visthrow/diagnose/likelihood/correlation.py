@@ -86,9 +86,7 @@ def correlations(windows: Sequence[Window], slabs: np.ndarray, channels: int) ->
     """Estimate which channels' noise is correlated, and how.
 
     ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the model's channels.
-
-    Returns:
-        Channel -> its noise, where that is surely not white.
+    Returns channel -> its noise, where that is surely not white.
     """
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = each(lambda window: hidden_gram(window, channels), free)

@@ -46,9 +46,8 @@ class _Design:
     def __init__(self, windows: Sequence[tuple[np.ndarray, ...]], floors: np.ndarray, channels: int, device: str):
         """Move them there, where they are also scaled.
 
-        Args:
-            windows: of each, its nuisances, latents, effects, deviations of nuisances, sigmas and channels.
-            floors: of the effects, shape (K,).
+        ``windows``: of each, its nuisances, latents, effects, deviations of nuisances, sigmas and channels; ``floors``: of the effects,
+        shape (K,).
         """
         self._widths = [sum(parts.shape[1] for parts in own[:3]) for own in windows]
         shape, width = (len(windows), max(len(own[4]) for own in windows)), max(self._widths)
@@ -133,10 +132,7 @@ def padded(
 ) -> torch.Tensor:
     """Parts of grams' inner products one beside the other, each padded with zeros, shape (grams, *shape).
 
-    Args:
-        inner: of the grams, see :attr:`Gram.placed`.
-        part: of one gram's, given its number.
-        shape: to pad to.
+    ``inner``: of the grams, see :attr:`Gram.placed`; ``part``: of one gram's, given its number; ``shape``: to pad to.
     """
     if not any(isinstance(own, There) for own in inner):
         return side_by_side([[part(own, i)] for i, own in enumerate(inner)], shape, device)
@@ -150,10 +146,7 @@ def padded(
 def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float, device: str) -> list[Gram]:
     """Correlate the latent forces of all windows, see :func:`visthrow.diagnose.likelihood.marginal.correlated`.
 
-    Args:
-        grams: of the windows, with ``factor`` the identity.
-        windows: for the knots.
-        time: correlation time [s].
+    ``grams``: of the windows, with ``factor`` the identity; ``windows``: for the knots; ``time``: correlation time [s].
     """
     if device == "cpu" or not all(gram.latents for gram in grams):
         return each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
@@ -174,12 +167,8 @@ def left_by(
 ) -> list[np.ndarray]:
     """What initial states and latent forces leave of windows' residuals.
 
-    Args:
-        floors: of the effects, shape (K,).
-        fits: of each window, its initial state in prior deviations and its latents at the knots, shape (D + L,).
-
-    Returns:
-        Of each window, shape (N,).
+    ``floors``: of the effects, shape (K,); ``fits``: of each window, its initial state in prior deviations and its latents at the knots,
+    shape (D + L,). Returns for each window, shape (N,).
     """
     if device == "cpu":
         return each(lambda pair: left_of(*pair), zip(windows, fits))
@@ -191,10 +180,8 @@ def with_residuals(
 ) -> list[Gram]:
     """Grams with the same derivatives and other residuals: of all windows at once on a GPU, where the derivatives stay.
 
-    Args:
-        grams: of the windows, whose latents are at the knots.
-        floors: of the effects, shape (K,).
-        residuals: of each window, shape (N,).
+    ``grams``: of the windows, whose latents are at the knots; ``floors``: of the effects, shape (K,); ``residuals``: of each window, shape
+    (N,).
     """
     if device == "cpu" or _correlated(windows):
         return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))

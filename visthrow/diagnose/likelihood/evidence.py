@@ -113,9 +113,7 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
 
     A change of one prior is a rank-one update, so all candidates and all draws cost one factorisation.
     ``information``: shape (K, K); ``score``: shape (K,) or (n, K).
-
-    Returns:
-        Nats, of the score's shape.
+    Returns nats, of the score's shape.
     """
     sigma = covariance(information, priors.deviation(active))
     mean, variance = score @ sigma, np.diag(sigma)
@@ -133,8 +131,7 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
 def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
     """The same for each two effects, a change of two priors: of two that hide each other, neither shows alone.
 
-    Returns:
-        Nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
+    Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
     """
     size, diagonal = len(score), np.eye(2)
     pairs = np.stack(np.divmod(np.arange(size * size), size), axis=1)

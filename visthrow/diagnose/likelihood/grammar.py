@@ -296,9 +296,7 @@ def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]
     """What terms exert in each latent block: a torque in the joint on the vehicle, on the rope and, by it, on the payload.
 
     ``values``: of the terms, shape (k, 3, T), in the block's frame.
-
-    Returns:
-        The latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).
+    Returns the latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).
     """
     if block != JOINT:
         return {block: values}
@@ -329,8 +327,7 @@ def between(count: int) -> np.ndarray:
 def through_latents(window: Window, known: Known, block: str) -> np.ndarray:
     """Latent-force coefficients that what a block exerts at the knots stands for.
 
-    Returns:
-        Shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
+    Returns shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
     """
     size = 3 * len(known["time"])
     if block != JOINT:

@@ -130,12 +130,8 @@ def columns(window: Window, floors: np.ndarray) -> np.ndarray:
 def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
     """Reduce a window to its inner products.
 
-    Raises DiagnoseError: the window's arrays do not fit together, or hold NaN or infinity.
-
-    Args:
-        window: with finite residuals and derivatives.
-        floors: of the effects, shape (K,).
-        channels: number C of the model's channels.
+    ``window``: with finite residuals and derivatives; ``floors``: of the effects, shape (K,); ``channels``: number C of the model's
+    channels. Raises DiagnoseError: the window's arrays do not fit together, or hold NaN or infinity.
     """
     check(window, len(floors), channels)
     return _inner_products(window, columns(window, floors), channels)

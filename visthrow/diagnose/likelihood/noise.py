@@ -51,13 +51,9 @@ def fit(
 ) -> tuple[Noise, list[Gram]]:
     """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
 
-    Args:
-        windows: for the knots of the latent forces.
-        grams: of the windows, with ``factor`` the identity.
-        start: an earlier estimate: its correlation time is kept, its levels are where the search starts.
-
-    Returns:
-        The levels, and the grams with correlated latent forces that belong to them.
+    ``windows``: for the knots of the latent forces; ``grams``: of the windows, with ``factor`` the identity; ``start``: an earlier
+    estimate: its correlation time is kept, its levels are where the search starts. Returns the levels, and the grams with correlated latent
+    forces that belong to them.
     """
     noise, time = start, CORRELATION_TIMES[0] if start is None else start.correlation_time
     if start is None and any(gram.latents for gram in grams):

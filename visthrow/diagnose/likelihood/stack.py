@@ -179,10 +179,8 @@ class Stack:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
 
         ``first``: whether others may look at these levels as well, with other residuals. Raises DiagnoseError: as :meth:`values`.
-
-        Returns:
-            Values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C).
-            What the scales share with the fitted columns is given to the channels by their part in them.
+        Returns values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What
+        the scales share with the fitted columns is given to the channels by their part in them.
         """
         found = self._each(lambda batch: _looked(batch, noise, first))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))

@@ -29,9 +29,7 @@ def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], 
     """Arrays one beside the other on a device, each padded with zeros to one shape.
 
     ``parts``: of each array, what stands side by side along its last axis, of one height unless it is empty; ``shape``: to pad to.
-
-    Returns:
-        Shape (arrays, *shape).
+    Returns shape (arrays, *shape).
     """
     out = torch.empty((len(parts), *shape), dtype=torch.float64, pin_memory=device.startswith("cuda"))
     rows = out.numpy()

@@ -226,10 +226,7 @@ def sigma_of(channel: Channel, least: float) -> np.ndarray:
 def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
     """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
 
-    Args:
-        slope: Of the half step counted from the start, and the state.
-        state: At the start, shape (B, S).
-        step: [s], shape (B, 1).
+    ``slope``: of the half step counted from the start, and the state; ``state``: at the start, shape (B, S); ``step``: [s], shape (B, 1).
     """
     path, half = np.empty((len(state), steps + 1, state.shape[1])), 0.5 * step
     path[:, 0] = state
@@ -245,15 +242,14 @@ def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray,
 def hermite(time: np.ndarray, start: float, step: float, value: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Values at stamps from values and rates on an even grid, cubic.
 
+    Returns shape (L, N, C).
+
     Args:
         time: [s], shape (N,), or one set of stamps a lane, (L, N).
         start: Of the grid [s].
         step: Of the grid [s].
         value: Shape (L, T, C).
         rate: Their derivatives, shape (L, T, C).
-
-    Returns:
-        Shape (L, N, C).
     """
     at = np.broadcast_to((np.asarray(time) - start) / step, (len(value), np.shape(time)[-1]))
     left = np.clip(at.astype(int), 0, value.shape[1] - 2)
@@ -290,13 +286,8 @@ def latent_layout(
 def latent_force(latent: np.ndarray, steps: int, blocks: int, axes: int = 3) -> np.ndarray:
     """Latent forces at the half steps of the grid.
 
-    Args:
-        latent: Coefficients, shape (B, G), ordered by :func:`latent_layout`.
-        blocks: Number of blocks in the layout.
-        axes: Of each block.
-
-    Returns:
-        Shape (2 steps + 1, blocks, B, axes).
+    ``latent``: coefficients, shape (B, G), ordered by :func:`latent_layout`; ``blocks``: number of blocks in the layout; ``axes``: of each
+    block. Returns shape (2 steps + 1, blocks, B, axes).
     """
     knots = latent.shape[1] // (blocks * axes)
     weights = triangles(np.linspace(0.0, 1.0, 2 * steps + 1), np.linspace(0.0, 1.0, knots))

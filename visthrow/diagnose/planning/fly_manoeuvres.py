@@ -242,8 +242,7 @@ class _Pilot:
     def step(self, row: int | None) -> dict[str, np.ndarray]:
         """Send one command and hold it for a period; without a row, hover where the reference begins.
 
-        Returns:
-            Samples of the period: :data:`SAMPLED`, shape (S, E, ...).
+        Returns samples of the period: :data:`SAMPLED`, shape (S, E, ...).
         """
         at = [min(row or 0, len(r.time) - 1) for r in self.references]
         place, speed, push = (np.array([getattr(r, name)[i] for r, i in zip(self.references, at)])

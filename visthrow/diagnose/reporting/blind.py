@@ -50,9 +50,8 @@ class Blind:
 def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     """Hide each effect at rising sizes in the flights' own noise and see whether the statistics name it.
 
-    Args:
-        diagnosis: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out first.
-        draws: worlds for each effect, size and sign.
+    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out first; ``draws``: worlds for each effect,
+    size and sign.
     """
     work, rng = diagnosis.work, np.random.default_rng(seed)
     point, priors, effects = work.after, work.problem.priors, work.problem.model.effects

@@ -11,8 +11,7 @@ from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
-from visthrow.diagnose.reporting.gain import Gain
-from visthrow.diagnose.reporting.landing_gain import LandingGain
+from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.select.state import Work

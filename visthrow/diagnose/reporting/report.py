@@ -10,8 +10,7 @@ import numpy as np
 from visthrow.diagnose.likelihood.forms import HEAD_SECONDS
 from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
-from visthrow.diagnose.reporting.gain import Gain
-from visthrow.diagnose.reporting.landing_gain import LandingGain
+from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 from visthrow.view.parts import Grid, Picture, Section, Text

@@ -108,10 +108,7 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
 def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
     """The verdict with the share of those commands of which a window tells by itself whether they came, with Jeffreys' interval.
 
-    Args:
-        problem: of a model with lost commands.
-        point: of it, with the noise levels that these leave.
-        found: the verdict before.
+    ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these leave; ``found``: the verdict before.
     """
     told = Told.of(problem, point, [point.about.windows[i] for i in problem.kept], point.commands, range(len(problem.kept)))
     own, score = told.information[:, -told.commands :, -told.commands :], told.score[:, -told.commands :]

@@ -95,11 +95,8 @@ def acts_on(point: Point, j: int, *, joint: bool = False, beside: Sequence[int] 
     """Block through which an effect moves things, or "" where it moves measurements alone.
 
     Its column is laid over the columns of each block's latent forces; the block that explains most of it, and at least half, is it.
-
-    Args:
-        point: with the latent forces' derivatives.
-        joint: consider the torque between vehicle and rope as well.
-        beside: effects that may take any size: what they can stand in for is left out.
+    ``point``: with the latent forces' derivatives; ``joint``: consider the torque between vehicle and rope as well; ``beside``: effects
+    that may take any size: what they can stand in for is left out.
     """
     weight = point.noise.scale**-2.0
     total, by_block = 0.0, dict.fromkeys((*LATENT_BLOCKS, JOINT), 0.0)

@@ -135,10 +135,8 @@ def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise,
 def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
     """Simulate and linearise at ``theta``, estimate the noise levels, gather.
 
-    Args:
-        theta: in floors, shape (K,).
-        start: noise levels to start from.
-        windows: what the model gave there, if it was asked already.
+    ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the model gave there, if it was asked
+    already.
     """
     sizes, channels = problem.sizes(theta), len(problem.model.channels)
     windows = problem.model.windows(sizes) if windows is None else windows

@@ -238,10 +238,8 @@ def disagreement(
     """Whether flights disagree on an effect of a set: shares of their own say more than a floor and a part of the effect's size would.
 
     ``least``: nats that a finding needs; ``share``: of the effect, by which flights may differ for its form alone.
-
-    Returns:
-        The flight that alone disagrees, or None in its place where all do; None where they agree, too few can say, or other effects
-        that are still missing may be why they differ.
+    Returns the flight that alone disagrees, or None in its place where all do; None where they agree, too few can say, or other effects
+    that are still missing may be why they differ.
     """
     if np.count_nonzero(statistics.information[:, j, j] > 0.0) < LEAST_FLIGHTS:
         return None
@@ -303,8 +301,7 @@ def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *give
 def freed(statistics: Statistics, varies: Varies) -> Statistics:
     """Statistics of what flights, or days, share: the shares that each has of its own are integrated out.
 
-    Args:
-        varies: effects that have such shares. Where days have some, what is returned is of days.
+    ``varies``: effects that have such shares. Where days have some, what is returned is of days.
     """
     left = _integrated(statistics, varies.flights)
     return _integrated(by_day(left, varies.days), varies.drifts) if varies.drifts else left
@@ -315,10 +312,7 @@ def freed_beside(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same of candidates that are no effects yet, each alone beside the effects, summed over flights.
 
-    Args:
-        own: information of each, shape (F, T).
-        score: about 0, shape (F, T).
-        cross: information with the effects, shape (F, T, K).
+    ``own``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``: information with the effects, shape (F, T, K).
     """
     rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
     for shares in (varies.flights, varies.drifts):
@@ -367,9 +361,8 @@ def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Stati
 def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.ndarray:
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in floors, shape (F, K).
 
-    Args:
-        theta: sizes that all flights share, in floors.
-        varies: effects that have shares. Those of days come first, and flights share what is left of them.
+    ``theta``: sizes that all flights share, in floors; ``varies``: effects that have shares. Those of days come first, and flights share
+    what is left of them.
     """
     at = np.tile(theta, (len(statistics.flights), 1))
     if varies.drifts:

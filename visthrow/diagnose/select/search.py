@@ -27,15 +27,9 @@ def explain(
 ) -> Diagnosis:
     """Say what the model gets wrong about its flights.
 
-    Raises DiagnoseError: the model gives no window, or contradicts itself.
-
-    Args:
-        model: a simulation of measured flights with its catalogue of effects.
-        seed: of the null worlds that the threshold is calibrated on.
-        laws: whether to look for laws outside the catalogue where it does not suffice.
-
-    Returns:
-        One verdict for every effect, and one overall.
+    ``model``: a simulation of measured flights with its catalogue of effects; ``seed``: of the null worlds that the threshold is calibrated
+    on; ``laws``: whether to look for laws outside the catalogue where it does not suffice. Returns one verdict for every effect, and one
+    overall. Raises DiagnoseError: the model gives no window, or contradicts itself.
     """
     begun, say = time.monotonic(), progress or (lambda _: None)
     memory.keep()
@@ -77,9 +71,7 @@ def put_right(
     """A model of logs whose commands are as the simulation takes them: without each suspected mistake that does not earn its price.
 
     ``plant``: that the commands are for; ``build``: makes a model of logs.
-
-    Returns:
-        The model, which names what was put right as its ``mistakes``, and its logs.
+    Returns the model, which names what was put right as its ``mistakes``, and its logs.
     """
     made, known = interface.commanded(logs, plant)
     kept = interface.suspected(made, plant)

@@ -218,9 +218,8 @@ def knots_of(point: Point) -> list[grammar.Known]:
 def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float) -> list[TermEffect]:
     """The terms that say most beside a set of names, by the linear statistics.
 
-    Args:
-        strongest: latent force of each block where the model stood alone [N or N m].
-        least: nats that a term must bring beyond its price.
+    ``strongest``: latent force of each block where the model stood alone [N or N m]; ``least``: nats that a term must bring beyond its
+    price.
     """
     calm, parts = calmed(point)
     known = knots_of(point)

@@ -62,10 +62,8 @@ def payload_down(flight: Recorded, landing_height: float) -> float:
 def cut(flight: Recorded, number: int, lag: float, landing_height: float, carries: bool) -> list[Cut]:
     """Cut one flight.
 
-    Args:
-        lag: of the release, as far as known [s].
-        landing_height: of the payload's centre [m].
-        carries: whether the flight carries a payload.
+    ``lag``: of the release, as far as known [s]; ``landing_height``: of the payload's centre [m]; ``carries``: whether the flight carries a
+    payload.
     """
     first, last = flight.start, flight.end
     separation = flight.latch + lag
@@ -98,9 +96,8 @@ def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:
     """A window cut about the time in which the rope was slack: that is only flown through.
 
-    Args:
-        first, last: of that time [s].
-        separation: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight after it.
+    ``first, last``: of that time [s]; ``separation``: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight
+    after it.
     """
     free = c.start < separation < min(last + LEAST_TAUT, c.end)
     last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)

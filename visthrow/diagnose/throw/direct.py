@@ -153,8 +153,7 @@ class CameraView:
     def __init__(self, logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting):
         """Smooth the poses about each view.
 
-        Args:
-            logs: flights. flights: the same as the replay takes them. cuts: windows. setting: the diagnosed one.
+        ``logs``: flights. flights: the same as the replay takes them. cuts: windows. setting: the diagnosed one.
         """
         self._nominal, self._windows = setting, {}
         for w, c in enumerate(cuts):

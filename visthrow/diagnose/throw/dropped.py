@@ -19,13 +19,9 @@ def without_each_command(
 ) -> list[np.ndarray]:
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
-    Args:
-        windows: their numbers.
-        known: delay of the commands by which those that act in a window are told [s]: their number is the same in all settings.
-        substep: largest integration step [s].
-
-    Returns:
-        Of each of these windows, shape (N, T), with the T commands that differ from the one before.
+    ``windows``: their numbers; ``known``: delay of the commands by which those that act in a window are told [s]: their number is the same
+    in all settings; ``substep``: largest integration step [s]. Returns for each of these windows, shape (N, T), with the T commands that
+    differ from the one before.
     """
     replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
     commands = [_acting(flights, w, known) for w in windows]

@@ -57,22 +57,13 @@ class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
     def __init__(
-        self,
-        flights: Flights,
-        retained: np.ndarray,
-        directions: tuple[Direction, ...],
-        setting: Setting,
-        *,
-        lag: float,
-        substep: float,
+        self, flights: Flights, retained: np.ndarray, directions: tuple[Direction, ...], setting: Setting, *, lag: float, substep: float,
         device: str,
-    ):
+    ):  # fmt: skip
         """Make ready.
 
-        Args:
-            directions: in which states may be wrong.
-            lag: of the release, as far as known [s].
-            substep: largest integration step [s].
+        ``directions``: in which states may be wrong; ``lag``: of the release, as far as known [s]; ``substep``: largest integration step
+        [s].
         """
         self.flights, self.retained, self.directions, self.setting = flights, retained, directions, setting
         self.substep = substep
@@ -91,9 +82,8 @@ class InitialFit:
     def fit(self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
-        Args:
-            starts: states to begin with, each window with the best of its own; those that do not count keep the last.
-            slopes: of windows' samples by their states, as :attr:`slopes` of another fit has them.
+        ``starts``: states to begin with, each window with the best of its own; those that do not count keep the last; ``slopes``: of
+        windows' samples by their states, as :attr:`slopes` of another fit has them.
         """
         count = len(self.flights.cuts)
         moves, damping = np.zeros((count, len(self.directions))), np.full(count, DAMPING)
@@ -238,9 +228,7 @@ class InitialFit:
         """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that they promise.
 
         ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape (T,).
-
-        Returns:
-            Steps, shape (T, directions); falls of the cost, shape (T,).
+        Returns steps, shape (T, directions); falls of the cost, shape (T,).
         """
         ds, (sd, scaled, bend) = self._free[w], self._scaled(w)
         off = residual / self._spread(w)
@@ -278,9 +266,7 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
     """How a window's initial state follows its effects: so that the flight stays as near to where it was as it can.
 
     ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as known [s].
-
-    Returns:
-        Changes in the state's units by the effects' sizes, shape (D, K).
+    Returns changes in the state's units by the effects' sizes, shape (D, K).
     """
     samples = len(flights.time(w))  # and those of a camera, which tell nothing of states
     weight = (sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w)))[:, None]

@@ -83,10 +83,7 @@ class Plan:
     ) -> Window:  # fmt: skip
         """What comes of the lanes.
 
-        Args:
-            channel: of the window's samples.
-            slopes: see :meth:`slopes`.
-            knots: simulated quantities at all its knots.
+        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated quantities at all its knots.
         """
         w, f = self.window, flights
         c, (effects, states, latents) = f.cuts[w], slopes

@@ -153,14 +153,9 @@ class Flights:
         return (self._known["measured", w] - seen[: int(self.rows[w]), lane]).ravel()
 
     def fly(
-        self,
-        replay: Replay,
-        settings: Sequence[Setting],
-        states: States,
-        lanes: Sequence[Lane],
-        substep: float,
+        self, replay: Replay, settings: Sequence[Setting], states: States, lanes: Sequence[Lane], substep: float,
         recording: Recording | None = None,
-    ) -> Replayed:
+    ) -> Replayed:  # fmt: skip
         """Fly lanes; ``settings`` are those of the replay's rows.
 
         Args:
@@ -208,14 +203,13 @@ def rough_step(setting: Setting, substep: float) -> float:
 def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: float) -> tuple[States, States]:
     """Initial states of all windows: measured poses, and inner states carried through the windows before.
 
+    Returns the states, and those at the windows' ends that they lead to.
+
     Args:
         flights: the windows, those of one flight in order of time.
         replay: whose row 0 is the setting.
         begin: function ``(flight, cut, inner or None)`` -> one state, with ``inner`` the end of the window before.
         substep: largest integration step [s].
-
-    Returns:
-        The states, and those at the windows' ends that they lead to.
     """
     by_flight: dict[int, list[int]] = {}
     for w, c in enumerate(flights.cuts):

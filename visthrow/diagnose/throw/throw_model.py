@@ -56,19 +56,10 @@ class ThrowModel:
     """
 
     def __init__(
-        self,
-        logs: Sequence[FlightLog],
-        plant: PlantParams,
-        *,
-        sensing: SensingParams | None = None,
-        device: str = "cpu",
-        substep: float = 0.002,
-        stride: int = 1,
-        only: Sequence[str] | None = None,
-        carries: bool | None = None,
+        self, logs: Sequence[FlightLog], plant: PlantParams, *, sensing: SensingParams | None = None, camera: CameraParams | None = None,
+        device: str = "cpu", substep: float = 0.002, stride: int = 1, only: Sequence[str] | None = None, carries: bool | None = None,
         simpler: bool = False,
-        camera: CameraParams | None = None,
-    ):
+    ):  # fmt: skip
         """Cut the flights and find the windows' initial states.
 
         Raises DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
@@ -273,8 +264,7 @@ class ThrowModel:
     def _through(self, setting: Setting) -> tuple[States, States]:
         """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before.
 
-        Returns:
-            The states, and those at the windows' ends.
+        Returns the states, and those at the windows' ends.
         """
 
         def begin(flight, c, inner):
