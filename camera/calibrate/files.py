@@ -68,8 +68,7 @@ def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
 def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> tuple[FisheyeParams, FitReport]:
     """Read one camera of a basalt calibration: ``kb4`` as it is, ``ds`` and ``eucm`` through a fit inside the field of view.
 
-    Returns:
-        The fisheye and what the fit left over (all zero for ``kb4``).
+    Returns the fisheye and what the fit left over (all zero for ``kb4``).
     """
     try:
         tree = json.loads(text_of(path, whole_lines=False))

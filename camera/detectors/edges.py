@@ -82,8 +82,7 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
 def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
     """Circles about the blobs of a mask, and about pairs of near ones, which may be one thing with something across it.
 
-    Returns:
-        Centre [px], shape (2,), and radius [px] of each.
+    Returns the centre [px], shape (2,), and radius [px] of each.
     """
     import cv2
 

@@ -70,9 +70,8 @@ class Gate:
     def check(self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None) -> str | None:
         """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and the cable's other end, where one hangs.
 
-        Returns:
-            Why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled),
-            "repeated" (the content of the last one), "swapped", "cable", "jump", "speed", "turn", "reset".
+        Returns why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled), "repeated" (the
+        content of the last one), "swapped", "cable", "jump", "speed", "turn", "reset".
         """
         reason = self._reason(pose, velocity, tether)
         if reason is not None:

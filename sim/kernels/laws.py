@@ -203,9 +203,8 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
 def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity) -> SimpleNamespace:
     """Compose the laws of a plant.
 
-    Returns:
-        Namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command, attached)`` -> air whose pushes hold the
-        laws' forces besides its own, and ``in_flight(air, vel_w)`` [N] on a payload that has left. Without laws both do nothing.
+    Returns a namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command, attached)`` -> air whose pushes hold the laws'
+    forces besides its own, and ``in_flight(air, vel_w)`` [N] on a payload that has left. Without laws both do nothing.
     """
     vec3, vec4, real, Vehicle, Rope, Air, QuadState = t.vec3, t.vec4, t.real, t.Vehicle, t.Rope, t.Air, t.QuadState
     if not laws:  # their factors take a seventh of the time in which a kernel is composed

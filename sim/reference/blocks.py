@@ -259,10 +259,7 @@ def composer(
     rate: np.ndarray,
     aero: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Add up the body wrench about the centre of mass.
-
-    Returns:
-        Force [N] and torque [N m], body frame, shapes (E, 3).
+    """Add up the body wrench about the centre of mass. Returns the force [N] and torque [N m], body frame, shapes (E, 3).
 
     Convention: the change of thrust by inflow enters the force as well as the torque.
     """

@@ -36,10 +36,9 @@ def vector_of_rotation(like: Any, quat: Any):
 def build_sensing(t: Types, Sensing: type):
     """Warp functions of the measurement model.
 
-    Returns:
-        ``pose(sensing, com, pos_w, quat_wb, reference)`` -> measured position of the marker body [m] and its attitude
-        against the quaternion ``reference`` as a rotation vector [rad]; ``point(sensing, pos_w)`` -> measured position of
-        the payload [m]; ``rate(sensing, rate_b)`` [rad/s].
+    Returns ``pose(sensing, com, pos_w, quat_wb, reference)`` -> measured position of the marker body [m] and its attitude against the
+    quaternion ``reference`` as a rotation vector [rad]; ``point(sensing, pos_w)`` -> measured position of the payload [m]; ``rate(sensing,
+    rate_b)`` [rad/s].
     """
     vec3, quat, real = t.vec3, t.quat, t.real
 

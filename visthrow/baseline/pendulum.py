@@ -99,8 +99,7 @@ def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float,
 def linearise(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex steps, exact to rounding.
 
-    Returns:
-        Next states (K, 16), Jacobians by state (K, 16, 16) and by input (K, 16, 4).
+    Returns next states (K, 16), Jacobians by state (K, 16, 16) and by input (K, 16, 4).
 
     Source: Squire and Trapp, "Using complex variables to estimate derivatives of real functions", SIAM Review 1998.
     """

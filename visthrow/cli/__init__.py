@@ -60,8 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 
-    Returns:
-        The command's own status; 2 for a mistake of the user, told in one message; 130 after Ctrl-C.
+    Returns the command's own status; 2 for a mistake of the user, told in one message; 130 after Ctrl-C.
     """
     try:
         args = build_parser().parse_args(argv)

@@ -35,8 +35,7 @@ def export(log: FlightLog, path: str | Path) -> None:
 def columns(log: FlightLog) -> dict[str, np.ma.MaskedArray]:
     """Lay all channels on the union of their time stamps.
 
-    Returns:
-        Column name -> values, shape (N,), masked where there is no valid sample; ``time [s]`` first.
+    Returns column name -> values, shape (N,), masked where there is no valid sample; ``time [s]`` first.
     """
     stamps = [channel.time for channel in log.channels.values()]
     time = np.unique(np.concatenate(stamps)) if stamps else np.empty(0)

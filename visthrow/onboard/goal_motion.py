@@ -87,8 +87,7 @@ def measured_goal(layout: Layout, frame: Tensor, valid: Tensor | None, camera: K
 def goal_by_corner(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
     """Goal in the world as each corner of one vision frame shows it; arguments as of :func:`measured_goal`.
 
-    Returns:
-        Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
+    Returns positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
     """
     corners = frame[:, VEHICLE : VEHICLE + layout.goal].unflatten(1, (GOAL_KEYPOINTS, 2))
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(corners))

@@ -155,8 +155,7 @@ def vision_part(
 ) -> tuple[Tensor, Tensor]:
     """Goal and payload of a vision frame.
 
-    Returns:
-        Keypoints, shape (E, 8, 2), normalised image coordinates, goal corners first; validity, shape (E, 8).
+    Returns keypoints, shape (E, 8, 2), normalised image coordinates, goal corners first; validity, shape (E, 8).
     """
     return keypoints(camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
 

@@ -68,9 +68,8 @@ def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generato
 def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes | None" = None) -> dict[str, np.ndarray]:
     """Fly one batch of policies that are trained for one plant, on the rendered pictures of ``eyes`` where there are any.
 
-    Returns:
-        :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws first, and ``goal_w`` where goals
-        move; NaN where a throw failed.
+    Returns :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws first, and ``goal_w`` where goals move;
+    NaN where a throw failed.
     """
     flown = [loaded[i] for i in job.policies]
     experiment, count = flown[0].experiment, job.count * len(flown)

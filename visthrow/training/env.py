@@ -216,9 +216,8 @@ class ThrowEnv(VecEnv):
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start anew.
 
-        Returns:
-            Observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not
-            be bootstrapped, so there are no ``time_outs``.
+        Returns observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not be
+        bootstrapped, so there are no ``time_outs``.
         """
         action = self._apply(actions)
         reward, done = self._judge(action)

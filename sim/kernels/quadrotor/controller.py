@@ -42,8 +42,7 @@ def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
 def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
     """Distribute thrust [N] and torque [N m] over four rotors; gives up yaw first, then collective, then roll and pitch.
 
-    Returns:
-        Thrust of each rotor [N], shape (4,), and the delivered shares of the roll-pitch and of the yaw demand, 0 to 1.
+    Returns the thrust of each rotor [N], shape (4,), and the delivered shares of the roll-pitch and of the yaw demand, 0 to 1.
     """
     zero = collective - collective
     room = max_thrust - p.controller.min_thrust
@@ -71,8 +70,7 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
 def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
     """PID with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
 
-    Returns:
-        Motor-speed set-points [rad/s], shape (4,), and the derivatives of integral, set-point filter and gyro filter.
+    Returns motor-speed set-points [rad/s], shape (4,), and the derivatives of integral, set-point filter and gyro filter.
     """
     c = p.controller
     rate_command = type(rate_b)(command[1], command[2], command[3])
@@ -101,8 +99,7 @@ def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any,
 def rate_controller_motor_mixing(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
     """PID whose output is added to motor commands, with iterm_relax, as Betaflight's firmware has them.
 
-    Returns:
-        As of `rate_controller_betaflight`; the set-point filter is that of iterm_relax.
+    Returns what `rate_controller_betaflight` does; the set-point filter is that of iterm_relax.
     """
     c = p.controller
     zero, one = voltage - voltage, type(voltage)(1.0)

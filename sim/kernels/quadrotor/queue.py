@@ -44,8 +44,7 @@ def held(queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: 
 def push(queue: wp.array2d(dtype=Any), env: int, command: Any):
     """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one.
 
-    Returns:
-        Whether the command was finite. One that is not is left out: the last one is held in its place.
+    Returns whether the command was finite. One that is not is left out: the last one is held in its place.
     """
     depth = queue.shape[0]
     for k in range(depth - 1):

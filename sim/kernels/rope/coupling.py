@@ -12,9 +12,8 @@ from sim.kernels.structs import Types
 def build_root(t: Types):
     """Solve for the root's acceleration, given what the chain asks for (``sim.kernels.rope.chain``).
 
-    Returns:
-        Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` -> acceleration of the centre of mass
-        [m/s^2, world], angular acceleration [rad/s^2, body], acceleration of the mount [world], force on the chain [N, world].
+    Returns a Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` -> acceleration of the centre of mass [m/s^2,
+    world], angular acceleration [rad/s^2, body], acceleration of the mount [world], force on the chain [N, world].
     """
     vec3, mat33, Vehicle, Rope, QuadState = t.vec3, t.mat33, t.Vehicle, t.Rope, t.QuadState
     real = t.real
@@ -46,12 +45,10 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
 
     The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The velocity of the root
     follows from the total linear momentum, which external forces alone change; so it is conserved to round-off.
-    Where a rod turns more than ``max_turn`` in the step, the first stage alone (linearly implicit Euler) is kept.
-
-    Returns:
-        Namespace of Warp functions ``step`` (new state, new total momentum, whether it fell back; the arrays n, u and
-        stiffness change in place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
-        momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its centre, world frame).
+    Where a rod turns more than ``max_turn`` in the step, the first stage alone (linearly implicit Euler) is kept. Returns a namespace of
+    Warp functions ``step`` (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in place),
+    ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear momentum [N s]), ``mount_velocity`` [m/s] and
+    ``payload`` (position and velocity of its centre, world frame).
     """
     vec3, vec4, real = t.vec3, t.vec4, t.real
     Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow

@@ -9,11 +9,8 @@ def build_loose_step(t: Types, chain, payload):
     """One ROS2 step of a rope that nothing holds.
 
     The root's acceleration a follows from ``A a + b = 0``: nothing pulls at the upper end. As in the coupled step the
-    root's velocity follows from the total momentum.
-
-    Returns:
-        Warp function ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity, gamma, max_turn, h)`` -> position and
-        velocity of the upper end; the arrays n, u and stiffness change in place.
+    root's velocity follows from the total momentum. Returns a Warp function ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity,
+    gamma, max_turn, h)`` -> position and velocity of the upper end; the arrays n, u and stiffness change in place.
     """
     vec3, mat33, real, Rope, Air = t.vec3, t.mat33, t.real, t.Rope, t.Air
     vec2, L = chain.vec2, chain.segments

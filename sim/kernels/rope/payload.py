@@ -23,9 +23,8 @@ def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
 def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     """Functions of the payload's forces for a choice of extensions.
 
-    Returns:
-        Namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N] (``along_w`` the last segment's
-        direction, ``jet_w`` the force of the rotors on the air [N]) and ``free(rope, air, vel_w)`` [N] in flight.
+    Returns a namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N] (``along_w`` the last segment's direction,
+    ``jet_w`` the force of the rotors on the air [N]) and ``free(rope, air, vel_w)`` [N] in flight.
     """
     Rope, Air, vec3 = t.Rope, t.Air, t.vec3
 

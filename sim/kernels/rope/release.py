@@ -47,11 +47,9 @@ def clearance(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity: Any, time: A
 def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     """How the payload leaves. Equations: :class:`sim.params.ReleaseParams`.
 
-    Returns:
-        Namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull at the latch [N], and
-        the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the last segment's direction and after
-        ``tail(r, vel_w, com_vel_w)`` with the velocity of the common centre of mass of payload and rope.
-        Each does only what ``extensions`` name.
+    Returns a namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull at the latch [N], and the payload's
+    velocity [m/s] after ``kick(r, vel_w, along_w)`` with the last segment's direction and after ``tail(r, vel_w, com_vel_w)`` with the
+    velocity of the common centre of mass of payload and rope. Each does only what ``extensions`` name.
     """
     real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
 

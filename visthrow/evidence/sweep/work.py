@@ -65,8 +65,7 @@ def held(path: Path) -> bool:
 def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
     """Do trainings and throws of these ids one after the other; after so many minutes a training stops with a checkpoint.
 
-    Returns:
-        0; 130 where a training was stopped before its end; 75 where another process had the unit.
+    Returns 0; 130 where a training was stopped before its end; 75 where another process had the unit.
     """
     begin, status = time.monotonic(), 0
     throws = {unit.id: unit for units in work.throws.values() for unit in units}

@@ -115,8 +115,7 @@ def unit_hint(ratio: float) -> str:
 def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
     """Derivative over about ``span`` seconds, or two periods where these are longer; gaps are left out.
 
-    Returns:
-        Times [s] and derivatives.
+    Returns times [s] and derivatives.
     """
     first, last, middle, width = _pairs(time, span)
     return middle, (values[last] - values[first]) / width[:, None]
@@ -125,8 +124,7 @@ def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> tupl
 def rates_of(time: np.ndarray, quat: np.ndarray, span: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
     """Body rates from attitudes xyzw, over about ``span`` seconds as in :func:`derivative`.
 
-    Returns:
-        Times [s] and rates [rad/s], shape (N, 3).
+    Returns times [s] and rates [rad/s], shape (N, 3).
     """
     first, last, middle, width = _pairs(time, span)
     if not len(middle):

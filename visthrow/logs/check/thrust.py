@@ -33,8 +33,7 @@ def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
 def thrust_of(log: FlightLog, known: Known = NOTHING) -> tuple[str, np.ndarray, np.ndarray] | None:
     """Return what a log says of its collective thrust.
 
-    Returns:
-        Channel, times [s] and thrust, shape (N, 1), in newtons where channel or map say so; None where it says nothing.
+    Returns channel, times [s] and thrust, shape (N, 1), in newtons where channel or map say so; None where it says nothing.
     """
     name = known.thrust_input or next((name for name in INPUTS if name in log), "")
     if name not in log or np.sum(log[name].valid) < 50:
