@@ -71,8 +71,8 @@ COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "
 def replay(folder: str | Path) -> dict[str, Any]:
     """Run the recorded poses, statuses and words of a run through the runner again; raises `RunError` for a folder that is none.
 
-    Returns the number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is missing
-    of the recording, or None; ``story``: where it went wrong, in a sentence.
+    Returns the number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is
+    missing of the recording, or None; ``story``: where it went wrong, in a sentence.
     """
     params, policy, ticks, poses = load_run(folder)
     playback, turn, last = Playback(params, policy), None, None
