@@ -286,7 +286,7 @@ def _looked(batch: _Batch, noise: Noise, first: bool) -> tuple[torch.Tensor, tor
     solved = _solved(at, batch)
     by_block = (batch.member.mT @ (variance + solved.mean**2 - 1.0)[:, :, None])[..., 0]
     moved = at.level * solved.mean
-    bent = ((batch.columns.hidden @ moved[:, None, :, None])[..., 0] * moved[:, None]).sum(-1)
+    bent = ((moved[:, None, None] @ batch.columns.hidden)[:, :, 0] @ moved[:, :, None])[..., 0]
     left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
     return solved.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
 

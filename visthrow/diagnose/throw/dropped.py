@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.effects.setting import Setting
 from sim.replay.lanes import Recording, Replay
-from visthrow.diagnose.throw.replay import BATCH, Flights, Lane, downloaded
+from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Flights, Lane, downloaded
 from visthrow.diagnose.throw.states import States
 
 
@@ -47,11 +47,17 @@ def _flown(
     flights: Flights, windows: Sequence[int], commands: Sequence[np.ndarray], replay: Replay, setting: Setting, states: States,
     substep: float,
 ) -> list[np.ndarray]:  # fmt: skip
-    """Of a few windows: a lane with all commands, then one without each of them."""
-    lanes, times, sent = [], [], []
+    """Of a few windows: a lane with all commands, then one without each of them, which leaves the first at the knot before."""
+    lanes, times, sent, run, kept = [], [], [], [], 0
     for w, own in zip(windows, commands):
         f = flights.flights[flights.cuts[w].flight]
         part = slice(max(own.min(initial=1) - 1, 0), own.max(initial=len(f.command_time) - 2) + 2)
+        acts = f.command_time[own] + setting.plant.vehicle.queue.delay
+        knots = np.clip((acts - flights.cuts[w].start) // KNOT_SPACING, 0, flights.knots[w] - 2).astype(int)  # the last is the end
+        whole = len(lanes)
+        run.append(Lane(whole, 0, w, keep=kept, rough=True))
+        run += [Lane(whole + 1 + i, 0, w, resume=kept + int(knot), parent=whole, rough=True) for i, knot in enumerate(knots)]
+        kept += int(flights.knots[w])
         for k in (None, *own.tolist()):
             flown = f.command[part].copy()
             if k is not None:
@@ -63,7 +69,6 @@ def _flown(
     fields = {name: values[at] for name, values in flights.recording.windows.items()}
     fields |= {"command_first": np.append(0, ends[:-1]), "command_last": ends}
     data = flights.recording.data | {"command_time": np.concatenate(times), "command": np.concatenate(sent)}
-    run = [Lane(i, 0, w, rough=True) for i, w in enumerate(lanes)]
     seen = flights.repeated(at).fly(replay, [setting], states, run, substep, Recording(fields, data)).seen
     found, first = [], 0
     for w, own in zip(windows, commands):

@@ -123,10 +123,10 @@ class ThrowModel:
         states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
         steps = [self._step(e, theta.get(e.name, 0.0)) for e in self._graded]
         settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
-        replay = self._replay(settings, download=wp.to_torch)
+        replay, begun = self._replay(settings, download=wp.to_torch), perturbed(states, self._directions)
         found: list[Window] = []
         for batch in self._batches():
-            found += self._linearised(replay, settings, np.array(steps), states, batch)
+            found += self._linearised(replay, settings, np.array(steps), begun, batch)
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, found)
@@ -344,7 +344,7 @@ class ThrowModel:
             plans.append(plan)
             lanes += own
             kept += 2 * int(f.knots[w])
-        flown = f.fly(replay, settings, perturbed(states, self._directions), lanes, self.substep)
+        flown = f.fly(replay, settings, states, lanes, self.substep)
 
         def slopes(plan: Plan) -> list[torch.Tensor]:
             return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
