@@ -314,7 +314,7 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
     if lowest < -1e-5:
         raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
     if lowest < 0.0:  # rounding, which wide priors of several named effects would turn into evidence
-        information += (-2.0 * lowest / len(flights)) * np.diag(scale**-2.0)
+        information -= 2.0 * lowest * information * np.eye(size)  # what says nothing of an effect stays silent
     return Statistics(flights, information, score, square, samples, np.array(theta, dtype=float))
 
 
