@@ -76,6 +76,7 @@ class Seen:
 
     ball: BallSeen | None
     goal: GoalSeen | None
+    squares: tuple[GoalSeen, ...] = ()  # all that may be the goal, the likeliest first
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,8 @@ class Detector:
         colours = colours_of(image)
         ball = colour_maps(colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow")
         goal = colour_maps(colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green")
-        return Seen(self._ball(*ball, known), self._goal(*goal, colours.bright, known))
+        squares = self._squares(*goal, colours.bright, known)
+        return Seen(self._ball(*ball, known), squares[0] if squares else None, squares)
 
     def check(self, image: np.ndarray) -> None:
         """Raise ValueError for an image of another size or type."""
@@ -197,14 +199,11 @@ class Detector:
         # A smaller thing on the ground would, were it the ball, lie below the ground.
         return known.height + distance * float(ray @ known.up_c) > -DISTANCE_ERROR * distance
 
-    def _goal(self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, known: Known) -> GoalSeen | None:
-        """The blob that is the best square with a rim."""
-        best: GoalSeen | None = None
-        for contour in outlines_of(mask):
-            found = fit_goal(self.lens, self.params.field_share, contour, level, bright)
-            if found is not None and self._right_size(found[0], known) and (best is None or found[1] > best.score):
-                best = GoalSeen(*found)
-        return best
+    def _squares(self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, known: Known) -> tuple[GoalSeen, ...]:
+        """The blobs that are squares with a rim, the best first."""
+        fits = [fit_goal(self.lens, self.params.field_share, contour, level, bright) for contour in outlines_of(mask)]
+        found = [GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], known)]
+        return tuple(sorted(found, key=lambda square: -square.score))
 
     def _right_size(self, rays_c: np.ndarray, known: Known) -> bool:
         """Whether the corners lie on the ground, a goal's side from one another; true where that cannot be told."""

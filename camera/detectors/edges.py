@@ -168,8 +168,8 @@ def fit_goal(
         bright: greatest channel, uint8, shape (H, W).
 
     Returns:
-        Unit rays to the outer corners, clockwise in the image, shape (4, 3), and a score; None where it is no square with
-        a rim.
+        Unit rays to the outer corners, clockwise in the image, shape (4, 3), and a score of at most 1; None where it is no
+        square with a rim.
     """
     rays = rays_of(lens, outline)
     centre = rays.mean(axis=0)
@@ -188,7 +188,7 @@ def fit_goal(
     if misfit > MOST_BENT or share < 0.5 or rim < LEAST_RIM:
         return None
     rays_c = np.column_stack([outer, np.ones(4)]) @ frame.T
-    return rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True), share - misfit + min(rim, 0.5)
+    return rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True), (share - misfit + min(rim, 0.5)) / 1.5
 
 
 def _quadrangle(points: np.ndarray) -> np.ndarray | None:

@@ -1,20 +1,21 @@
-"""Ball and goal from frame to frame: where they are looked for, and what the ball reads while it is missed.
+"""Ball and goal from frame to frame: where they are looked for, what the ball reads while it is missed, and which square is the goal.
 
-Each is a direction in the world that turns. A hanging ball is a pendulum: the vehicle's thrust drives its direction about the lens, the
-same gravity pulls both. What is not known of it is noise of a Kalman filter, whose spread says how far off a prediction can be.
+A ball is a direction in the world that turns. One that hangs is a pendulum: the vehicle's thrust drives its direction about the lens,
+the same gravity pulls both. What is not known of it is noise of a Kalman filter, whose spread says how far off a prediction can be.
+A square lies at a place on the ground, where what each frame says of it adds up; the likeliest of all is the goal.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera.detectors.contours import GATE, BallSeen, Known, Seen
+from camera.detectors.contours import GATE, BallSeen, GoalSeen, Known, Seen
 
 READ = 0.01
 """Of a direction in the world, about each axis: of the attitude, with which a detection is turned there, and of the detection [rad]."""
 
-TURNS = {"ball": 4.0, "goal": 1.0}  # rate of what was seen once, about each axis [rad/s]
+TURNS = 4.0  # rate of a ball that was seen once, about each axis [rad/s]
 
 DRIVEN = 8.0
 """Of a direction's acceleration in each frame, about each axis, beyond a pendulum's [rad/s^2]. Set on 20 throws of the training simulator;
@@ -28,6 +29,11 @@ STILL = 0.05, 0.2  # of a ball that is said to hang still: direction [rad] and i
 LOST = 0.04
 """Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by as much in a frame of a throw, and of
 the frames of training one in twenty is repeated."""
+
+MEMORY = 2.0
+"""Time in which what a frame said of a square fades to 1/e, and after which one that was not seen again is forgotten [s]: a hover."""
+
+SUREST = 0.99  # probability of a square in one frame at most: frames err alike
 
 
 class Track:
@@ -60,52 +66,90 @@ class Track:
         self._covariance = self._covariance - np.outer(gain, self._covariance[0])
 
 
+@dataclass(eq=False)
+class Square:
+    """What may be the goal: where it was seen last on the ground [m], shape (2,), when [s], and its log-odds by the frames so far."""
+
+    place_w: np.ndarray
+    stamp: float
+    log_odds: float = 0.0
+
+
 class Following:
     """What one camera has seen of ball and goal."""
 
-    def __init__(self, radius: float, ball_w: np.ndarray | None = None) -> None:
-        """Begin with a ball of a radius [m] that hangs still at a place from the lens [m], shape (3,), world frame, or with none."""
-        self._radius, self._half_angle, self._begin = radius, 0.0, ball_w
-        self._tracks: dict[str, Track] = {}
+    def __init__(self, radius: float, side: float, ball_w: np.ndarray | None = None) -> None:
+        """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the lens [m], shape (3,), or with none."""
+        self._radius, self._side, self._half_angle, self._begin = radius, side, 0.0, ball_w
+        self._ball: Track | None = None
+        self._squares: list[Square] = []
+        self._eye_w, self._stamp = np.zeros(3), -math.inf
 
-    def known(self, rot_wc: np.ndarray, up_w: np.ndarray, height: float, distance: tuple[float, float] | None, stamp: float) -> Known:
+    def known(self, rot_wc: np.ndarray, up_w: np.ndarray, eye_w: np.ndarray, distance: tuple[float, float] | None, stamp: float) -> Known:
         """What a detector is told of a frame.
 
         Args:
             rot_wc: camera to world, shape (3, 3). up_w: the vehicle's z, along which it thrusts, shape (3,).
-            height: of the lens [m]. distance: of a ball that hangs [m]; None: it does not.
+            eye_w: the lens [m], shape (3,). distance: of a ball that hangs [m]; None: it does not.
             stamp: of the frame [s].
         """
         if self._begin is not None:
             far = float(np.linalg.norm(self._begin))
-            self._tracks["ball"], self._half_angle = Track(self._begin / far, stamp, *STILL), math.asin(self._radius / far)
+            self._ball, self._half_angle = Track(self._begin / far, stamp, *STILL), math.asin(self._radius / far)
             self._begin = None
-        for name, track in self._tracks.items():
-            hangs = name == "ball" and distance is not None
-            pull = THRUST * math.sin(self._half_angle) / self._radius if hangs else 0.0
-            track.predict(stamp, -pull * _across(up_w, track.ray_w))
-        where = {f"{name}_{of}": value for name, track in self._tracks.items()
-                 for of, value in (("ray_c", rot_wc.T @ track.ray_w), ("within", min(GATE * track.spread, math.pi)))}  # fmt: skip
-        return Known(rot_wc[2], height, distance, north_c=rot_wc[0], **where)
+        where = {}
+        if self._ball is not None:
+            pull = THRUST * math.sin(self._half_angle) / self._radius if distance is not None else 0.0
+            self._ball.predict(stamp, -pull * _across(up_w, self._ball.ray_w))
+            where = {"ball_ray_c": rot_wc.T @ self._ball.ray_w, "ball_within": min(GATE * self._ball.spread, math.pi)}
+        self._squares = [square for square in self._squares if stamp - square.stamp < MEMORY]
+        for square in self._squares:
+            square.log_odds *= math.exp((self._stamp - stamp) / MEMORY)
+        self._eye_w, self._stamp = eye_w, stamp
+        if self._squares:
+            away = np.append(self._likeliest().place_w, 0.0) - eye_w
+            where |= {"goal_ray_c": rot_wc.T @ _unit(away), "goal_within": self._side / float(np.linalg.norm(away))}
+        return Known(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
     def take(self, seen: Seen, rot_wc: np.ndarray | None, stamp: float) -> Seen:
-        """What was seen in a frame, with a ball that was missed where it is predicted; without an attitude nothing is followed."""
+        """What was seen in a frame, with a ball that was missed where it is predicted, and of the squares the one that is the goal.
+
+        Without an attitude nothing is followed.
+        """
         if rot_wc is None:
-            self._tracks = {}
+            self._ball, self._squares = None, []
             return seen
-        rays = {} if seen.ball is None else {"ball": seen.ball.ray_c}
-        rays |= {} if seen.goal is None else {"goal": _unit(seen.goal.rays_c.mean(0))}
-        for name, ray_c in rays.items():
-            ray_w, track = rot_wc @ ray_c, self._tracks.get(name)
-            if track is not None and ray_w @ track.ray_w > math.cos(min(GATE * math.hypot(track.spread, READ), math.pi)):
-                track.see(ray_w)
-            else:
-                self._tracks[name] = Track(ray_w, stamp, READ, TURNS[name])
+        seen = replace(seen, goal=self._goal(seen, rot_wc))
         if seen.ball is not None:
+            ray_w = rot_wc @ seen.ball.ray_c
+            if self._ball is not None and ray_w @ self._ball.ray_w > math.cos(min(GATE * math.hypot(self._ball.spread, READ), math.pi)):
+                self._ball.see(ray_w)
+            else:
+                self._ball = Track(ray_w, stamp, READ, TURNS)
             self._half_angle = seen.ball.half_angle
-        elif "ball" in self._tracks and self._tracks["ball"].spread < LOST:
-            return replace(seen, ball=BallSeen(rot_wc.T @ self._tracks["ball"].ray_w, self._half_angle, 0.0))
+        elif self._ball is not None and self._ball.spread < LOST:
+            return replace(seen, ball=BallSeen(rot_wc.T @ self._ball.ray_w, self._half_angle, 0.0))
         return seen
+
+    def _goal(self, seen: Seen, rot_wc: np.ndarray) -> GoalSeen | None:
+        """Add up what a frame says of squares, of which two are no nearer than a side; returns the goal, unless it was missed."""
+        found: dict[int, GoalSeen] = {}
+        for one in seen.squares:  # the likeliest first
+            ray_w = rot_wc @ one.rays_c.mean(0)
+            place_w = self._eye_w[:2] + ray_w[:2] * (self._eye_w[2] / -ray_w[2])
+            apart = [float(np.linalg.norm(square.place_w - place_w)) for square in self._squares]
+            i = int(np.argmin([*apart, self._side]))  # the last: a new one
+            if i in found:
+                continue
+            if i == len(self._squares):
+                self._squares.append(Square(place_w, self._stamp))
+            square, sure, found[i] = self._squares[i], min(max(one.score, 1.0 - SUREST), SUREST), one
+            square.place_w, square.stamp = place_w, self._stamp
+            square.log_odds += math.log(sure / (1.0 - sure))
+        return found.get(self._squares.index(self._likeliest())) if self._squares else None
+
+    def _likeliest(self) -> Square:
+        return max(self._squares, key=lambda square: square.log_odds)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

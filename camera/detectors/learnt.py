@@ -193,7 +193,8 @@ class LearntDetector(Detector):
         places = places_of(self.networks.search(halved(frames)), self.lens)
         north = torch.tensor(known.north_c if known.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32)
         ball, goal = (self._closest(kind, frames, *places[kind], north) for kind in KINDS)
-        return Seen(self._best_ball(*ball, known), self._best_goal(*goal, known))
+        squares = self._squares(*goal, known)
+        return Seen(self._best_ball(*ball, known), squares[0] if squares else None, squares)
 
     def _closest(self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor) -> tuple[Tensor, Tensor]:
         """Probabilities and findings at places."""
@@ -211,15 +212,15 @@ class LearntDetector(Detector):
                 return BallSeen(ray, half_angle, float(probability[i]))
         return None
 
-    def _best_goal(self, probability: Tensor, things: Tensor, known: Known) -> GoalSeen | None:
+    def _squares(self, probability: Tensor, things: Tensor, known: Known) -> tuple[GoalSeen, ...]:
+        """What is sure, or sure where it is expected, the likeliest first; each by its own probability, which frames add up."""
         raised = self._expected_there(probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within)
-        # Another square is mistaken for the goal in one frame as in the next: where it was seen does not choose between two sure ones.
-        for odds in (probability, raised):
-            for i in odds.argsort(descending=True).tolist():
-                rays = things[i].double().numpy()
-                if odds[i] >= LEAST_PROBABILITY and self._right_size(rays, known):
-                    return GoalSeen(rays, float(odds[i]))
-        return None
+        found = []
+        for i in probability.argsort(descending=True).tolist():
+            rays = things[i].double().numpy()
+            if max(probability[i], raised[i]) >= LEAST_PROBABILITY and self._right_size(rays, known):
+                found.append(GoalSeen(rays, float(probability[i])))
+        return tuple(found)
 
     def _expected_there(self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float) -> Tensor:
         """Probabilities where it is known about where the thing is; the networks' own are of a thing that can be anywhere in view.

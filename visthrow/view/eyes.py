@@ -101,13 +101,13 @@ class Eyes:
     def _hanging(self, rot_wb: np.ndarray) -> Following:
         """A ball that hangs still below a vehicle: where it is looked for first."""
         from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
-        return Following(self.params.payload_radius, from_lens - [0.0, 0.0, self._below])
+        return Following(self.params.payload_radius, self.params.goal_side, from_lens - [0.0, 0.0, self._below])
 
     def _looked(self, picture: np.ndarray, e: int, pos_w: np.ndarray, rot_wb: np.ndarray, carried: bool, stamp: float) -> Seen:
         """What the detector finds, or of a ball that it misses where it is predicted; vehicle e and its measured pose at a time [s]."""
         rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
-        height = float(pos_w[2] + rot_wb[2] @ np.array(self.params.mount.position_b))
-        seen = self.detector.detect(picture, self._followed[e].known(rot_wc, rot_wb[:, 2], height, HANGING if carried else None, stamp))
+        eye_w = pos_w + rot_wb @ np.array(self.params.mount.position_b)
+        seen = self.detector.detect(picture, self._followed[e].known(rot_wc, rot_wb[:, 2], eye_w, HANGING if carried else None, stamp))
         self.found["frames"] += 1
         for name in THINGS:
             self._hits[name][e] += getattr(seen, name) is not None

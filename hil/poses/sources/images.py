@@ -84,7 +84,7 @@ class Eyes:
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
-        self._followed = Following(training.payload_radius)
+        self._followed = Following(training.payload_radius, training.goal_side)
 
     def look(self, picture: np.ndarray, stamp: float) -> Detection:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
@@ -92,8 +92,8 @@ class Eyes:
         if hint is not None:
             rot_wb = rotation_of(hint.quat)
             rot_wc = rot_wb @ self._rot_cb.T
-            height = hint.pos_w[2] + float(rot_wb[2] @ self._position_b)
-            known = self._followed.known(rot_wc, rot_wb[:, 2], height, hint.ball_distance, stamp)
+            eye_w = np.array(hint.pos_w) + rot_wb @ self._position_b
+            known = self._followed.known(rot_wc, rot_wb[:, 2], eye_w, hint.ball_distance, stamp)
         try:
             seen = self._followed.take(self.detector.detect(picture, known), rot_wc, stamp)
         except ValueError as error:
