@@ -171,11 +171,12 @@ class Fake(ABC):
     usually_prompt = True  # with its heartbeat after a change of mode
 
     def __init__(
-        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None
+        self, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0, options: Options | None = None,
+        port: Port | None = None,
     ) -> None:  # fmt: skip
-        """Begin in the hands of a pilot; the poses go out on the link, with the vehicle's ids."""
+        """Begin in the hands of a pilot; poses go out on the link, with the vehicle's ids, commands come by the port, or on the link."""
         self.plant, self.link, self.options = plant, link, options or Options()
-        self.port: Any = link.port
+        self.port: Any = port or link.port
         self.mocap = Mocap(mocap or MocapParams(), seed)
         self.mocap_fault = MocapFault(self.options.mocap_fault, self.options.fault_time, seed)
         self.witness = Witness((plant.max_thrust, *MAX_RATES))
@@ -388,25 +389,19 @@ class PortFake(Fake):
 
     thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
 
-    def __init__(self, *args: Any, port: Port | None = None, **kwargs: Any) -> None:
-        """Take the port that commands come on; else as of `Fake`."""
-        super().__init__(*args, **kwargs)
-        self.port = port
-
     @abstractmethod
     def came(self, data: bytes) -> None:
         """Take what came on the port."""
 
     def hear(self) -> None:
-        for data in () if self.port is None else chunks(self.port):
+        for data in chunks(self.port):
             self.heard = self.wall()
             self.came(data)
         super().hear()
 
     def close(self) -> None:
         super().close()
-        if self.port is not None:
-            self.port.close()
+        self.port.close()
 
 
 class Bridge(Fake):

@@ -105,8 +105,7 @@ def make_fake(
     """Return a fake of a kind, with its port of MSP for Betaflight, of CRTP for the Crazyflie; raises `RunError` for an unknown kind."""
     if kind not in KINDS:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, KINDS)}")
-    more = {"port": port} if kind in ("betaflight", "crazyflie") else {}
-    return KINDS[kind](plant, link, mocap, seed, options, **more)
+    return KINDS[kind](plant, link, mocap, seed, options, port)
 
 
 @contextlib.contextmanager

@@ -11,16 +11,7 @@ from typing import Any
 import numpy as np
 
 from hil.fakes.mavlink import FakeMavlink
-from hil.links.backends.px4 import (
-    AUTO_LAND,
-    AUTO_LOITER,
-    LAND_OR_HOLD,
-    MAIN_AUTO,
-    MAIN_OFFBOARD,
-    MAIN_POSCTL,
-    bytes_to_integer,
-    integer_to_bytes,
-)
+from hil.links.backends import px4
 from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 
@@ -34,8 +25,8 @@ def custom(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-OFFBOARD, POSCTL = custom(MAIN_OFFBOARD), custom(MAIN_POSCTL)
-HOLD, LAND = custom(MAIN_AUTO, AUTO_LOITER), custom(MAIN_AUTO, AUTO_LAND)
+OFFBOARD, POSCTL = custom(px4.MAIN_OFFBOARD), custom(px4.MAIN_POSCTL)
+HOLD, LAND = custom(px4.MAIN_AUTO, px4.AUTO_LOITER), custom(px4.MAIN_AUTO, px4.AUTO_LAND)
 
 
 class FakePx4(FakeMavlink):
@@ -96,11 +87,11 @@ class FakePx4(FakeMavlink):
 
     def field(self, name: str) -> tuple[float, int]:
         if name in INTEGERS:
-            return integer_to_bytes(self.parameters[name]), mav.MAV_PARAM_TYPE_INT32
+            return px4.integer_to_bytes(self.parameters[name]), mav.MAV_PARAM_TYPE_INT32
         return super().field(name)
 
     def value(self, field: float, kind: int) -> float:
-        return bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
+        return px4.bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -111,7 +102,7 @@ class FakePx4(FakeMavlink):
     def flown(self) -> np.ndarray:
         if self.mode == OFFBOARD and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]:
             self.happened("left OFFBOARD: no set-points")
-            self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == LAND_OR_HOLD[0] else HOLD)
+            self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == px4.LAND_OR_HOLD[0] else HOLD)
             self.beat_soon()
         if self.mode == LAND:
             return self.descend()

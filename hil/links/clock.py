@@ -106,9 +106,8 @@ class TimeSync:
     DRIFT = 1e-3  # that clocks may part by within the window: 200 parts in a million over 5 s [s]
     STEP_AFTER = 3  # contradicting exchanges in a row that make a step
 
-    def __init__(self, window: int = 50) -> None:
-        """Remember the last ``window`` exchanges."""
-        self._exchanges: deque[tuple[float, float]] = deque(maxlen=window)
+    def __init__(self) -> None:
+        self._exchanges: deque[tuple[float, float]] = deque(maxlen=50)
         self._odd = 0
         self.steps = 0
 

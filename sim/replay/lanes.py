@@ -68,32 +68,25 @@ class Replay:
         plants: parameters of the rows that lanes choose from; one choice of blocks and one number of segments.
         sensings: of the same rows.
         device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the same.
-        precision: "float64", in which differences of lanes do not drown in rounding, or "float32".
-        gravity: [m/s^2].
         download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
     """
 
     def __init__(
-        self,
-        plants: Sequence[PlantParams],
-        sensings: Sequence[SensingParams],
-        device: str = "cpu",
-        precision: str = "float64",
-        gravity: float = GRAVITY,
+        self, plants: Sequence[PlantParams], sensings: Sequence[SensingParams], device: str = "cpu",
         download: Callable[[wp.array], np.ndarray] = wp.array.numpy,
-    ):
+    ):  # fmt: skip
         first = plants[0]
         if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {first.rope.segments}:
             raise ValueError(
                 f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with {len(sensings)} sensings: "
                 "expected one number of segments and a sensing each"
             )
-        self.device, self.gravity, self.segments, self._sim = device, gravity, first.rope.segments, first.sim
+        self.device, self.segments, self._sim = device, first.rope.segments, first.sim
         self._download = download
-        self.types = t = types(precision)
+        self.types = t = types("float64")  # in which differences of lanes do not drown in rounding
         kinds = kinds_of(first.vehicle)
         check_laws(first.laws)
-        key = (precision, kinds, self.segments, structure(first.laws))
+        key = (kinds, self.segments, structure(first.laws))
         if key not in _BUILDS:
             _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws)
         self.kernel = _BUILDS[key]
@@ -144,7 +137,7 @@ class Replay:
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
         launches = [rows[np.argsort(-costs[rows], kind="stable")] for rows in _in_order(np.asarray(lanes["shared"]), resumed)]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
-        numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, self.gravity]
+        numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, GRAVITY]
         told = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
         (begin, flown), (windows, data) = (_struct(t, *given, device) for given in told), recording.on(k, t, device)
         before = [*self._plants[device], *numerics, begin, windows, flown, data, order]

@@ -111,11 +111,6 @@ class Follower:
             found.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
         return found
 
-    @property
-    def over(self) -> bool:
-        """Whether the run has ended."""
-        return (self.folder / SUMMARY).is_file()
-
     def close(self) -> None:
         """Close its files."""
         for lines in self._tails.values():
@@ -127,7 +122,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
     follower, show, dropped = Follower(Path(folder)), None, 0
     try:
         while going():
-            over = follower.over
+            over = (follower.folder / SUMMARY).is_file()
             ticks = follower.ticks()
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:

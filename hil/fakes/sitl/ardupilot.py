@@ -95,7 +95,8 @@ class ArduPilotSitl(Bridge):
             self.restarts += number < self._number
             self._number, self.frames = number, self.frames + 1
             self.motors = np.clip((servos[list(OURS)] - LOW) / (HIGH - LOW), 0.0, 1.0)
-            self._mechanism(servos)
+            at, opens = self.params.servo_output - 1, self.params.servo_open_us
+            self.output(0 <= at < len(servos) and abs(servos[at] - opens) <= NEAR, self.plant.time)
             super().fly()
         self._socket.sendto(state_line(self.plant.time, self.plant), to)
 
@@ -106,10 +107,6 @@ class ArduPilotSitl(Bridge):
             if frame is not None:
                 return frame, sender
         return None, None
-
-    def _mechanism(self, servos: np.ndarray) -> None:
-        at = self.params.servo_output - 1
-        self.output(0 <= at < len(servos) and abs(servos[at] - self.params.servo_open_us) <= NEAR, self.plant.time)
 
     def flown(self) -> np.ndarray:
         return self.motors

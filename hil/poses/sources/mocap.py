@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from hil.errors import SourceError
-from hil.links.device import check_device
 from hil.links.mavlink_link import Link
 from hil.poses.pose import BODIES, Body, Pose
 from hil.poses.sources.base import Source
@@ -160,15 +159,6 @@ class NatNetSource(MocapSource):
     def close(self) -> None:
         self._client.shutdown()
         super().close()
-
-
-def open_mocap(
-    params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], remote: bool, link: Link | None = None
-) -> MocapSource:
-    """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this machine without the config's leave."""
-    check_device(f"tcp:{params.host}:1", remote=remote)
-    kind = NatNetSource if params.system == "natnet" else MotionCaptureSource
-    return kind(params, bodies, clock, link)
 
 
 def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import Pose
 from hil.poses.sources.base import Recorded
 from hil.poses.sources.mavlink import COMPANIONS, MavlinkSource
-from hil.poses.sources.mocap import open_mocap
+from hil.poses.sources.mocap import MocapParams, MocapSource, MotionCaptureSource, NatNetSource, RigidBody
 from hil.poses.sources.player import CHANNELS, read_autopilot, read_table, read_tlog
 from hil.poses.sources.ros2 import Ros2Source
 from visthrow.logs.check import physics
@@ -75,15 +75,20 @@ def open_source(
     link = None
     if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
         link = opened(params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
-    if source.kind != "mavlink" and source.mocap.system == "ros2":
-        check_device(f"tcp:{source.mocap.host}:1", remote=params.link.remote)
-        return Ros2Source(source.mocap, source.bodies, clock.now, link), link, False
-    if source.kind != "mavlink":
+    if source.kind == "mocap":
         return open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link), link, False
     if not own:
         return MavlinkSource(link, source.senders, clock.now), link, False
     poses = opened(source.device, POSES_TLOG, parties(params, True, False))
     return MavlinkSource(poses, source.senders, clock.now, link), link, False
+
+
+def open_mocap(
+    params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], remote: bool, link: Link | None = None
+) -> MocapSource:
+    """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this machine without the config's leave."""
+    check_device(f"tcp:{params.host}:1", remote=remote)
+    return {"natnet": NatNetSource, "ros2": Ros2Source}.get(params.system, MotionCaptureSource)(params, bodies, clock, link)
 
 
 LEAST = 50  # poses below which nothing is said

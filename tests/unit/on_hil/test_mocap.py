@@ -10,7 +10,8 @@ import pytest
 
 from hil.errors import LinkError, SourceError
 from hil.params import HilParams
-from hil.poses.sources.mocap import MocapParams, MotionCaptureSource, NatNetSource, RigidBody, open_mocap
+from hil.poses.sources.mocap import MocapParams, MotionCaptureSource, NatNetSource, RigidBody
+from hil.poses.sources.opening import open_mocap
 from visthrow import config
 from visthrow.common.errors import ConfigError
 

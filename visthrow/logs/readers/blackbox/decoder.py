@@ -87,7 +87,6 @@ class _Decoder:
         self.header: dict[str, str] = {}
         self.fields: dict[str, Fields] = {}
         self.reader = Reader(data, self._read_header(data))
-        self.motor0 = None
         self._prepare()
         self.history: list[list[int]] = []  # last frames, newest first; empty: not valid
         self.last_time = self.last_iteration = None
