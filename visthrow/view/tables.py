@@ -42,20 +42,24 @@ COLUMNS = (
 )  # fmt: skip
 
 
+def of_paper(name: str, target: float) -> str:
+    """The paper's error and duration, mean and deviation, in words; "-" where it has none."""
+    paper = PAPER.get((name, target))
+    return "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
+
+
 def markdown(rows: Sequence[dict], title: str) -> str:
     """Table of summaries, :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and ``layout`` added."""
     return f"{title}\n\n{aligned(COLUMNS, [_cells(row) for row in rows], heads=1)}\n"
 
 
 def _cells(row: dict) -> tuple[str, ...]:
-    paper = PAPER.get((row["layout"], row["target"]))
-    beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
-    head = (row["policy"], f"{row['target']:.1f}", str(row["throws"]))
+    head, paper = (row["policy"], f"{row['target']:.1f}", str(row["throws"])), of_paper(row["layout"], row["target"])
     success = f"{100 * row['success']:.1f} %"
     if not row["success"]:
-        return (*head, "-", "-", success, "-", "-", beside)
+        return (*head, "-", "-", success, "-", "-", paper)
     error, duration = (f"{row[f'{name}_mean']:.3f} ± {row[f'{name}_std']:.3f}" for name in ("error", "duration"))
-    return (*head, error, duration, success, f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", beside)
+    return (*head, error, duration, success, f"{row['bias_x']:+.3f} / {row['bias_y']:+.3f}", f"{row['smoothness']:.3f}", paper)
 
 
 def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:

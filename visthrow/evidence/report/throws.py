@@ -10,7 +10,7 @@ from visthrow.throws.plants import PLANTS
 from visthrow.throws.results import Result
 from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text, section
-from visthrow.view.tables import PAPER, PAPER_NOTE
+from visthrow.view.tables import PAPER, PAPER_NOTE, of_paper
 
 SHORT = {
     "pendulum": "own model", "hybrid": "training simulator", "reference": "reference plant",
@@ -48,14 +48,13 @@ def wanted_there(plant: str, target: float) -> bool:
 
 def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]:
     head = (name, f"{target:.1f}", SHORT[plant], str(len(found.good)), landed(found))
-    paper = PAPER.get((name, target))
-    beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
+    paper = of_paper(name, target)
     if not found.good.any():
-        return (*head, "-", "-", "-", "-", beside)
+        return (*head, "-", "-", "-", "-", paper)
     bias = st.bias(found.miss)
     return (
         *head, st.mean(found.of("error")).text(), f"{found.of('error').std():.3f}", f"{found.of('duration').mean():.3f}",
-        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}", beside,
+        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}", paper,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from visthrow.task.measurement import TARGETS
 from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
-from visthrow.view.tables import PAPER
+from visthrow.view.tables import PAPER, of_paper
 
 DRAWS = 800  # bootstrap samples of a hypervolume
 
@@ -75,14 +75,13 @@ def by_target(found: Sequence[Result]) -> Grid:
 def _row(found: Result) -> tuple[str, ...]:
     unit = found.unit
     own = unit["plant"] == thrower.OWN
-    paper = PAPER.get(("TO+MPC", unit["target"])) if own else None
+    paper = of_paper("TO+MPC", unit["target"]) if own else "-"
     head = (f"{unit['target']:.1f}", SHORT[unit["plant"]], "-" if own else thrower.MADE_UP[unit["compensation"]],
             str(len(found.good)), landed(found, digits=0))  # fmt: skip
-    beside = "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
     if not found.good.any():
-        return (*head, "-", "-", "-", "-", "-", beside)
+        return (*head, "-", "-", "-", "-", "-", paper)
     means = (f"{100 * found.of(name).mean():.1f}" for name in ("position_error", "velocity_error", "tracking"))
-    return (*head, st.mean(found.of("error")).text(), f"{found.of('duration').mean():.3f}", *means, beside)
+    return (*head, st.mean(found.of("error")).text(), f"{found.of('duration').mean():.3f}", *means, paper)
 
 
 def _steps() -> list[Grid | Text]:
