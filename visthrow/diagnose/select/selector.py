@@ -155,7 +155,8 @@ class Selector(SearchState):
         """Simulate all sets that may be worth as much, and go over to the best of them; what is left is possible as well."""
         if self.rivalled is self.point:
             return False
-        ranked = [move for move in self._rivals() if frozenset(move.active) not in self.visited]
+        visited = self.visited | {frozenset(self.active)}
+        ranked = [move for move in self._rivals() if frozenset(move.active) not in visited]
         tried = self._tried(self.point, [move.active for move in ranked])
         listed = {move.active: move.nats for move in ranked}
         if self._best(tried, listed, AHEAD):
