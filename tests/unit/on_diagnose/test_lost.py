@@ -78,7 +78,7 @@ def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(act
     at = selector.Selector(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
     at.point = candidate(at.problem, nominal, active)
     drag = terms.as_effect(Term("vehicle force", ("speed",), "vel"), 0.1, 7.0)
-    (at.problem, at.origin), (_, at.point) = (terms.extended(problem, p, [drag]) for p in (at.origin, at.point))
+    at.problem, (at.origin, at.point) = terms.extended(problem, (at.origin, at.point), [drag])
     left = [i for i in problem.kept if i != BAD]
     assert at.stands_without([BAD], problem.only(left), only(nominal, left), 5.0) == stands
     assert len(at.point.windows) == len(at.origin.windows) == len(left)

@@ -214,7 +214,7 @@ def beside_a_law(model: SyntheticModel, active: list[int], *laws: grammar.Term) 
     problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
     if laws:
-        problem, point = terms.extended(problem, point, [terms.as_effect(term, 0.1, 7.0) for term in laws])
+        problem, (point,) = terms.extended(problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in laws])
     named = [*active, *range(len(model.effects), len(problem.priors.floor))]
     return selector.Selector(problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named))
 
@@ -226,7 +226,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     known = terms.knots_of(at.point)
     of = terms.screen(at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        problem, point = terms.extended(at.problem, at.point, [terms.as_effect(of.terms[i], 1.0, 0.0)])
+        problem, (point,) = terms.extended(at.problem, [at.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
         scale = problem.priors.floor[-1]
         assert point.information[-1, -1] == pytest.approx(scale**2 * of.own[i], rel=1e-6)
         assert point.score[-1] == pytest.approx(scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i]))
@@ -319,7 +319,7 @@ def test_terms_are_screened_beside_what_varies(days):
     screen = terms.screen(calm, parts, "payload force", terms.knots_of(calm))
     for i in (0, 1, 40):
         own = terms.as_effect(screen.terms[i], 0.1, 0.0)
-        _, wide = terms.extended(problem, calm, [own])
+        _, (wide,) = terms.extended(problem, [calm], [own])
         np.testing.assert_allclose(screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
         np.testing.assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
         cross = wide.information[-1, :-1] / own.floor

@@ -355,9 +355,9 @@ class Selector(SearchState):
         if not short:
             return False
         points = {id(p): p for p in (self.nominal, self.origin, self.point)}
-        wide = {key: terms.extended(self.problem, p, short) for key, p in points.items()}
-        self.problem = wide[id(self.point)][0]
-        self.nominal, self.origin, self.point = (wide[id(p)][1] for p in (self.nominal, self.origin, self.point))
+        self.problem, wide = terms.extended(self.problem, list(points.values()), short)
+        at = dict(zip(points, wide))
+        self.nominal, self.origin, self.point = (at[id(p)] for p in (self.nominal, self.origin, self.point))
         return True
 
     def _lawful(self, point: Point, active: Sequence[int], j: int) -> bool:

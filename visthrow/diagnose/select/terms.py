@@ -15,13 +15,14 @@ import torch
 from scipy.linalg import lapack
 
 from visthrow.diagnose.likelihood import grammar
+from visthrow.diagnose.likelihood.designs import Same
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
 from visthrow.diagnose.likelihood.grammar import TermEffect, carries, forces
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
-from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
@@ -173,29 +174,42 @@ def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
     return kept
 
 
-def extended(problem: Problem, point: Point, terms: Sequence[TermEffect]) -> tuple[Problem, Point]:
-    """The problem and a point of it with more terms as effects, at 0; nothing is simulated again."""
+def extended(problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]) -> tuple[Problem, list[Point]]:
+    """The problem and points of it with more terms as effects, at 0; nothing is simulated again, and the same derivatives are laid once."""
     wide = replace(problem, terms=(*problem.terms, *terms))
     wide = replace(wide, priors=Priors.of(wide.effects, tuple(problem.model.channels)))
-    through = each(lambda window: forces(window, terms), point.windows)
 
-    def column(w: int) -> Gram:
-        gram, own = point.grams[w], through[w] * wide.priors.floor[-len(terms) :]
-        return _appended(gram, lapack.dtrtrs(gram.factor, own, lower=1)[0] if gram.latents else own)
+    def laid(window: Window, gram: Gram) -> tuple[np.ndarray, ...]:
+        through = forces(window, terms)
+        own = through * wide.priors.floor[-len(terms) :]
+        own = lapack.dtrtrs(gram.factor, own, lower=1)[0] if gram.latents else own
+        return np.hstack((window.effects, window.latent @ through)), _appended(gram, own), own
 
-    windows = [replace(w, effects=np.hstack((w.effects, w.latent @ own))) for w, own in zip(point.windows, through)]
-    at = np.append(point.theta, np.zeros(len(terms)))
-    return wide, regathered(point, theta=at, windows=windows, grams=each(column, range(len(windows))))
+    known: dict[Same, list[tuple[np.ndarray, ...]]] = {}
+    found = []
+    for point in points:
+        there = Same([a for w, gram in zip(point.windows, point.grams) for a in (w.effects, gram.inner)])
+        if there not in known:
+            known[there] = each(lambda pair: laid(*pair), zip(point.windows, point.grams))
+        windows = [replace(w, effects=effects) for w, (effects, _, _) in zip(point.windows, known[there])]
+        grams = [replace(gram, inner=inner, cross=np.concatenate((gram.cross, gram.cross[:, _latents(gram)] @ own), axis=1))
+                 for gram, (_, inner, own) in zip(point.grams, known[there])]  # fmt: skip
+        found.append(regathered(point, theta=np.append(point.theta, np.zeros(len(terms))), windows=windows, grams=grams))
+    return wide, found
 
 
-def _appended(gram: Gram, columns: np.ndarray) -> Gram:
-    """Append G columns as effects; ``columns`` are in the gram's own latents, shape (L, T)."""
-    part, size, count = slice(gram.nuisances, gram.nuisances + gram.latents), gram.inner.shape[1], columns.shape[1]
+def _latents(gram: Gram) -> slice:
+    return slice(gram.nuisances, gram.nuisances + gram.latents)
+
+
+def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
+    """A gram's inner products with G columns as further effects; ``columns`` are in the gram's own latents, shape (L, T)."""
+    part, size, count = _latents(gram), gram.inner.shape[1], columns.shape[1]
     along = gram.inner[:, :, part] @ columns
     inner = np.empty((len(along), size + count, size + count))
     inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = gram.inner, along, along.transpose(0, 2, 1)
     inner[:, size:, size:] = columns.T @ along[:, part]
-    return replace(gram, inner=inner, cross=np.concatenate((gram.cross, gram.cross[:, part] @ columns), axis=1))
+    return inner
 
 
 def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
