@@ -167,7 +167,7 @@ def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
 
     def value(time: float) -> float:
         shaped = [marginal.correlated(g, w, time) for g, w in zip(grams, windows)]
-        return noise._maximise(shaped, replace(noise._first_guess(shaped), correlation_time=time), "cpu")[1]
+        return noise.maximised(shaped, replace(noise._first_guess(shaped), correlation_time=time), "cpu")[1]
 
     found = noise.fit(windows, [marginal.gram_of(w, floors, 2) for w in windows])[0].correlation_time
     assert found == max(noise.CORRELATION_TIMES, key=value)
@@ -282,7 +282,7 @@ def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
 
     less = np.where(found.share == 1.0, 1.0, 0.7 * found.share)
     starts = [replace(found, share=share) for share in (less, np.ones_like(found.share))]
-    again = [value(noise.refit(grams, start)) for start in starts]
+    again = [value(noise.maximised(grams, start, "cpu")[0]) for start in starts]
     np.testing.assert_allclose(again, value(found), atol=10.0 * noise.ENOUGH_NATS)
 
 

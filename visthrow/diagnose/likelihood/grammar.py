@@ -81,7 +81,8 @@ class Term:
         """Of the coefficient, such that the term is a force [N] or, on the vehicle and in the joint, a torque [N m]."""
         target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
         parts = [SCALARS[f].unit for f in self.factors] + [VECTORS[self.block][self.vector].unit]
-        return unit_text(tuple(t - sum(p[i] for p in parts) for i, t in enumerate(target)))
+        left = zip(("kg", "m", "s"), (t - sum(p[i] for p in parts) for i, t in enumerate(target)))
+        return " ".join(name if n == 1 else f"{name}^{n}" for name, n in left if n) or "1"
 
     @property
     def formula(self) -> str:
@@ -234,12 +235,6 @@ VECTORS: dict[str, dict[str, Factor]] = {
 MOST_SCALARS = 2
 
 
-def unit_text(unit: Unit) -> str:
-    """Write a unit, such as ``kg m^-1``."""
-    parts = [name if n == 1 else f"{name}^{n}" for name, n in zip(("kg", "m", "s"), unit) if n]
-    return " ".join(parts) or "1"
-
-
 def terms(block: str, known: Sequence[str]) -> list[Term]:
     """All terms of a block whose factors can be made of these knots, simplest first."""
     have = set(known)
@@ -285,11 +280,6 @@ class Layout:
         for which in self.scalar:
             values *= scalars[:, None, which]
         return values
-
-
-def acting(block: str) -> tuple[str, ...]:
-    """Latent blocks that terms of a block act in."""
-    return LATENT_BLOCKS if block == JOINT else (block,)
 
 
 def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -356,7 +346,7 @@ class TermEffect(Effect):
 
 def carries(latent_block: np.ndarray, block: str) -> bool:
     """Whether a window has all latents that terms of a block act through."""
-    return set(map(LATENT_BLOCKS.index, acting(block))) <= set(np.unique(latent_block).tolist())
+    return set(map(LATENT_BLOCKS.index, LATENT_BLOCKS if block == JOINT else (block,))) <= set(np.unique(latent_block).tolist())
 
 
 def forces(window: Window, terms_: Sequence[TermEffect]) -> np.ndarray:

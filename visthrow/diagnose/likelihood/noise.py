@@ -61,7 +61,7 @@ def fit(
         time = noise.correlation_time
     shaped = designs.correlated_of(grams, windows, time, device)
     begin = replace(noise or _first_guess(shaped), correlation_time=time)
-    return _maximise(shaped, begin, device)[0], shaped
+    return maximised(shaped, begin, device)[0], shaped
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) -> Noise:
@@ -72,7 +72,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
         if i not in found:
             shaped = designs.correlated_of(bare, windows, CORRELATION_TIMES[i], device)
             begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
-            found[i] = _maximise(shaped, begin, device, ROUGHLY_NATS)
+            found[i] = maximised(shaped, begin, device, ROUGHLY_NATS)
         return found[i][1]
 
     best = len(CORRELATION_TIMES) // 2
@@ -81,14 +81,6 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
         while 0 <= best + way < len(CORRELATION_TIMES) and likely(best + way, found[best][0]) > found[best][1]:
             best += way
     return found[best][0]
-
-
-def refit(grams: Sequence[Gram], start: Noise, device: str = "cpu") -> Noise:
-    """Estimate the levels anew, with the correlation time that the grams have been given.
-
-    ``grams``: of the windows, with correlated latent forces; ``start``: where the search starts.
-    """
-    return _maximise(grams, start, device)[0]
 
 
 def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
@@ -102,7 +94,7 @@ def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, f
     guess = _first_guess(grams)
     if start is not None:
         guess = replace(start, latent_sd={key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()})
-    return _maximise(grams, guess, "cpu", ROUGHLY_NATS)
+    return maximised(grams, guess, "cpu", ROUGHLY_NATS)
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
@@ -172,7 +164,7 @@ class _Layout:
         return low, high
 
 
-def _maximise(grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
+def maximised(grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import beta
 
-from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
@@ -28,11 +27,6 @@ NAME = "dropped_commands"  # of the random effect in the catalogue
 
 EITHER = 0.5
 """Mean and deviation of m where either is as likely. From half of it as a deviation 0 and 1 are told apart: half way is two from both."""
-
-
-def effect() -> RandomEffect:
-    """Return the catalogue's entry."""
-    return next(v for v in random_effects() if v.name == NAME)
 
 
 @dataclass(frozen=True)
@@ -92,7 +86,7 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
     """
     if not hasattr(problem.model, "without_commands"):
         return None
-    v, priors, sizes = effect(), problem.priors, problem.sizes(point.theta)
+    v, priors, sizes = next(v for v in random_effects() if v.name == NAME), problem.priors, problem.sizes(point.theta)
     reach = REACH * v.prior_sd
     sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
     every = range(len(problem.kept))

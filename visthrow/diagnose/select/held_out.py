@@ -28,7 +28,7 @@ from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
-from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
 from visthrow.diagnose.select.scatter import allowed, deviations, differences, freed
 from visthrow.diagnose.select.selector import MOST_NAMES
 from visthrow.diagnose.select.state import Work
@@ -102,10 +102,6 @@ def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
     return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
 
 
-def folds_of(count: int) -> list[np.ndarray]:
-    return [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
-
-
 def crossed(diagnosis: Diagnosis) -> Crossed:
     """Repeat a search without each of the flights, by statistics; what an effect that varies has of its own there is integrated out."""
     work, least = diagnosis.work, diagnosis.threshold
@@ -113,7 +109,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     groups, left_out = groups_of(point, work.problem.kept)
     varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.effects], ())
     statistics = freed(regrouped(point, groups), varies.by_flight)
-    count, folds = len(statistics.flights), folds_of(len(statistics.flights))
+    count = len(statistics.flights)
+    folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
     trained, named = np.zeros((count, len(priors.floor))), Counter()
     for fold in folds:
         rest = np.setdiff1d(np.arange(count), fold)
@@ -231,7 +228,8 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     if not (held.low > 0.0 and shown):
         reason = f"held-out {held.left_out} do not confirm {', '.join(names)} ({_share(held)})"
         return _unconfirmed(_demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"), held, names, reason)
-    unsure = [name for name in names if share_of(diagnosis[name], held) < FIRM + 1e-9]
+    alike = {name: (name, *diagnosis[name].partners) for name in names}  # what names one of a class names it
+    unsure = [name for name in names if sum(held.named_in.get(own, 0.0) for own in alike[name]) < FIRM + 1e-9]
     after = _demoted(diagnosis, unsure, result.CANDIDATE, "not all searches that leave flights out name it")
     if not after.theta:
         reason = f"searches that leave {held.left_out} out do not agree on a name"
@@ -271,11 +269,6 @@ def _unconfirmed(diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reas
     block = diagnosis.block or most.block
     earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
     return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *earlier), held_out=held)
-
-
-def share_of(finding: Finding, held: HeldOut) -> float:
-    """Share of the folds that name a cause or one of its class."""
-    return min(sum(held.named_in.get(name, 0.0) for name in (finding.name, *finding.partners)), 1.0)
 
 
 def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str) -> Diagnosis:

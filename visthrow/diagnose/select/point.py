@@ -142,7 +142,7 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     windows = problem.model.windows(sizes) if windows is None else windows
     own = with_correlations([windows[i] for i in problem.kept], problem.correlated)
     commands = problem.model.without_commands(sizes, problem.kept) if problem.lost else ()
-    commands = [_padded(c, w) for c, w in zip(commands, own)]
+    commands = [np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, own)]  # nothing behind replayed samples
     found = own if not problem.terms else each(lambda w: with_terms(w, problem.terms, theta), own)
     found = found if not commands else [_losing(w, c, problem.lost) for w, c in zip(found, commands)]
     device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
@@ -172,15 +172,10 @@ def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
     return replace(window, residual=window.residual - share * columns.sum(1), nuisance=nuisance, nuisance_sd=sd)
 
 
-def _padded(columns: np.ndarray, window: Window) -> np.ndarray:
-    """Columns that say nothing of what stands behind a window's replayed samples."""
-    return np.pad(columns, ((0, len(window.residual) - len(columns)), (0, 0)))
-
-
 def only(point: Point, windows: Sequence[int]) -> Point:
     """The same of some of its windows, with noise levels estimated from these."""
     own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "raw", "grams", "commands") if getattr(point, name)}
-    noise = levels.refit(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)
+    noise = levels.maximised(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)[0]
     return regathered(point, noise=noise, **own)
 
 
@@ -254,7 +249,7 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
 
 def with_fitted_noise(point: Point) -> Point:
     """The same with noise levels estimated from its residuals."""
-    return regathered(point, noise=levels.refit(point.grams, point.noise, point.device))
+    return regathered(point, noise=levels.maximised(point.grams, point.noise, point.device)[0])
 
 
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
@@ -288,7 +283,7 @@ def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = Non
     row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
     moves = [at[row[window.flight]] for window in point.windows]
     grams = [shifted(gram, move) for gram, move in zip(point.grams, moves)]
-    return regathered(point, noise=levels.refit(grams, point.noise, point.device))
+    return regathered(point, noise=levels.maximised(grams, point.noise, point.device)[0])
 
 
 def shifted(gram: Gram, change: np.ndarray) -> Gram:

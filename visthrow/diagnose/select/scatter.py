@@ -130,12 +130,8 @@ def varying(
             if not told[best.name].found:
                 break
         drawn = drawn.also(at[best.name], told[best.name].size / priors.floor, told[best.name].by)
-    return tuple(_named(s, s.name in {v.name for v in others}) for s in told.values())
-
-
-def _named(s: Scatter, other: bool) -> Scatter:
-    """A verdict whose name says what has the shares, where it is none of the catalogue's random effects."""
-    return replace(s, name=f"{s.name}{FORM}{s.by}") if other else s
+    own = {v.name for v in others}  # whose names say what has the shares: the catalogue's random effects need no such
+    return tuple(replace(s, name=f"{s.name}{FORM}{s.by}") if s.name in own else s for s in told.values())
 
 
 def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:

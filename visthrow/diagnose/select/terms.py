@@ -38,14 +38,9 @@ WEIGHED = 6  # terms that become effects to be weighed: as many as other sets th
 
 
 @lru_cache(maxsize=32)
-def _terms(block: str, known: tuple[str, ...]) -> tuple[grammar.Term, ...]:
-    return tuple(grammar.terms(block, known))
-
-
-@lru_cache(maxsize=32)
-def _layout(block: str, known: tuple[str, ...]) -> grammar.Layout | None:
-    terms = _terms(block, known)
-    return grammar.Layout.of(terms) if terms else None
+def _laid(block: str, known: tuple[str, ...]) -> tuple[tuple[grammar.Term, ...], grammar.Layout | None]:
+    terms = tuple(grammar.terms(block, known))
+    return terms, grammar.Layout.of(terms) if terms else None
 
 
 @dataclass
@@ -87,7 +82,7 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
     through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
     names = [set(point.windows[w].knots) for w in through]
     shared = tuple(sorted(set.intersection(*names))) if names else ()
-    layout = _layout(block, shared) if "time" in shared else None
+    terms, layout = _laid(block, shared) if "time" in shared else ((), None)
     if layout is None:
         return None
     own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
@@ -108,7 +103,7 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
         information, score, cross = (values[0] for values in (information, score, cross))
     square = square.sum(0)
     count = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
-    return Screen(_terms(block, shared), np.sqrt(square / max(count, 1)), information, score, cross)
+    return Screen(terms, np.sqrt(square / max(count, 1)), information, score, cross)
 
 
 def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarray:

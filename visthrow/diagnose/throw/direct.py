@@ -18,7 +18,7 @@ from sim.params import SensingParams
 from visthrow.diagnose.check.signals import highpass_sigma
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples, measured
+from visthrow.diagnose.throw.recorded import NEVER, Recorded, measured
 from visthrow.diagnose.throw.states import smoothed
 from visthrow.logs.flightlog import FlightLog
 
@@ -210,7 +210,10 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     if goal is None:
         seen[:, :4] = False
     grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
-    table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in _sources(flight, x).items()}
+    tracks = {"vehicle": (flight.vehicle, x.vehicle_delay), "attitude": (flight.attitude, x.vehicle_delay),
+              "payload": (flight.payload, x.payload_delay)}  # fmt: skip
+    sources = {name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()}  # at the times that they show
+    table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in sources.items()}
     if any(row is None for rows in table.values() for row in rows):
         return None
     seen = seen[..., None] & MEASURED
@@ -227,13 +230,6 @@ def _noise(points: np.ndarray, seen: np.ndarray) -> float:
     tracks = [points[seen[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
     sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
     return float(np.median(sigmas)) if sigmas else 0.0
-
-
-def _sources(flight: Recorded, x: SensingParams) -> dict[str, Samples]:
-    """Tracks at the times that they show."""
-    tracks = {"vehicle": (flight.vehicle, x.vehicle_delay), "attitude": (flight.attitude, x.vehicle_delay),
-              "payload": (flight.payload, x.payload_delay)}  # fmt: skip
-    return {name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()}
 
 
 def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:

@@ -5,19 +5,17 @@ commands is used, so that the landing is predicted through the throw, the releas
 prediction from a state that is fitted up to the separation: what is then left comes from release and flight alone.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
-from sim.effects.setting import Setting
 from sim.replay.kernel import ATTACHED
 from sim.replay.lanes import Replay
 from visthrow.diagnose.throw.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
-from visthrow.diagnose.throw.states import States
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]
 HEAD = 0.4  # of it, over which the initial state is fitted [s]
@@ -73,25 +71,8 @@ def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | 
     return down + float(late.min()), np.polynomial.polynomial.polyval(float(late.min()), fit)
 
 
-class FlownModel(Protocol):
-    """What of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel` landings are predicted with."""
-
-    setting: Setting
-    flights: Flights
-    device: str
-    substep: float
-
-    def beside(self, cuts: Sequence[Cut]) -> "FlownModel":
-        """Return the same model of other windows of its flights."""
-        ...
-
-    def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
-        """Return the setting with effects at ``theta``, and initial states fitted in it."""
-        ...
-
-
-def landings(model: FlownModel, theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
-    """Predict the landings of throws with effects at ``theta``.
+def landings(model: Any, theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
+    """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel` with effects at ``theta``.
 
     ``theta``: sizes of effects in their units; those not named at 0; ``flights``: numbers of flights to look at; default all.
     """
@@ -106,7 +87,7 @@ def landings(model: FlownModel, theta: Mapping[str, float], flights: Iterable[in
     return Landings(np.array(list(spans)), np.array([known[n][1] for n in spans]), *paths)
 
 
-def _spans(model: FlownModel, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
+def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Where a throw's state is fitted [s]: before the open loop, and up to the separation; both outside of a slack rope."""
     flight = model.flights.flights[number]
     separation = flight.latch + model.setting.plant.release.lag
@@ -120,7 +101,7 @@ def _spans(model: FlownModel, number: int) -> tuple[tuple[float, float], tuple[f
     return (head, (last, separation)) if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT else None
 
 
-def _fly(model: FlownModel, theta: Mapping[str, float], spans: Mapping[int, tuple[float, float]],
+def _fly(model: Any, theta: Mapping[str, float], spans: Mapping[int, tuple[float, float]],
          ends: Mapping[int, float]) -> np.ndarray:  # fmt: skip
     """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``, shape (F, 3)."""
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
@@ -141,7 +122,7 @@ def _fly(model: FlownModel, theta: Mapping[str, float], spans: Mapping[int, tupl
     return out
 
 
-def _approach(model: FlownModel, number: int, begin: float, end: float) -> list[Cut]:
+def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
     """A flight's windows before ``begin``, only flown through, and the one that its state is fitted over."""
     before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
     through = [replace(c, end=min(c.end, begin), retained=False) for c in before]

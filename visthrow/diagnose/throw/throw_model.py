@@ -177,7 +177,9 @@ class ThrowModel:
         states = resampled(states, setting.plant.rope.segments)
         seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
         flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
-        full = [np.concatenate((r, *self._direct_residuals(w, setting))) for r, w in zip(flown, self._retained)]
+        held = [[(kind, kind.samples(w)[1]) for kind in self._direct] for w in self._retained]
+        direct = [[x - kind.predicted(w, setting) for kind, x in own if len(x)] for w, own in zip(self._retained, held)]
+        full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
         return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
 
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[np.ndarray]:
@@ -221,10 +223,6 @@ class ThrowModel:
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
         return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
-
-    def _direct_residuals(self, w: int, setting: Setting) -> list[np.ndarray]:
-        held = [(kind, kind.samples(w)[1]) for kind in self._direct]
-        return [values - kind.predicted(w, setting) for kind, values in held if len(values)]
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
         """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
