@@ -9,9 +9,9 @@ import pytest
 FREE_AND_TAKE = """
 import resource, sys
 import numpy as np
-from visthrow.diagnose.likelihood import memory
+from visthrow.diagnose.likelihood import threads
 if sys.argv[1] == "kept":
-    memory.keep()
+    threads.keep()
 def faults():
     arrays = [np.ones(100_000) for _ in range(20)]  # 16 MB in pieces that malloc maps or trims by default
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt

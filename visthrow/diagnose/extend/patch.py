@@ -47,16 +47,6 @@ def differences(before: Any, after: Any) -> dict[str, Any]:
     return out
 
 
-def touched(theta: Mapping[str, float]) -> dict[str, list[str]]:
-    """Dotted key of an experiment -> effects that change it."""
-    keys: dict[str, list[str]] = {}
-    for name in theta:
-        for key in catalogue()[name].changes:
-            path = key.path.removeprefix("plant.")
-            keys.setdefault(path, []).append(name)
-    return keys
-
-
 def text(
     base: str, experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int,
     provenance: Sequence[str], laws: Sequence[LawParams] = (),
@@ -69,36 +59,26 @@ def text(
         plants: to draw in training from the joint posterior.
         laws: terms outside the catalogue, to stand beside those that the configuration has.
     """
-    after = dataclasses.replace(
-        extended(experiment, theta),
-        diagnosed=_diagnosed(experiment, theta, covariance, plants),
-        laws=(*experiment.laws, *laws),
-    )
+    named, covariance = [catalogue()[name] for name in theta], np.reshape(covariance, (len(theta), len(theta)))
+    # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are
+    own = [i for i, e in enumerate(named) if e.changes and all(key.path.startswith("plant.") for key in e.changes)]
+    rows = tuple(map(tuple, covariance[np.ix_(own, own)].tolist()))
+    drawn = dataclasses.replace(experiment.diagnosed, effects=tuple(named[i].name for i in own), covariance=rows, plants=plants)
+    after = dataclasses.replace(extended(experiment, theta), diagnosed=drawn, laws=(*experiment.laws, *laws))
     check_laws(after.laws)
     plain = config.load(Experiment, config.find("train", base))
     changed = differences(config.to_dict(plain), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
-    about = touched(theta)
-    sd = {name: covariance[i][i] ** 0.5 for i, name in enumerate(theta)}
-    section = ""
+    told = {e.name: f"{e.name} {theta[e.name]:+.4g} +- {covariance[i][i] ** 0.5:.2g} {e.unit}" for i, e in enumerate(named)}
+    section, switched = "", [e.name for e in named if e.switch]
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
-        switched = [n for n in theta if catalogue()[n].switch]
-        words = [f"{n} {theta[n]:+.4g} +- {sd[n]:.2g} {catalogue()[n].unit}" for n in about.get(path, [])]
+        words = [told[e.name] for e in named for key in e.changes if key.path.removeprefix("plant.") == path]
         if " = " in line and not words:
             words = ["of the diagnosis above"] if section == "diagnosed" or line.startswith("laws") else switched
         lines.append(f"{line}  # {'; '.join(words)}" if words else line)
     return "\n".join(lines).rstrip() + "\n"
-
-
-def _diagnosed(experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int):
-    """The joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are."""
-    changes = [catalogue()[name].changes for name in theta]
-    own = [i for i, keys in enumerate(changes) if keys and all(k.path.startswith("plant.") for k in keys)]
-    names = list(theta)
-    rows = tuple(tuple(float(covariance[i][j]) for j in own) for i in own)
-    return dataclasses.replace(experiment.diagnosed, effects=tuple(names[i] for i in own), covariance=rows, plants=plants)
 
 
 def with_scatter(

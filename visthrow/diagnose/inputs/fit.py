@@ -81,15 +81,10 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     after = model.residuals(problem.sizes(point.theta))
     units = tuple(model.effects[i].unit for i in at)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
-    rms = [_rms(model, before, residuals) for residuals in ([w.residual for w in before], after)]
+    channel, seen = np.concatenate([w.channel for w in before]), ([w.residual for w in before], after)
+    rms = [{name: float(np.sqrt(np.mean(value[channel == i] ** 2))) for i, name in enumerate(model.channels) if np.any(channel == i)}
+           for value in map(np.concatenate, seen)]  # fmt: skip
     return Fitted(tuple(free), units, sizes, covariance, identified, *rms, middle_speed=getattr(model, "middle", 0.0))
-
-
-def _rms(model: Model, windows: Sequence[Any], residuals: Sequence[np.ndarray]) -> dict[str, float]:
-    channel, value = np.concatenate([w.channel for w in windows]), np.concatenate(residuals)
-    return {
-        name: float(np.sqrt(np.mean(value[channel == i] ** 2))) for i, name in enumerate(model.channels) if np.any(channel == i)
-    }
 
 
 def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParams:

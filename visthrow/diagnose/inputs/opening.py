@@ -38,9 +38,17 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
 
     Raises ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's own model.
     """
-    from visthrow.diagnose.inputs import measures
+    from visthrow.diagnose.inputs import measures, setup
 
-    model, logs = _opened(args)
+    logs = setup.read_logs(args.logs, args.config)
+    chosen = setup.load(args.config) if args.config else None
+    if chosen is None or not chosen.named():
+        model, logs = throw_model(args, logs)
+    elif args.overrides:
+        raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
+    else:
+        model = setup.model_of(chosen, logs)
+        model = _only(model, args.only.split(",")) if args.only else model
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
     # day of each flight, from 0: what its log says, else those of one folder are of one
@@ -57,29 +65,16 @@ def made_with(args: argparse.Namespace) -> dict[str, Any]:
     return {"model": own[0] if own else THROW, "plant": args.plant, "config": args.config, "overrides": args.overrides}
 
 
-def _opened(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
-    from visthrow.diagnose.inputs import setup
-
-    logs = setup.read_logs(args.logs, args.config)
-    chosen = setup.load(args.config) if args.config else None
-    if chosen is not None and chosen.named():
-        if args.overrides:
-            raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
-        model = setup.model_of(chosen, logs)
-        return (_only(model, args.only.split(",")) if args.only else model), logs
-    return throw_model(args, logs)
-
-
 def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Model, list[FlightLog]]:
     """The whole throw, with the plant of an experiment, and its logs with their commands put right."""
     from visthrow import config
-    from visthrow.diagnose.likelihood import memory
+    from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.search import put_right
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
     from visthrow.training.device import resolve
 
-    memory.keep()
+    threads.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only else None
     known = {"sensing": experiment.sensing, "camera": experiment.camera, "device": resolve(args.device)}

@@ -31,11 +31,8 @@ class FlyerModel(NumericModel):
         """Cut the flights into windows. Raises LogError where no log has the channels, or none flies."""
         self.params = params
         self.has_voltage = all("battery_voltage" in log for log in logs)
-        channels = [params.position]
-        if params.cable is not None:
-            channels.append("payload_pos_w")
-        if params.torque is not None:
-            channels.append("rate_b")
+        more = {"payload_pos_w": params.cable, "rate_b": params.torque}
+        channels = [params.position, *(name for name, simulated in more.items() if simulated is not None)]
         stretches = stretches_of(logs, params, channels)
         there = [name for name in ("battery_voltage", "acc_b", "rate_b") if all(name in log for log in logs)]
         inputs = [params.attitude, params.input, *there]
@@ -147,15 +144,11 @@ class FlyerModel(NumericModel):
                 value, rate = value + path[..., 6:9], rate + path[..., 9:12]
             pos = hermite(late, start, p.step, value, rate)
             if channel == 0 and "marker_z" in self.numbers:
-                pos = pos + self._marker(lanes, stretch, time)
+                lever = np.stack([self.of(lanes, f"marker_{axis}") for axis in "xyz"], 1)
+                at = np.clip(((time - start) / (0.5 * p.step)).round().astype(int), 0, 2 * self.steps)
+                pos = pos + np.einsum("nij,bj->bni", stretch.data["rot"][at + self._spare], lever)
             out[:, own] = pos.reshape(len(path), -1)
         return out
-
-    def _marker(self, lanes: Lanes, stretch: Stretch, time: np.ndarray) -> np.ndarray:
-        """Shift of the measured point by the marker's lever, shape (B, N, 3)."""
-        lever = np.stack([self.of(lanes, f"marker_{axis}") for axis in "xyz"], 1)
-        at = np.clip(((time - stretch.data["start"]) / (0.5 * self.params.step)).round().astype(int), 0, 2 * self.steps)
-        return np.einsum("nij,bj->bni", stretch.data["rot"][at + self._spare], lever)
 
 
 class _Dynamics:

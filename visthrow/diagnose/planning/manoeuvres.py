@@ -124,10 +124,6 @@ def _steps(t: np.ndarray) -> np.ndarray:
     return 1.0 + 0.4 * ((inside < 0.15) * 1.0 - ((inside >= 0.15) & (inside < 0.3)))
 
 
-def _sideways_step(t: np.ndarray) -> np.ndarray:
-    return 0.35 * rise(t, 0.0, 0.8)
-
-
 def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     """Integral of :func:`rise` over time."""
     s = np.clip((t - begin) / length, 0.0, 1.0)
@@ -180,7 +176,8 @@ def catalogue() -> tuple[Manoeuvre, ...]:
                   _at(x=fast)),
         Manoeuvre("circle", "drag in all directions, lever arms", 10.0,
                   _at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t)))),
-        Manoeuvre("swing and decay", "rope length by period, damping by decay, payload drag", 9.0, _at(x=_sideways_step)),
+        Manoeuvre("swing and decay", "rope length by period, damping by decay, payload drag", 9.0,
+                  _at(x=lambda t: 0.35 * rise(t, 0.0, 0.8))),
         Manoeuvre("stop after speed", "rope mass and bending, payload's second mode, mount", 9.0, _at(x=_stop)),
         *runs,
     )  # fmt: skip

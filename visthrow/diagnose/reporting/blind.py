@@ -82,17 +82,12 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             best = gain.argmax(axis=1) == j
             close = gain[:, j] > gain.max(axis=1) - STRONG
             rows.append((size, np.mean(found & best), np.mean(found & close), np.mean(found & ~close)))
-        curves.append(_curve(effect.name, effect.unit, effect.floor, rows))
+        size, exact, near, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
+        limit = _limit(size, near) * effect.floor if rows else float("nan")
+        curves.append(Completeness(effect.name, effect.unit, *map(tuple, (size * effect.floor, exact, near, wrong)), limit))
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))
     source = "drawn from its fitted level" if parametric else "the flights' own residuals, with random signs a flight"
     return Blind(tuple(curves), float(alarms.mean()), 10 * draws, source)
-
-
-def _curve(name: str, unit: str, floor: float, rows: list[tuple[float, ...]]) -> Completeness:
-    if not rows:
-        return Completeness(name, unit, (), (), (), (), float("nan"))
-    size, exact, near, wrong = (np.array(column, dtype=float) for column in zip(*rows))
-    return Completeness(name, unit, tuple(size * floor), tuple(exact), tuple(near), tuple(wrong), _limit(size, near) * floor)
 
 
 def _limit(size: np.ndarray, share: np.ndarray) -> float:

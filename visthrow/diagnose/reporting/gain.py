@@ -63,13 +63,12 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     cross = crossed(diagnosis)
     box = _blackbox(work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng)
     gains = channel_gains(work, cross, box)
-    shares = {work.problem.model.effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
     sizes = cross.trained if cross.left_out == "flights" and diagnosis.theta else ()
     trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}
     landing = landing_gain(work, diagnosis.theta, trained, seed)
     whole = all(w.nuisance.shape[1] == 0 for w in work.after.windows)
     nats = _nats(work.before, work.after, cross)
-    return Gain(gains, nats, shares, len(cross.folds), cross.left_out, landing, whole)
+    return Gain(gains, nats, cross.named, len(cross.folds), cross.left_out, landing, whole)
 
 
 def landing_gain(

@@ -51,7 +51,7 @@ class Crossed:
     statistics: Statistics  # by group
     folds: list[np.ndarray]  # rows of the statistics that are left out together
     trained: np.ndarray  # sizes in floors that the others gave, shape (F, K)
-    named: Mapping[int, int]  # effect -> number of folds that named it
+    named: Mapping[str, float]  # effect -> share of the folds that named it
 
 
 def select(
@@ -123,7 +123,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
             active = anew
         trained[fold] = estimate(information, score, priors, active)
         named.update(active)
-    return Crossed(groups, left_out, statistics, folds, trained, named)
+    shares = {work.problem.effects[j].name: n / len(folds) for j, n in named.items()}
+    return Crossed(groups, left_out, statistics, folds, trained, shares)
 
 
 def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) -> tuple[float, float, float]:
@@ -203,11 +204,9 @@ def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, flo
 def measure(diagnosis: Diagnosis) -> HeldOut:
     """Ask held-out flights about the names of a search."""
     work, cross = diagnosis.work, crossed(diagnosis)
-    effects = work.problem.effects
-    sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in effects]) / work.problem.priors.floor
+    sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects]) / work.problem.priors.floor
     share = borne_out(cross.statistics, cross.trained, sizes)
-    named = {effects[j].name: n / len(cross.folds) for j, n in cross.named.items()}
-    return HeldOut(*share, channel_gains(work, cross), named, len(cross.folds), cross.left_out)
+    return HeldOut(*share, channel_gains(work, cross), cross.named, len(cross.folds), cross.left_out)
 
 
 def judged(diagnosis: Diagnosis) -> Diagnosis:

@@ -8,9 +8,8 @@ import numpy as np
 
 from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood import memory
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import each, keep
 from visthrow.diagnose.models.interface import Model, Window
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
@@ -32,7 +31,7 @@ def explain(
     overall. Raises DiagnoseError: the model gives no window, or contradicts itself.
     """
     begun, say = time.monotonic(), progress or (lambda _: None)
-    memory.keep()
+    keep()
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")

@@ -15,7 +15,7 @@ from sim.replay.lanes import Replay
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
-from visthrow.diagnose.throw.states import Direction, States, concerns, moved, moved_along, rows_of, stacked
+from visthrow.diagnose.throw.states import Direction, States, concerns, moved_along, rows_of, stacked
 
 DAMPING, DAMPING_MOST = 1e-3, 1e5  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
 ROUNDS = 25
@@ -280,4 +280,5 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
 
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
-    return stacked([states, *[moved(states, d, d.step) for d in directions]])
+    steps = np.ones((len(states["pos_w"]), 1))
+    return stacked([states, *[moved_along(states, (d,), d.step * steps) for d in directions]])

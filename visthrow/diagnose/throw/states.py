@@ -91,12 +91,6 @@ def _tangents(n: np.ndarray) -> np.ndarray:
     return np.stack((first, np.cross(n, first)), axis=-2)
 
 
-def moved(states: States, direction: Direction, size: np.ndarray | float) -> States:
-    """States moved along one direction by ``size`` (shape (S,) or a number)."""
-    size = np.broadcast_to(np.asarray(size, dtype=float), (len(states["pos_w"]),))
-    return moved_along(states, (direction,), size[:, None])
-
-
 def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarray) -> States:
     """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope before its rates."""
     out = dict(states)
