@@ -22,13 +22,13 @@ import numpy as np
 
 from visthrow.common import provenance, workers
 from visthrow.common.storage import write_json
-from visthrow.diagnose.check.run import check
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting import report
 from visthrow.diagnose.reporting.explain_cli import explained
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import result
+from visthrow.logs.check.run import check
 from visthrow.logs.flightlog import Channel, FlightLog
 
 Logs = list[FlightLog]

@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.unit.on_diagnose.test_check import flight, log_of
 
 from tests import logfiles
 from tests.plants import paper_plant
-from tests.unit.on_diagnose.test_check import flight, log_of
 from visthrow import cli
 from visthrow.common.errors import LogError
-from visthrow.diagnose.check.run import check, contradictions
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
 from visthrow.diagnose.inputs.proposal import propose
 from visthrow.diagnose.throw.interface import commanded
 from visthrow.diagnose.throw.recorded import record_of
 from visthrow.logs import read, table_of
+from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
 

@@ -8,13 +8,13 @@ import pytest
 from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.check.signals import highpass_sigma
 from visthrow.diagnose.likelihood import designs, marginal, noise
 from visthrow.diagnose.likelihood import stack as stacks
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.select.point import Problem, linearise, only
+from visthrow.logs.check.signals import highpass_sigma
 
 EFFECTS = catalogue(6)
 

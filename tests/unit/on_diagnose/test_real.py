@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from visthrow import cli
-from visthrow.diagnose.check.run import check, contradictions
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.select.result import CANDIDATE, FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT, UNKNOWN
 from visthrow.diagnose.select.search import explain
 from visthrow.logs import read_all
+from visthrow.logs.check.run import check, contradictions
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 REAL = DATA / "real"

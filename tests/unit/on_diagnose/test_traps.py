@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.unit.on_diagnose.test_check import faults, flight, log_of
 
 from tests import logfiles
-from tests.unit.on_diagnose.test_check import faults, flight, log_of
-from visthrow.diagnose.check.run import check, contradictions, copies
 from visthrow.diagnose.inputs import setup
 from visthrow.logs import read
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import Known
+from visthrow.logs.check.run import check, contradictions, copies
 from visthrow.logs.flightlog import Channel, FlightLog
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "real"

@@ -17,9 +17,9 @@ import pytest
 from tests import logfiles
 from visthrow import cli
 from visthrow.common.errors import LogError, VisthrowError
-from visthrow.diagnose.check.run import check, table
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs import read
+from visthrow.logs.check.run import check, table
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 

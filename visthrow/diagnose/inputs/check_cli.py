@@ -28,9 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, look, print."""
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.check.picture import draw
-    from visthrow.diagnose.check.run import check, table
+    from visthrow.diagnose.inputs.picture import draw
     from visthrow.diagnose.inputs.setup import known, read_logs
+    from visthrow.logs.check.run import check, table
 
     logs = read_logs(args.logs, args.config)
     results = check(logs, known(args.config, args.plant))

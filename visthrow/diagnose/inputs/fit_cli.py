@@ -26,9 +26,9 @@ def run(args: argparse.Namespace) -> int:
     from sim.params import VehicleParams
     from visthrow import config
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.check.run import check
     from visthrow.diagnose.inputs import fit as fitting
     from visthrow.diagnose.inputs import setup as setups
+    from visthrow.logs.check.run import check
 
     setup = setups.load(args.config)
     logs = setups.read_logs(args.logs, args.config)

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import lapack
 
-from visthrow.diagnose.check.signals import MAD_TO_SIGMA
 from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood.marginal import TAIL, Gram, Noise, hidden_gram, without_effects
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.logs.check.signals import MAD_TO_SIGMA
 
 CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
 """Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
-from visthrow.diagnose.check.signals import noise
 from visthrow.diagnose.models.interface import Effect, Linearised, Window
+from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel
 
 EFFECT_STEP = 0.05

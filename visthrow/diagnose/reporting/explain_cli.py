@@ -59,8 +59,8 @@ def explained(
 
     ``laws``: see :func:`visthrow.diagnose.select.search.explain`.
     """
-    from visthrow.diagnose.check.run import check, contradictions, copies
     from visthrow.diagnose.select import search
+    from visthrow.logs.check.run import check, contradictions, copies
 
     checked = check(logs, known)
     reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))

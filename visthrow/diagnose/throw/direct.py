@@ -15,11 +15,11 @@ from camera.params import CameraParams
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.params import SensingParams
-from visthrow.diagnose.check.signals import highpass_sigma
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, measured
 from visthrow.diagnose.throw.states import smoothed
+from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
 
 LANDING, KEYPOINTS = "landing", "keypoints"

@@ -7,8 +7,8 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
-from visthrow.diagnose.check.signals import highpass_sigma
 from visthrow.logs.check.relations import attitude_at
+from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import Channel, FlightLog
 
 NEVER = 1e9  # a time after every flight [s]

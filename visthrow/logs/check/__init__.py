@@ -1,1 +1,1 @@
-"""Units, axes, signs and delays of a flight log by physics: what must follow from what, whatever the vehicle."""
+"""What can be said of flight logs before any model is asked: each channel, units, axes, signs and delays by physics, what is excited."""

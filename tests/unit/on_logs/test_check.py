@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from visthrow import cli
-from visthrow.diagnose.check.run import check, table
-from visthrow.diagnose.check.signals import noise
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check.relations import relate
+from visthrow.logs.check.run import check, table
+from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.81

@@ -1,4 +1,4 @@
-"""All checks of several logs; their verdict, table and picture."""
+"""All checks of several logs; their verdict and table."""
 
 import hashlib
 from collections.abc import Sequence
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow.diagnose.check import excitation, signals
-from visthrow.logs.check import physics, relations, thrust
+from visthrow.logs.check import excitation, physics, relations, signals, thrust
 from visthrow.logs.check.rows import NOTHING, Known, Row, Verdict, worst
 from visthrow.logs.flightlog import FlightLog
 

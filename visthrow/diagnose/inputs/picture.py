@@ -6,8 +6,8 @@ import numpy as np
 
 from visthrow.common import style
 from visthrow.common.storage import atomic_write
-from visthrow.diagnose.check.run import Checked
 from visthrow.logs.check.rows import worst
+from visthrow.logs.check.run import Checked
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view.parts import png_of
 

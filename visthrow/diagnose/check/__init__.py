@@ -1,1 +1,0 @@
-"""What can be said of logs before any model is asked."""
