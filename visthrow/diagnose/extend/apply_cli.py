@@ -166,6 +166,5 @@ def origin(report: dict, path: str) -> list[str]:
     if own:
         lines.append("The sizes are those with which these causes alone explain the flights. With everything else below its floor:")
         lines += [f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to {f['high']:.3g})." for f in own]
-    drawn = [s for s in report.get("scatter") or [] if s["found"]]
-    own = [(s.get("by", "flight"), s) for s in drawn]
-    return lines + [f"Varies from {by} to {by}: {s['name']} {s['size']:.3g} {s['unit']}." for by, s in own]
+    drawn = [(s.get("by", "flight"), s) for s in report.get("scatter") or [] if s["found"]]
+    return lines + [f"Varies from {by} to {by}: {s['name']} {s['size']:.3g} {s['unit']}." for by, s in drawn]

@@ -6,6 +6,7 @@ Where a diagnosis asks which cause is there, a fit takes for granted that all ch
 import dataclasses
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,7 +94,7 @@ def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParam
     A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest thrust follows the map.
     ``base``: vehicle that lends all other numbers. Raises DiagnoseError: the setup's model is of no vehicle.
     """
-    size = dict(zip(found.names, map(float, found.theta)))
+    size = defaultdict(float, zip(found.names, map(float, found.theta)))
     if setup.flyer is not None:
         return _of_flyer(setup.flyer, size, base)
     if setup.stand is not None:
@@ -102,18 +103,15 @@ def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParam
 
 
 def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
-    def get(name: str) -> float:
-        return size.get(name, 0.0)
-
-    gain, curve = 1.0 + get("thrust_gain"), get("thrust_curve")
-    mass = p.mass + get("mass_quad")
-    motor = dataclasses.replace(base.motor, kind="first_order", time_constant=max(p.motor_time_constant + get("motor_tau"), 1e-3))
+    gain, curve = 1.0 + size["thrust_gain"], size["thrust_curve"]
+    mass = p.mass + size["mass_quad"]
+    motor = dataclasses.replace(base.motor, kind="first_order", time_constant=max(p.motor_time_constant + size["motor_tau"], 1e-3))
     aero = dataclasses.replace(
-        base.aero, kind="rotor_drag", drag_x=p.drag_xy + get("rotor_drag_xy"), drag_y=p.drag_xy + get("rotor_drag_xy"),
-        drag_z=p.drag_z + get("rotor_drag_z"), parasitic=max(get("parasitic"), 0.0), translational_lift=get("translational_lift"),
+        base.aero, kind="rotor_drag", drag_x=p.drag_xy + size["rotor_drag_xy"], drag_y=p.drag_xy + size["rotor_drag_xy"],
+        drag_z=p.drag_z + size["rotor_drag_z"], parasitic=max(size["parasitic"], 0.0), translational_lift=size["translational_lift"],
     )  # fmt: skip
     battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
-    thrust = dataclasses.replace(base.thrust, voltage_coefficient=p.voltage_coefficient + get("battery_sag"))
+    thrust = dataclasses.replace(base.thrust, voltage_coefficient=p.voltage_coefficient + size["battery_sag"])
     controller = base.controller
     hover = mass * p.gravity / 4.0
     if p.input == "motor_speed":
@@ -127,14 +125,14 @@ def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> Vehicle
         thrust = dataclasses.replace(thrust, gain=tuple(gain * own for own in thrust.gain))
     return dataclasses.replace(
         base, body=dataclasses.replace(base.body, mass=mass), motor=motor, aero=aero, battery=battery, thrust=thrust,
-        controller=controller, queue=dataclasses.replace(base.queue, delay=max(p.command_delay + get("cmd_delay"), 0.0)),
+        controller=controller, queue=dataclasses.replace(base.queue, delay=max(p.command_delay + size["cmd_delay"], 0.0)),
     )  # fmt: skip
 
 
 def _of_stand(p: Any, size: Mapping[str, float], middle: float, base: VehicleParams) -> VehicleParams:
-    k_f = p.k_f * (1.0 + size.get("thrust_gain", 0.0))
-    k_1 = p.k_f * size.get("thrust_linear", 0.0) * middle
-    thrust = dataclasses.replace(base.thrust, k_f=k_f, k_1=k_1, voltage_coefficient=size.get("thrust_voltage", 0.0))
+    k_f = p.k_f * (1.0 + size["thrust_gain"])
+    k_1 = p.k_f * size["thrust_linear"] * middle
+    thrust = dataclasses.replace(base.thrust, k_f=k_f, k_1=k_1, voltage_coefficient=size["thrust_voltage"])
     battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
     return dataclasses.replace(base, thrust=thrust, battery=battery)
 

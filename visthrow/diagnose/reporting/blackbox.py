@@ -22,16 +22,12 @@ REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
 
 def _inputs(window: Window) -> np.ndarray:
     """Body velocity, body rates and thrust at the knots, as far as they are known, shape (k, I)."""
-    knots, parts = window.knots, []
-    if {"vel_w", "quat_wb"} <= set(knots):
-        parts.append(grammar.rotate_back(knots, knots["vel_w"]))
-    elif "vel_w" in knots:
-        parts.append(knots["vel_w"])
-    if "rate_b" in knots:
-        parts.append(knots["rate_b"])
-    if "thrust" in knots:
-        parts.append(np.asarray(knots["thrust"])[:, None])
-    return np.hstack(parts) if parts else np.zeros((len(knots.get("time", ())), 0))
+    knots = window.knots
+    parts = [np.zeros((len(knots.get("time", ())), 0))]
+    if "vel_w" in knots:
+        parts.append(grammar.rotate_back(knots, knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"])
+    parts += [knots[name].reshape(len(knots[name]), -1) for name in ("rate_b", "thrust") if name in knots]
+    return np.hstack(parts)
 
 
 @dataclass(frozen=True)
@@ -51,17 +47,12 @@ class Table:
 
     def columns(self, window: Window) -> np.ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
-        basis, parts = self.radial(_inputs(window)), []
-        count = basis.shape[1]
+        basis, parts, known = self.radial(_inputs(window)), [], grammar.Known(window.knots)
         for block in self.blocks:
-            values = np.zeros((len(basis), 3, 3 * count))
-            for axis in range(3):
-                direction = np.tile(np.eye(3)[axis], (len(basis), 1))
-                if block != "vehicle torque" and "quat_wb" in window.knots:
-                    direction = grammar.rotate(window.knots, direction)
-                values[:, :, axis * count : (axis + 1) * count] = direction[:, :, None] * basis[:, None, :]
-            through = grammar.through_latents(window, grammar.Known(window.knots), block)
-            parts.append(through @ values.reshape(through.shape[1], -1))
+            turned = block != "vehicle torque" and "quat_wb" in known
+            axes = np.stack([known[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1)) for i, row in zip("xyz", np.eye(3))], -1)
+            through = grammar.through_latents(window, known, block)
+            parts.append(through @ (axes[..., None] * basis[:, None, None]).reshape(through.shape[1], -1))
         return np.hstack(parts)
 
 

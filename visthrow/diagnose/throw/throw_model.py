@@ -117,7 +117,7 @@ class ThrowModel:
         self._secants: dict[str, list[np.ndarray]] = {}  # of other kinds of blocks, by their name, where they were asked for first
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        """See :class:`visthrow.diagnose.models.interface.Model`; with what was seen besides poses."""
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
         states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
@@ -130,28 +130,19 @@ class ThrowModel:
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, found)
-        columns = [self._secants[e.name] for e in self._switched]
+        blank = [np.zeros(len(w.residual)) for w in found]  # of effects that a camera alone shows
+        columns = [*(self._secants[e.name] for e in self._switched), *[blank] * len(self._sighted)]
         if columns:
             found = [
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
                 for i, w in enumerate(found)
             ]
-        return self._with_direct(setting, theta, found)
-
-    def _with_direct(self, setting: Setting, theta: Mapping[str, float], windows: list[Window]) -> list[Window]:
-        """Windows with what was seen besides poses, and columns of the effects that this alone shows."""
-        whole = windows
-        if self._sighted:
-            blank = [np.zeros((len(w.residual), len(self._sighted))) for w in windows]
-            whole = [dataclasses.replace(w, effects=np.hstack((w.effects, b))) for w, b in zip(windows, blank)]
         if not self._direct:
-            return whole
+            return found
         entries = list(self.entries.values())
         steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
-        return [
-            with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._retained, whole)
-        ]
+        return [with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._retained, found)]
 
     def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
         """Samples with the other kind of block less those with this one, per theta; a column for each window.
