@@ -91,15 +91,23 @@ class BallModel(NumericModel):
 
 
 def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
-    channel = log[CHANNEL]
-    time, pos = channel.samples()
-    if len(time) < 40:
+    times, path = log[CHANNEL].samples()
+    if len(times) < 40:
         return []
-    sigma = sigma_of(channel, 1e-5)
-    found = []
-    for start, end in _free(time, pos, params):
-        inside = np.flatnonzero((time >= start) & (time <= end))[:: params.every]
-        found.append(_stretch(time[inside], pos[inside], sigma, number))
+    sigma, found = sigma_of(log[CHANNEL], 1e-5), []
+    for start, end in _free(times, path, params):
+        inside = np.flatnonzero((times >= start) & (times <= end))[:: params.every]
+        time, pos = times[inside], path[inside]
+        fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
+        along = fit[1] * np.array([1.0, 1.0, 0.0])
+        along = along / max(np.linalg.norm(along), 1e-6)
+        found.append(
+            Stretch(
+                number, "ballistic", np.repeat(time, 3), np.zeros(3 * len(time), dtype=int), pos.ravel(), np.tile(sigma, len(time)),
+                np.concatenate([fit[0], fit[1]]), np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
+                {"time": time, "across": np.array([-along[1], along[0], 0.0])}, **latent_layout(time[0], time[-1], KNOTS, (2,)),
+            )
+        )  # fmt: skip
     return found
 
 
@@ -114,15 +122,3 @@ def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[f
     edges = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]]).astype(int)))
     spans = [(at[a] + params.edge, at[b - 1] - params.edge) for a, b in zip(edges[::2], edges[1::2])]
     return [(a, b) for a, b in spans if b - a >= params.shortest]
-
-
-def _stretch(time: np.ndarray, pos: np.ndarray, sigma: np.ndarray, number: int) -> Stretch:
-    relative = time - time[0]
-    fit = np.polynomial.polynomial.polyfit(relative, pos, 3)
-    along = fit[1] * np.array([1.0, 1.0, 0.0])
-    along = along / max(np.linalg.norm(along), 1e-6)
-    return Stretch(
-        number, "ballistic", np.repeat(time, 3), np.zeros(3 * len(time), dtype=int), pos.ravel(), np.tile(sigma, len(time)),
-        np.concatenate([fit[0], fit[1]]), np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
-        {"time": time, "across": np.array([-along[1], along[0], 0.0])}, **latent_layout(time[0], time[-1], KNOTS, (2,)),
-    )  # fmt: skip

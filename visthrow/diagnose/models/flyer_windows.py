@@ -58,15 +58,11 @@ def _windows(log: FlightLog, number: int, params: FlyerParams, channels: Sequenc
     sigma = {name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels}  # no less is believed
     driven = [log[name] for name in (params.position, params.attitude, params.input)]
     first, last = max(c.time[0] for c in driven), min(c.time[-1] for c in driven)
-    found = []
     starts = np.arange(first + params.window, last - params.window, params.window)
     starts = starts[:: max(1, len(starts) // (4 * params.most_windows))]  # hours are thinned before they are cut
-    for start in starts:
-        if all(_covered(c, start, start + params.window) for c in driven):
-            stretch = _window(log, number, params, channels, sigma, float(start))
-            if stretch is not None:
-                found.append(stretch)
-    return found
+    covered = (float(start) for start in starts if all(_covered(c, start, start + params.window) for c in driven))
+    found = (_window(log, number, params, channels, sigma, start) for start in covered)
+    return [stretch for stretch in found if stretch is not None]
 
 
 def _covered(channel: Channel, start: float, end: float) -> bool:

@@ -47,7 +47,7 @@ class GimbalModel(NumericModel):
         """Cut the logs. Raises LogError where none has both bodies and the marker, or the marker is not seen at the payload."""
         self.params = params
         self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
-        stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params, self.camera)]
+        stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params)]
         super().__init__(effects_of("gimbal", params), (CHANNEL,), stretches, NEEDED)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
@@ -85,7 +85,7 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
     return time, {"gap": gap, "rot": rot.reshape(-1, 9), "gimbal": gimbal.reshape(-1, 9)}
 
 
-def _cut(log: FlightLog, number: int, params: GimbalParams, camera: np.ndarray) -> list[Stretch]:
+def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
     marker = log[CHANNEL]
     if not all(np.any(log[name].valid) for name in NEEDED):
         return []

@@ -84,33 +84,24 @@ def _latent(start: float, end: float) -> dict[str, np.ndarray]:
 
 
 def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
-    position, command = log[params.position], log[params.command]
-    time_v, vel = derivative(*position.samples(), 0.2)
-    if params.velocity in log:
-        time_v, vel = log[params.velocity].samples()
+    window, stamps, nothing = params.slowest_window, log[params.command].time, (np.zeros(0), np.zeros(0))
+    (time, sent), (time_p, pos) = log[params.command].samples(), log[params.position].samples()
+    time_v, vel = log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
+    time_u, volts = log["battery_voltage"].samples() if "battery_voltage" in log else nothing
     found = []
-    for start in np.arange(command.time[0], command.time[-1] - params.slowest_window, params.slowest_window):
-        end = start + params.slowest_window
-        inside = command.valid & (command.time >= start) & (command.time < end)
-        near = (position.time >= start) & (position.time < end) & position.valid
-        moving = (time_v >= start) & (time_v < end)
-        if np.sum(inside) < 20 or np.sum(near) < 20 or np.sum(moving) < 20:
+    for start in np.arange(stamps[0], stamps[-1] - window, window):
+        inside, near, moving, charged = ((t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u))
+        if min(np.sum(inside), np.sum(near), np.sum(moving)) < 20:
             continue
-        speed = float(np.mean(np.linalg.norm(vel[moving], axis=1)))
-        if np.min(position.values[near][:, 2]) < params.lowest or speed > params.fastest:
+        own = vel[moving]
+        if np.min(pos[near][:, 2]) < params.lowest or np.mean(np.linalg.norm(own, axis=1)) > params.fastest:
             continue
-        climb = (vel[moving][-5:, 2].mean() - vel[moving][:5, 2].mean()) / params.slowest_window
-        volts = params.reference_voltage
-        if "battery_voltage" in log:
-            time, told = log["battery_voltage"].samples()
-            told = told[(time >= start) & (time < end)]
-            volts = float(np.mean(told)) if len(told) else volts
-        mean = np.mean(command.values[inside].astype(float), axis=0)
+        lift = 1.0 + (own[-5:, 2].mean() - own[:5, 2].mean()) / window / params.gravity
+        data = {"volts": float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage, "lift": lift}
         found.append(
             Stretch(
-                number, "hover", np.full(4, start), np.zeros(4, dtype=int), mean, np.full(4, params.spread),
-                np.zeros(0), np.zeros(0),
-                {"volts": volts, "lift": 1.0 + climb / params.gravity}, **_latent(start, end),
+                number, "hover", np.full(4, start), np.zeros(4, dtype=int), np.mean(sent[inside], axis=0), np.full(4, params.spread),
+                np.zeros(0), np.zeros(0), data, **_latent(start, start + window),
             )
         )  # fmt: skip
     return found
