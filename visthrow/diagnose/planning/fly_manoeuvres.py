@@ -8,6 +8,7 @@ import numpy as np
 from sim.effects.effect import apply
 from sim.params import PlantParams
 from sim.units import Units, in_units
+from visthrow import config
 from visthrow.common import mocap
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import DiagnoseError, LogError
@@ -22,6 +23,7 @@ from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
+from visthrow.task import Experiment, plant_of
 
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
 COARSE = 2.0  # steps of a promise, in those of the search
@@ -60,36 +62,26 @@ def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[Fl
     """
     whole = getattr(model, "whole", model)
     if isinstance(whole, ThrowModel):
-        return _of_throw(whole, diagnosis, seed), lambda manoeuvre: manoeuvre
-    if isinstance(whole, FlyerModel) and made is not None:
-        return _of_flyer(whole, diagnosis, made, seed), lambda manoeuvre: carried(manoeuvre, whole.params)
-    raise DiagnoseError("manoeuvres are flown by a vehicle; a plan needs the model of the throw, or of a quadrotor with or without payload")
+        plant, device, asked = apply(whole.entries, whole.setting, diagnosis.theta).plant, whole.device, {e.name for e in whole.effects}
 
+        def own(flight: "Flight") -> Model:
+            log, carries = flight.log(noise), flight.manoeuvre.payload
+            there = effects_for(whole.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release))
+            return ThrowModel([log], whole.setting.plant, sensing=whole.setting.sensing, device=device,
+                              substep=COARSE * whole.substep, only=[n for n in there if n in asked], carries=carries)  # fmt: skip
+    elif isinstance(whole, FlyerModel) and made is not None:
+        plant, device = vehicle_of(whole.params, plant_of(config.load(Experiment, config.find("train", "state")))), "cpu"
 
-def _of_throw(model: ThrowModel, diagnosis: Diagnosis, seed: int) -> Simulate:
-    noise, asked = _sensor_noise(diagnosis), {e.name for e in model.effects}
-    plant = apply(model.entries, model.setting, diagnosis.theta).plant
+        def own(flight: "Flight") -> Model:
+            return made([flight.setup_log(whole.params, noise, ("battery_voltage",) * whole.has_voltage)])
+    else:
+        raise DiagnoseError("manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's with or without payload")
+    noise = _sensor_noise(diagnosis)
 
-    def own(flight: "Flight") -> Model:
-        log, carries = flight.log(noise), flight.manoeuvre.payload
-        there = effects_for(model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release))
-        return ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=model.device,
-                          substep=COARSE * model.substep, only=[n for n in there if n in asked], carries=carries)  # fmt: skip
+    def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
+        return [flight.simulated(own) for flight in fly(plant, manoeuvres, seed, device)]
 
-    return lambda manoeuvres: [flight.simulated(own) for flight in fly(plant, manoeuvres, seed, model.device)]
-
-
-def _of_flyer(model: FlyerModel, diagnosis: Diagnosis, made: Callable[[Sequence[FlightLog]], Model], seed: int) -> Simulate:
-    from visthrow import config
-    from visthrow.task import Experiment, plant_of
-
-    plant = vehicle_of(model.params, plant_of(config.load(Experiment, config.find("train", "state"))))
-    noise, extra = _sensor_noise(diagnosis), ("battery_voltage",) * model.has_voltage
-
-    def own(flight: "Flight") -> Model:
-        return made([flight.setup_log(model.params, noise, extra)])
-
-    return lambda manoeuvres: [flight.simulated(own) for flight in fly(plant, manoeuvres, seed)]
+    return simulate, lambda manoeuvre: carried(manoeuvre, whole.params) if isinstance(whole, FlyerModel) else manoeuvre
 
 
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
