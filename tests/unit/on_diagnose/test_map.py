@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.unit.on_diagnose.test_check import flight, log_of
 
 from tests import logfiles
 from tests.plants import paper_plant
+from tests.unit.on_logs.test_check import flight, log_of
 from visthrow import cli
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.unit.on_diagnose.test_check import flight
+from tests.unit.on_logs.test_check import flight
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.proposal import propose
 from visthrow.logs import read, table_of

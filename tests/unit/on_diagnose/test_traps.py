@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.unit.on_diagnose.test_check import faults, flight, log_of
 
 from tests import logfiles
+from tests.unit.on_logs.test_check import faults, flight, log_of
 from visthrow.diagnose.inputs import setup
 from visthrow.logs import read
 from visthrow.logs.check import relations
