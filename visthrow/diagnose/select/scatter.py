@@ -111,7 +111,7 @@ def varying(
     """
     known, told, drawn = list(names), {}, Varies(days)
     may_vary = [*(v for v in random_effects() if v.of), *others]
-    at = {v.name: [j for j in map(known.index, set(v.of) & set(known)) if priors.visible[j]] for v in may_vary}
+    at = {v.name: [j for name in v.of if name in known and priors.visible[j := known.index(name)]] for v in may_vary}
     price = {v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary}  # of all effects, one varies more by chance
     for _ in range(CHAIN + 1):
         given = priors, drawn, active
@@ -383,7 +383,7 @@ def deviations(scatter: Sequence[Scatter], priors: Priors, names: Sequence[str],
     known, found = list(names), Varies(days)
     for s in scatter:
         if s.found:
-            found = found.also([j for j in map(known.index, set(s.of) & set(known))], s.size / priors.floor, s.by)
+            found = found.also([known.index(name) for name in s.of if name in known], s.size / priors.floor, s.by)
     return found
 
 
