@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, require_positive
+from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, require
 from sim.units import Units, in_units
 
 Range = tuple[float, float]
@@ -58,8 +58,7 @@ class FleetParams:
 
     def __post_init__(self) -> None:
         """Raise ValueError for ranges that nothing can be drawn from."""
-        require_positive("fleet", rope_length=self.rope_length, total_mass=self.total_mass)
-        require_positive("fleet", least_thrust=self.least_thrust, yaw_loop=1.0 if self.yaw_loop is None else self.yaw_loop)
+        require("fleet", self, positive="rope_length total_mass least_thrust yaw_loop")
         if self.count < 0 or self.first < 0 or self.seed < 0:
             raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}; expected 0 or more of each")
         for name, (low, high) in self.ranges.items():

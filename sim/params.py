@@ -7,25 +7,23 @@ y left, z up) with the origin at the vehicle's centre of mass unless said otherw
 """
 
 import math
+import sys
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 GRAVITY = 9.81
 """Standard acceleration of free fall used by every plant of the project [m/s^2]."""
 
 
-def require_positive(owner: str, **values: float) -> None:
-    """Raise ValueError for the first value that is not finite and above zero, naming it."""
-    for name, value in values.items():
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{owner}.{name} is {value}; expected above 0")
-
-
-def require_not_negative(owner: str, **values: float) -> None:
-    """Raise ValueError for the first value that is not finite and 0 or more, naming it."""
-    for name, value in values.items():
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"{owner}.{name} is {value}; expected 0 or more")
+def require(owner: str, of: Any, *, positive: str = "", not_negative: str = "", finite: str = "") -> None:
+    """Raise ValueError for the first of an owner's fields, by their names, that is not so; of a tuple every number counts, None passes."""
+    kinds = ((positive, "above 0", math.ulp(0.0)), (not_negative, "0 or more", 0.0), (finite, "a finite value", -sys.float_info.max))
+    for names, expected, least in kinds:
+        for name in names.split():
+            value = getattr(of, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not least <= number < math.inf:  # true for NaN
+                    raise ValueError(f"{owner}.{name} is {number}; expected {expected}")
 
 
 @dataclass(frozen=True)
@@ -216,27 +214,16 @@ class VehicleParams:
     def __post_init__(self) -> None:
         """Raise ValueError for a vehicle that the equations do not describe."""
         body, rotors, c, cell = self.body, self.rotors, self.controller, self.battery
-        require_positive("vehicle.body", mass=body.mass, inertia=min(body.inertia))
-        require_positive("vehicle.thrust", k_f=self.thrust.k_f)
-        require_not_negative("vehicle.thrust", torque_ratio=self.thrust.torque_ratio)
-        require_positive("vehicle.motor", time_constant=self.motor.time_constant)
-        if self.motor.kind == "asymmetric":
-            require_positive("vehicle.motor", time_constant_down=self.motor.time_constant_down)
-        require_positive("vehicle.thrust", gain=min(self.thrust.gain), torque_gain=self.thrust.torque_gain)
-        require_positive(
-            "vehicle.controller", setpoint_time_constant=c.setpoint_time_constant, gyro_time_constant=c.gyro_time_constant,
-            max_thrust=c.max_thrust,
-        )
-        require_positive(
-            "vehicle.battery", capacity=cell.capacity, time_constant=cell.time_constant, efficiency=cell.efficiency,
-            reference_voltage=cell.reference_voltage,
-        )
-        require_not_negative("vehicle.battery", resistance=cell.resistance, idle_power=cell.idle_power)
-        require_not_negative("vehicle.controller", min_thrust=c.min_thrust)
+        require("vehicle.body", body, positive="mass inertia")
+        require("vehicle.thrust", self.thrust, positive="k_f gain torque_gain", not_negative="torque_ratio")
+        asymmetric = self.motor.kind == "asymmetric"
+        require("vehicle.motor", self.motor, positive="time_constant time_constant_down" if asymmetric else "time_constant")
+        above = "setpoint_time_constant gyro_time_constant max_thrust"
+        require("vehicle.controller", c, positive=above, not_negative="min_thrust")
+        above = "capacity time_constant efficiency reference_voltage"
+        require("vehicle.battery", cell, positive=above, not_negative="resistance idle_power")
         if not c.min_thrust < c.max_thrust:
-            raise ValueError(
-                f"vehicle.controller.min_thrust is {c.min_thrust} N; expected less than max_thrust {c.max_thrust} N"
-            )
+            raise ValueError(f"vehicle.controller.min_thrust is {c.min_thrust} N; expected less than max_thrust {c.max_thrust} N")
         if not (any(rotors.x) and any(rotors.y)) or abs(sum(rotors.spin)) > 0:
             raise ValueError(
                 f"rotors at x={rotors.x}, y={rotors.y} with spin {rotors.spin}; expected four rotors spread along x and y, "
@@ -282,17 +269,12 @@ class RopeParams:
     compliance: float = 0.0  # lengthening for every newton of pull [m/N]
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a number of segments outside 1 to 64, or masses and lengths that no rope has."""
         if not 1 <= self.segments <= 64:
             raise ValueError(f"rope of {self.segments} segments; expected 1 to 64")
-        require_positive("rope", length=self.length, rope_mass=self.rope_mass, payload_mass=self.payload_mass)
-        require_not_negative("rope", payload_inertia=self.payload_inertia, payload_offset=self.payload_offset)
-        require_not_negative("rope", joint_damping=self.joint_damping)
-        require_not_negative("rope", payload_drag=self.payload_drag, mount_damping=self.mount_damping)
-        require_not_negative("rope", swing_damping=self.swing_damping, downwash=self.downwash, compliance=self.compliance)
-        for name in ("payload_side", "payload_lift"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"rope.{name} is {getattr(self, name)}; expected a finite value")
+        require(
+            "rope", self, positive="length rope_mass payload_mass", finite="payload_side payload_lift",
+            not_negative="payload_inertia payload_offset joint_damping payload_drag mount_damping swing_damping downwash compliance",
+        )  # fmt: skip
 
     @property
     def segment_length(self) -> float:
@@ -323,10 +305,7 @@ class AirParams:
     ground_effect: float = 0.0  # [-]
 
     def __post_init__(self) -> None:
-        """Raise ValueError for wind or a ground effect that is not finite."""
-        for name, value in (("wind_w", sum(self.wind_w)), ("ground_effect", self.ground_effect)):
-            if not math.isfinite(value):
-                raise ValueError(f"air.{name} is {getattr(self, name)}; expected finite values")
+        require("air", self, finite="wind_w ground_effect")
 
 
 @dataclass(frozen=True)
@@ -353,11 +332,7 @@ class ReleaseParams:
     rope_tail: float = 0.0  # share of the rope that leaves with the payload [-]
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a negative lag or fewer than two samples of the flight."""
-        require_not_negative("release", lag=self.lag, rope_tail=self.rope_tail)
-        for name, value in (("lag_tension", self.lag_tension), ("kick_w", sum(self.kick_w)), ("kick_along", self.kick_along)):
-            if not math.isfinite(value):
-                raise ValueError(f"release.{name} is {getattr(self, name)}; expected finite values")
+        require("release", self, not_negative="lag rope_tail", finite="lag_tension kick_w kick_along")
         if self.rope_tail > 1.0:
             raise ValueError(f"release.rope_tail is {self.rope_tail}; expected a share from 0 to 1")
         if self.clearance_samples < 2:
@@ -375,9 +350,7 @@ class SimParams:
     precision: Literal["float32", "float64"] = "float32"
 
     def __post_init__(self) -> None:
-        """Raise ValueError for steps or limits that are not positive."""
-        require_positive("sim", control_period=self.control_period, substep=self.substep)
-        require_positive("sim", gamma=self.gamma, max_turn=self.max_turn)
+        require("sim", self, positive="control_period substep gamma max_turn")
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
         if kinds_of(vehicle) != kinds:
             raise ValueError(f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same blocks")
         rotors, thrust = vehicle.rotors, vehicle.thrust
-        P.require_positive("vehicle.thrust", torque_ratio=thrust.torque_ratio)  # the mixer divides by it
+        P.require("vehicle.thrust", thrust, positive="torque_ratio")  # the mixer divides by it
         # Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each of shape (4,).
         x, y, spin = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
         row["mixer"]["roll"], row["mixer"]["pitch"] = y / (4 * np.mean(y**2)), -x / (4 * np.mean(x**2))
