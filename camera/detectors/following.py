@@ -31,9 +31,10 @@ LOST = 0.04
 the frames of training one in twenty is repeated."""
 
 MEMORY = 2.0
-"""Time in which what a frame said of a square fades to 1/e, and after which one that was not seen again is forgotten [s]: a hover."""
+"""Time in which what a frame said of a square fades to 1/e, and after which one that was not seen again is forgotten [s]: a hover.
+A frame counts by the time since the one before, as frames err alike the closer they are."""
 
-SUREST = 0.99  # probability of a square in one frame at most: frames err alike
+SUREST = 0.99  # probability of a square in one frame at most
 
 
 class Track:
@@ -83,7 +84,7 @@ class Following:
         self._radius, self._side, self._half_angle, self._begin = radius, side, 0.0, ball_w
         self._ball: Track | None = None
         self._squares: list[Square] = []
-        self._eye_w, self._stamp = np.zeros(3), -math.inf
+        self._eye_w, self._stamp, self._weight = np.zeros(3), math.inf, 0.0
 
     def known(self, rot_wc: np.ndarray, up_w: np.ndarray, eye_w: np.ndarray, distance: tuple[float, float] | None, stamp: float) -> Known:
         """What a detector is told of a frame.
@@ -103,8 +104,9 @@ class Following:
             self._ball.predict(stamp, -pull * _across(up_w, self._ball.ray_w))
             where = {"ball_ray_c": rot_wc.T @ self._ball.ray_w, "ball_within": min(GATE * self._ball.spread, math.pi)}
         self._squares = [square for square in self._squares if stamp - square.stamp < MEMORY]
+        self._weight = -math.expm1(-max(stamp - self._stamp, 0.0) / MEMORY)
         for square in self._squares:
-            square.log_odds *= math.exp((self._stamp - stamp) / MEMORY)
+            square.log_odds *= 1.0 - self._weight
         self._eye_w, self._stamp = eye_w, stamp
         if self._squares:
             away = np.append(self._likeliest().place_w, 0.0) - eye_w
@@ -145,7 +147,7 @@ class Following:
                 self._squares.append(Square(place_w, self._stamp))
             square, sure, found[i] = self._squares[i], min(max(one.score, 1.0 - SUREST), SUREST), one
             square.place_w, square.stamp = place_w, self._stamp
-            square.log_odds += math.log(sure / (1.0 - sure))
+            square.log_odds += self._weight * math.log(sure / (1.0 - sure))
         return found.get(self._squares.index(self._likeliest())) if self._squares else None
 
     def _likeliest(self) -> Square:
