@@ -1,4 +1,7 @@
-"""The bridge to ArduPilot's JSON interface against a fake of the other side, which sends servo outputs and waits for the state."""
+"""The bridge to ArduPilot's JSON interface against a fake of the other side, which sends servo outputs and waits for the state.
+
+Each waits for the other as long as it takes, so that frames alone move the simulator's clock, however busy the machine is.
+"""
 
 import json
 import socket
@@ -10,7 +13,8 @@ import pytest
 
 from hil.fakes.base import VEHICLE_ID, Options
 from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl.ardupilot import SERVOS, ArduPilotSitl, outputs
+from hil.fakes.sitl import ardupilot
+from hil.fakes.sitl.ardupilot import ArduPilotSitl, outputs
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
@@ -20,23 +24,23 @@ from visthrow.throws.wire_plant import make_motors
 HOVER = 1437
 """Output at which the rotors carry the vehicle [us]: the square root of its weight over four motors of 3.5 N, a little more."""
 
+PATIENCE = 60.0
+"""After which a side that says nothing is broken [s]."""
+
 
 class OtherSide(threading.Thread):
     """Sends frames one after another and keeps the states that come back."""
 
-    def __init__(self, frames):
+    def __init__(self, frames, bridge):
         super().__init__(daemon=True)
-        self.frames, self.states = frames, []
+        self.frames, self.bridge, self.states = frames, bridge, []
 
     def run(self):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-            link.settimeout(2.0)
+            link.settimeout(PATIENCE)
             for number, servos in self.frames:
-                link.sendto(struct.pack("<HHI16H", 18458, 1000, number, *servos), ("127.0.0.1", SERVOS))
-                try:
-                    self.states.append(json.loads(link.recv(4096)))
-                except TimeoutError:
-                    return
+                link.sendto(struct.pack("<HHI16H", 18458, 1000, number, *servos), self.bridge)
+                self.states.append(json.loads(link.recv(4096)))
 
 
 def servos(*motors, hook=1100):
@@ -44,7 +48,9 @@ def servos(*motors, hook=1100):
 
 
 @pytest.fixture
-def bridge():
+def bridge(monkeypatch):
+    monkeypatch.setattr(ardupilot, "SERVOS", 0)  # any port that is free
+    monkeypatch.setattr(ardupilot, "PATIENCE", PATIENCE)
     params = config.load(HilParams, config.find("hil", "ardupilot_sitl")).ardupilot
     link = Link(UdpPort(Device("udpout", "127.0.0.1", 14998)), *VEHICLE_ID)
     made = ArduPilotSitl(make_motors("vision", 0), link, MocapParams(), 0, Options(), params)
@@ -53,11 +59,11 @@ def bridge():
 
 
 def fly(bridge, frames):
-    other = OtherSide(frames)
+    other = OtherSide(frames, bridge.port.getsockname())
     other.start()
     for _ in frames:
         bridge.step()
-    other.join(5.0)
+    other.join(PATIENCE)
     return other.states
 
 
@@ -93,6 +99,13 @@ def test_the_mechanisms_output_lets_the_ball_go(bridge):
     report = bridge.report()
     assert report["releases"] == 1
     assert report["separation_time"] == pytest.approx(report["release_time"] + 0.06, abs=0.005)
+
+
+def test_without_a_frame_time_goes_on_and_nothing_is_flown(bridge, monkeypatch):
+    monkeypatch.setattr(ardupilot, "PATIENCE", 0.0)
+    bridge.step()
+    assert bridge.plant.time == bridge.plant.period
+    assert (bridge.frames, bridge.repeated) == (0, 0)
 
 
 def test_strange_packets_are_none():
