@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from tests.bench import loop, start
+from tests.bench import report as records
 from visthrow import config
 from visthrow.common import statistics
 from visthrow.common.storage import write_json
 from visthrow.diagnose.extend.patch import extended
-from visthrow.evidence.bench import records
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import device

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from sim.cores import cores
 from tests.bench import start
+from tests.bench.report import Report, Table, add_arguments_of_measurements, finish
 from visthrow.diagnose.inputs import opening
 from visthrow.diagnose.reporting import explain_cli
 from visthrow.diagnose.select import search
-from visthrow.evidence.bench.records import Report, Table, add_arguments_of_measurements, finish
 from visthrow.training.device import resolve
 
 VERDICT_S = {"cpu": 90.0, "cuda": 5.0}

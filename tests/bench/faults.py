@@ -19,9 +19,9 @@ import torch
 
 from tests.bench.figures import json_lines
 from tests.bench.processes import CONFIGS, ENDED, Pair, own_cores, side_by_side
+from tests.bench.report import Report, Table
 from tests.bench.soak import STILL, never_releasing
 from visthrow.common.errors import VisthrowError, suggest
-from visthrow.evidence.bench.records import Report, Table
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.hover import GRAVITY
 

@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from tests.bench import start
+from tests.bench.report import Report, Table, finish
 from visthrow.common.arguments import add_common, add_out
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import status
-from visthrow.evidence.bench.records import Report, Table, body, finish
+from visthrow.evidence.measurements import body
 
 TARGETS = (1.5, 2.0, 2.5)
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")

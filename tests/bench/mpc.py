@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from tests.bench import start
+from tests.bench.report import Report, Table, finish
 from tests.bench.sim import on_one_core
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import records
-from visthrow.evidence.bench.records import Report, Table
 
 TARGETS = (1.5, 2.0, 2.5)
 LIMIT_MS = 10.0
@@ -28,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
     with on_one_core(args.core) as core:
         report = measure(experiment, args.throws, core)
-    return records.finish(report, args)
+    return finish(report, args)
 
 
 def measure(experiment, throws: int, core: int | None = None) -> Report:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from visthrow.evidence.bench.records import Table, rate
+from tests.bench.report import Table, rate
 
 BATCHES = (8192, 16384, 32768, 65536)
 SUBSTEPS = 10  # in the graph: one control step of ours

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 from tests.bench import start
 from tests.bench.faults import faults
+from tests.bench.report import finish
 from tests.bench.soak import soak
 from tests.bench.throws import series
-from visthrow.evidence.bench.records import finish
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,12 +17,12 @@ import numpy as np
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
 from tests.bench import commands, start
+from tests.bench.report import Report, Table, finish
 from tests.oracle.converged import converged
 from tests.simulators import fly
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.records import Report, Table, finish
 from visthrow.task import Experiment, plant_of
 
 BATCH = 1024

@@ -8,7 +8,7 @@ import warp as wp
 
 from sim.hybrid import HybridSim, tether_lengths
 from tests.bench import commands
-from visthrow.evidence.bench.records import Report, Table, rate
+from tests.bench.report import Report, Table, rate
 from visthrow.task import Experiment, plant_of
 from visthrow.training.device import device_name
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from tests.bench.processes import Memory, Pair
+from tests.bench.report import Report, Table
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.records import Report, Table
 
 STILL = ("--plant", "tests.level:make")
 """A vehicle without a simulator: it takes no time from the runner."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from tests.bench.figures import bootstrap_upper, finite, json_lines
 from tests.bench.processes import Pair, own_cores, side_by_side
+from tests.bench.report import Report, Table
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench.records import Report, Table
 
 MEAN, RATIO = 0.10, 1.3
 """Bars: mean landing error [m]; the 90 % upper bound of the ratio of mean errors."""

@@ -24,7 +24,7 @@ COMMANDS = {
     "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.cli.sweep"),
     "report": ("write one page with the paper's tables and figures beside ours", "visthrow.cli.report"),
     "camera": ("make a camera configuration from a calibration, check it, look at what it sees", "visthrow.cli.camera"),
-    "bench": ("measure how long training and diagnosis take; what was measured before", "visthrow.cli.bench"),
+    "bench": ("print what was measured, with command, commit and machine", "visthrow.cli.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
 }
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"

@@ -1,26 +1,26 @@
-"""``visthrow bench``: how long training takes here; what was measured before. Each action is imported when chosen."""
+"""``visthrow bench records``: what was measured, with command, commit and machine."""
 
 import argparse
 
-from visthrow.common.arguments import add_commands, run_command
-
-ACTIONS = {
-    "train": ("where the wall time of a training goes: in an iteration, or to an error", "visthrow.evidence.bench.iteration"),
-    "records": ("print the recorded measurements as Markdown", "visthrow.evidence.bench.records"),
-}
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the actions of the command."""
-    parser.epilog = (
-        "examples:\n"
-        "  visthrow bench train state --device cuda       simulation, environment, inference and learning\n"
-        "  visthrow bench train laptop --until 0.06 0.04  seconds of a whole training to these errors, over seeds\n"
-        "  visthrow bench records                         what was measured before, on which machine and commit\n"
+    """Add the action of the command."""
+    records = parser.add_subparsers(dest="bench", metavar="ACTION", required=True).add_parser(
+        "records", help="print the recorded measurements as Markdown", description="print the recorded measurements as Markdown"
     )
-    add_commands(parser, ACTIONS, "bench")
+    records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, or print what was measured."""
-    return run_command(ACTIONS, args.bench, args)
+    """Print records."""
+    from visthrow.common.errors import VisthrowError, suggest
+    from visthrow.evidence import measurements
+
+    kept = {path.stem: path for path in sorted(measurements.FOLDER.glob("*.json"))}
+    unknown = [name for name in args.names if name not in kept]
+    if unknown:
+        raise VisthrowError(f"no record '{unknown[0]}'; {suggest(unknown[0], kept)}")
+    for name in args.names or kept:
+        record = measurements.load(kept[name])
+        print(f"## {name}\n\n{measurements.origin(record)}\n\n{measurements.body(record)}\n")
+    return 0

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sim.replay.lanes import Recording
+from sim.kernels.replay.lanes import Recording
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow.diagnose.likelihood.correlation import LOOKED_AT

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from sim.cores import _pool
 from sim.hybrid import HybridSim
+from sim.kernels.replay import kernel as rk
+from sim.kernels.replay.lanes import _BUILDS, Recording, Replay, _shared_out
 from sim.kernels.structs import EXTENSIONS
 from sim.params import SensingParams
-from sim.replay import kernel as rk
-from sim.replay.lanes import _BUILDS, Recording, Replay, _shared_out
 from tests.plants import paper_plant
 
 PERIODS, RELEASED_AT = 40, 20

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
+from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
 from visthrow.diagnose.throw.recorded import NEVER, Recorded
 
 LENGTH = 1.0  # of a window, about [s]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim.effects.setting import Setting
-from sim.replay.lanes import Recording, Replay
+from sim.kernels.replay.lanes import Recording, Replay
 from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Flights, Lane, downloaded
 from visthrow.diagnose.throw.states import States
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.effects.setting import Setting
-from sim.replay.kernel import ATTACHED
-from sim.replay.lanes import Replay
+from sim.kernels.replay.kernel import ATTACHED
+from sim.kernels.replay.lanes import Replay
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sim.replay.kernel import ATTACHED
-from sim.replay.lanes import Replay
+from sim.kernels.replay.kernel import ATTACHED
+from sim.kernels.replay.lanes import Replay
 from visthrow.diagnose.throw.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
 from visthrow.diagnose.throw.replay import Flights, Lane, downloaded

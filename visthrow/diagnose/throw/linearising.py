@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
-from sim.replay.kernel import NO_PAYLOAD
+from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.recorded import NEVER
 from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Flights, Lane

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from sim.effects.setting import Setting
-from sim.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
-from sim.replay.lanes import Recording, Replay, Replayed
+from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
+from sim.kernels.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.likelihood.transfer import to_host
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting
+from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from sim.params import GRAVITY, PlantParams, VehicleParams
-from sim.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import Recorded, Samples

@@ -13,9 +13,9 @@ import warp as wp
 from camera.params import CameraParams
 from sim.effects.effect import SettingEffect, apply
 from sim.effects.setting import Setting, generalised
+from sim.kernels.replay.kernel import ATTACHED
+from sim.kernels.replay.lanes import Replay
 from sim.params import PlantParams, SensingParams
-from sim.replay.kernel import ATTACHED
-from sim.replay.lanes import Replay
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host

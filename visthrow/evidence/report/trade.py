@@ -8,6 +8,7 @@ from visthrow.baseline import front, thrower
 from visthrow.baseline.front import FRONT_TARGET, FRONT_THROWS
 from visthrow.baseline.thrower import BOUNDS
 from visthrow.common import statistics as st
+from visthrow.evidence import measurements
 from visthrow.evidence.report.result_set import SHIPPED, ResultSet, landed
 from visthrow.evidence.report.throws import SHORT
 from visthrow.task.measurement import TARGETS
@@ -86,9 +87,7 @@ def _row(found: Result) -> tuple[str, ...]:
 
 def _steps() -> list[Grid | Text]:
     """Step times of the controller, from the records of ``python -m tests.bench.mpc``."""
-    from visthrow.evidence.bench import records
-
-    found = [records.load(path) for path in sorted(records.FOLDER.glob("mpc*.json"))]
+    found = [measurements.load(path) for path in sorted(measurements.FOLDER.glob("mpc*.json"))]
     if not found:
         return [Text("No step times of the controller: `python -m tests.bench.mpc --record mpc-cpu`.", "missing")]
     grids = []

@@ -1,16 +1,21 @@
-"""``visthrow bench train``: where the wall time of a training iteration goes."""
+"""Where the wall time of a training goes: in an iteration, or to an error over seeds.
+
+    python -m tests.bench.train state --device cuda       simulation, environment, inference and learning
+    python -m tests.bench.train laptop --until 0.06 0.04  seconds of whole trainings to these errors
+"""
 
 import argparse
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from tests.bench import start
+from tests.bench.report import Report, Table, add_arguments_of_measurements, finish, rate
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.evidence.bench import records
-from visthrow.evidence.bench.records import Report, Table, rate
 from visthrow.training.device import device_name, rounded_products
 
 WARM_UP = 3  # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
@@ -104,19 +109,6 @@ def split(total: dict[str, float], parts: dict[str, float]) -> dict[str, float]:
     return dict(zip(PARTS, (parts["simulation"], environment, parts["inference"], storage, total["learning"])))
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    add = parser.add_argument
-    add("configs", metavar="CONFIG", nargs="*", default=["state"], help="training configurations (default: state)")
-    add("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
-    add("--until", type=float, nargs="+", metavar="ERROR", help="train until throws at 2.0 m land so near on average [m], and time that")
-    add("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], metavar="N", help="of the trainings (default: 1 to 5)")
-    add("--minutes", type=float, default=30.0, metavar="T", help="that a training may take (default: 30)")
-    add("--evaluate-every", type=int, metavar="N", help="iterations between throws (default: a twentieth of the time)")
-    records.add_arguments_of_measurements(parser, 5)
-    add_common(parser)
-
-
 def run(args: argparse.Namespace) -> int:
     """Measure a training iteration."""
     numbers = (args.iterations, args.repeats, args.minutes, args.evaluate_every or 1, *(args.until or ()))
@@ -132,15 +124,15 @@ def run(args: argparse.Namespace) -> int:
     experiments = {path.stem: config.load(Experiment, path, args.overrides) for path in paths}
     name = device.resolve(args.device)
     if args.until:
-        from visthrow.evidence.bench import time_to_error
+        from tests.bench import time_to_error
 
-        return records.finish(time_to_error.measure(experiments, name, args.until, args.seeds, args.minutes, args.evaluate_every), args)
+        return finish(time_to_error.measure(experiments, name, args.until, args.seeds, args.minutes, args.evaluate_every), args)
     if len(experiments) > 1:
         raise VisthrowError(f"{' '.join(experiments)}: an iteration is measured of one configuration; several with --until")
     (stem, experiment), *_ = experiments.items()
     if experiment.algorithm != "ppo":
         raise VisthrowError(f'{stem}: algorithm "{experiment.algorithm}"; parts of an iteration are measured of "ppo"; use --until')
-    return records.finish(measure(experiment, stem, name, args.iterations, args.repeats), args)
+    return finish(measure(experiment, stem, name, args.iterations, args.repeats), args)
 
 
 def measure(experiment: Any, name: str, device: str, iterations: int, repeats: int) -> Report:
@@ -171,3 +163,22 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     }  # fmt: skip
     table = Table(title, ("part", "time", "share", "env-steps/s"), tuple(rows))
     return Report("train", f"A training iteration on {device_name(device)}", (table,), notes, figures)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__, record=False)
+    add = parser.add_argument
+    add("configs", metavar="CONFIG", nargs="*", default=["state"], help="training configurations (default: state)")
+    add("--iterations", type=int, default=5, metavar="N", help="iterations measured (default: 5)")
+    add("--until", type=float, nargs="+", metavar="ERROR", help="train until throws at 2.0 m land so near on average [m], and time that")
+    add("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5], metavar="N", help="of the trainings (default: 1 to 5)")
+    add("--minutes", type=float, default=30.0, metavar="T", help="that a training may take (default: 30)")
+    add("--evaluate-every", type=int, metavar="N", help="iterations between throws (default: a twentieth of the time)")
+    add_arguments_of_measurements(parser, 5)
+    add_common(parser)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

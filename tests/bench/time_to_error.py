@@ -1,4 +1,4 @@
-"""``visthrow bench train --until``: wall time of trainings to a landing error, over seeds, configurations side by side."""
+"""Wall time of trainings to a landing error, over seeds, configurations side by side."""
 
 import math
 import statistics
@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from visthrow.evidence.bench.records import Report, Table, rate
+from tests.bench.report import Report, Table, rate
 from visthrow.training.device import device_name
 
 TARGET = 2.0  # [m]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import warp as wp
 
 from sim.kernels.quadrotor.rigid_body import quat_rate
+from sim.kernels.replay.sensing import build_sensing
 from sim.kernels.structs import Types, make_struct
-from sim.replay.sensing import build_sensing
 
 
 @dataclass(frozen=True)

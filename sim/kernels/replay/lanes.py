@@ -10,9 +10,9 @@ from sim.cores import cores, in_pieces
 from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
 from sim.kernels.laws import check_laws, structure
+from sim.kernels.replay import kernel as rk
 from sim.kernels.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
 from sim.params import GRAVITY, PlantParams, SensingParams
-from sim.replay import kernel as rk
 
 
 @dataclass(frozen=True)

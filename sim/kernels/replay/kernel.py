@@ -12,6 +12,7 @@ from sim.kernels import state as st
 from sim.kernels.laws import build_laws
 from sim.kernels.quadrotor.rigid_body import build_flow
 from sim.kernels.quadrotor.thrust import rotor_thrust
+from sim.kernels.replay.sampling import build_sampling
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose_step
@@ -19,7 +20,6 @@ from sim.kernels.rope.payload import build_flight, build_payload
 from sim.kernels.rope.release import build_letting_go, build_step_in_flight
 from sim.kernels.structs import EXTENSIONS, Types, make_struct
 from sim.params import LawParams, SensingParams, VehicleParams
-from sim.replay.sampling import build_sampling
 
 EVERYTHING = frozenset(EXTENSIONS)  # the replay has every extension built in, so that lanes may differ in all of them
 

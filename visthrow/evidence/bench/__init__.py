@@ -1,1 +1,0 @@
-"""Measurements of a user's own machine, and the records of those that were made before."""

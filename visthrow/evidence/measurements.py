@@ -1,0 +1,40 @@
+"""Recorded measurements of speed, each with its command, commit and machine: read, and put in Markdown."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.errors import StorageError
+from visthrow.view.parts import aligned
+
+FOLDER = Path(__file__).with_name("records") / "bench"
+KEYS = {"bench", "title", "provenance", "tables", "notes", "figures"}
+
+
+def body(record: dict[str, Any]) -> str:
+    """Title, tables and notes of a record as Markdown."""
+    tables = [f"**{table['title']}**\n\n{aligned(table['header'], table['rows'])}" for table in record["tables"]]
+    return "\n\n".join([f"### {record['title']}", *tables, "\n".join(f"- {note}" for note in record["notes"])]).rstrip()
+
+
+def origin(record: dict[str, Any]) -> str:
+    """Provenance of a record in a few lines of Markdown."""
+    came = record["provenance"]
+    processors = came["processors"]
+    machine = f"{processors['cpu']}, {processors['cores']} cores"
+    if processors.get("gpu"):
+        machine += f"; {', '.join(processors['gpu'])}"
+    versions = ", ".join(f"{name} {version}" for name, version in came["versions"].items())
+    return f"`{came['command']}`, {came['time']}, commit {came['commit'][:12]}\n\n{machine}\n\n{versions}"
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a record; StorageError where it is no JSON, or keys are missing."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StorageError(f"{path.name}: not a readable record ({error})") from error
+    missing = KEYS - (record.keys() if isinstance(record, dict) else set())
+    if missing:
+        raise StorageError(f"{path.name}: not a record; missing {sorted(missing)}")
+    return record
