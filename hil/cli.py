@@ -14,7 +14,6 @@ ACTIONS = {
     "calibrate": ("flight:fly", "hover, sway, tell the camera's tilt and latency and the thrust in hover, and land; no throw"),
     "record": ("flight:fly", "record the poses that come and what the policy would make of them; never arms, sends nothing"),
     "fake": ("simulated:fake", "a fake autopilot with the simulator's vehicle, to throw over the wire"),
-    "direct": ("simulated:direct", "throws through Betaflight's firmware in software, in lock step with the simulator's vehicle"),
 }
 """Name -> module and function, imported only when it was chosen, and help."""
 
@@ -44,7 +43,7 @@ def checked(kind: type, good: Callable[[float], bool], expected: str) -> Callabl
 
 
 ABOVE_ZERO, SEED = checked(float, lambda x: x > 0.0, "a number above 0"), checked(int, lambda x: x >= 0, "a whole number of 0 or more")
-FLIES, FAKES = ("run", "record", "calibrate"), ("fake", "direct")
+FLIES = ("run", "record", "calibrate")
 FLAG, OVERRIDES = {"action": "store_true"}, {"dest": "overrides", "action": "append", "default": []}
 KINDS = "ardupilot, px4, betaflight, crazyflie; or a bridge to software: betaflight-sitl, ardupilot-sitl, px4-sih"
 PLANTS = "visthrow.throws.wire_plant:make, behind a firmware :make_motors"
@@ -52,8 +51,7 @@ FILE = "of the recording: .rrd (rerun) or .mcap (Foxglove); default: run.rrd in 
 
 OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any]], ...] = (
     (("run", "check", "record", "calibrate"), "--config", "NAME", "of configs/hil, or a file", {"default": "dry_run"}),
-    (("direct",), "--config", "NAME", "of configs/hil, or a file", {"default": "betaflight_sitl"}),
-    (("run", "check", "record", "calibrate", "direct"), "--set", "KEY=VALUE", None, OVERRIDES),
+    (("run", "check", "record", "calibrate"), "--set", "KEY=VALUE", None, OVERRIDES),
     (("run", "check", "record", "calibrate"), "--seconds", None, "end after this time", {"type": ABOVE_ZERO}),
     (("run", "check", "record", "calibrate"), "--speed", None, "of the clock; below 1 with a fake of the same speed",
      {"type": float, "default": 1.0}),
@@ -71,13 +69,10 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
     (("view",), "--out", "FILE", FILE, {}),
     (("view",), "--web-port", "N", "of the live view (default: 9090)", {"type": int, "default": 9090}),
     (("view",), "--data-port", "N", "of its data (default: 9876)", {"type": int, "default": 9876}),
-    (("direct",), "--seeds", "N", "of starts, noise and loss; a throw each", {"type": SEED, "nargs": "+", "default": [0]}),
     (("fake",), "--rate", "HZ", "poses a second of each body", {"type": float, "default": 100.0}),
-    (("direct",), "--policy", "POLICY", "whose plant is flown (default: the one that throws)", {}),
-    (("direct",), "--firmware", "PROGRAM", "Betaflight's for a PC, to fly the plant's motors", {"required": True}),
-    (("fake",), "--firmware", "PROGRAM", "of --kind betaflight-sitl: as of `hil direct`", {}),
-    (FAKES, "--folder", "FOLDER", "of the firmware's settings and blackbox", {"default": "out/firmware"}),
-    (FAKES, "--plant", "MODULE:FUNCTION", f"that makes the vehicle (default: {PLANTS})", {}),
+    (("fake",), "--firmware", "PROGRAM", "of --kind betaflight-sitl: Betaflight's for a PC, to fly the plant's motors", {}),
+    (("fake",), "--folder", "FOLDER", "of the firmware's settings and blackbox", {"default": "out/firmware"}),
+    (("fake",), "--plant", "MODULE:FUNCTION", f"that makes the vehicle (default: {PLANTS})", {}),
     (("fake",), "--device", None, "the runner's port", {"default": "udpout:127.0.0.1:14560"}),
     (("fake",), "--sign", "KEYFILE", "as of `hil run`", {}),
     (("fake",), "--policy", "POLICY", "whose plant is flown", {"default": "vision"}),

@@ -1,8 +1,7 @@
-"""``visthrow hil fake`` and ``direct``: the simulated vehicle over the wire, and behind a firmware in lock step."""
+"""``visthrow hil fake``: the simulated vehicle over the wire, and behind a firmware in software."""
 
 import argparse
 import json
-import math
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,8 +17,7 @@ from hil.fakes.sitl.ardupilot import ArduPilotSitl
 from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl
 from hil.fakes.sitl.firmware import Firmware, needed
 from hil.fakes.sitl.sih import HangingBall, Px4Sih
-from hil.fakes.sitl.throw import throw
-from hil.flight import key_of, params_of
+from hil.flight import key_of
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
@@ -35,20 +33,6 @@ SITL = {"betaflight-sitl": MOTORS, "ardupilot-sitl": MOTORS, "px4-sih": BALL}
 
 BRIDGE_ID = (254, 190)  # MAVLink ids of the bridge where it listens to an autopilot itself
 BALL_LAG = 0.06  # from the mechanism's output to separation below PX4's vehicle [s], as `visthrow.throws.wire_plant.MECHANISM`
-
-
-def direct(args: argparse.Namespace) -> int:
-    """Throw through a firmware in lock step; a line of JSON a seed."""
-    params = params_of(args)
-    policy = Policy.load(find_policy(params.policy))
-    for seed in args.seeds:
-        flown = load_plant(args.plant or MOTORS, args.policy or params.policy, seed)
-        report = throw(args.firmware, Path(args.folder) / f"{seed:03d}", params, policy, flown, MocapParams(), seed)
-        summary, landed = report.pop("run"), report["landing_w"]
-        error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])
-        told = {"seed": seed, "error": error, "state": summary["state"], "reason": summary["reason"], **report}
-        print(json.dumps(told), flush=True)
-    return 0
 
 
 def fake(args: argparse.Namespace) -> int:

@@ -13,7 +13,6 @@ from hil.fakes.base import VEHICLE_ID, Options
 from hil.fakes.crazyflie import FakeCrazyflie
 from hil.fakes.mocap import MocapParams
 from hil.fakes.process import AnsweringPort
-from hil.fakes.sitl.throw import FlightClock
 from hil.links import crtp
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
@@ -23,6 +22,7 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.poses.sources.opening import open_source
 from tests.bench.processes import free_port
+from tests.sitl.direct import FlightClock
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make

@@ -18,8 +18,8 @@ import numpy as np
 from hil.fakes.mocap import MocapParams
 from hil.fakes.sitl.betaflight import SAMPLE
 from hil.fakes.sitl.firmware import Firmware, needed
-from hil.fakes.sitl.throw import SETTINGS, throw
 from hil.params import HilParams
+from tests.sitl.direct import SETTINGS, throw
 from tests.sitl.landings import BASE, DELAY
 from tests.sitl.test_betaflight import program
 from visthrow import config

@@ -19,7 +19,6 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from hil.fakes.mocap import SLACK, Mocap, MocapParams
-from hil.fakes.sitl.throw import FlightClock, set_up
 from hil.links.backends.base import Held
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD
@@ -27,6 +26,7 @@ from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, VehicleParams
 from tests.sitl import test_betaflight as bench
+from tests.sitl.direct import FlightClock, set_up
 from visthrow import config
 from visthrow.logs.flightlog import FlightRecorder
 from visthrow.logs.readers.blackbox.decoder import read_blackbox

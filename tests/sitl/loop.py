@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl.throw import throw
 from hil.params import HilParams
 from tests.bench.direct import Direct
+from tests.sitl.direct import throw
 from tests.sitl.test_betaflight import program
 from visthrow import config
 from visthrow.common import provenance

@@ -22,13 +22,13 @@ from hil.fakes.base import VEHICLE_ID, Options
 from hil.fakes.mocap import MocapParams
 from hil.fakes.sitl.betaflight import BetaflightSitl
 from hil.fakes.sitl.firmware import Firmware, needed
-from hil.fakes.sitl.throw import opened, throw
 from hil.links.backends.base import FOLLOW
 from hil.links.backends.betaflight import Betaflight
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from tests.loopback import test_endings as endings
+from tests.sitl.direct import opened, throw
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors

@@ -1,9 +1,14 @@
-"""A throw through the firmware in lock step: runner, link, firmware and vehicle take turns in one process, on no clock but theirs.
+"""Throws through the firmware in lock step: runner, link, firmware and vehicle take turns in one process, on no clock but theirs.
+
+    python tests/sitl/alone.py python -m tests.sitl.direct --firmware PROGRAM --seeds 0 1 2    # a line of JSON a throw
 
 The runner is the one that flies, with its state machine, guard, back-end and recorder; poses come by MAVLink, commands go by MSP.
 The same seed gives the same throw on any machine that is not out of memory, as fast as it can.
 """
 
+import argparse
+import json
+import math
 import select
 import shutil
 from collections.abc import Iterator, Sequence
@@ -21,6 +26,7 @@ from hil.control.runner import Runner
 from hil.control.states import State
 from hil.fakes.base import VEHICLE_ID, Fake, Options
 from hil.fakes.mocap import SLACK, MocapParams
+from hil.fakes.process import load_plant
 from hil.fakes.sitl.betaflight import BetaflightSitl, MotorPlant
 from hil.fakes.sitl.firmware import Firmware, needed
 from hil.links.backends import make_backend, mechanism_lag
@@ -29,7 +35,9 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.poses.sources.base import Source
 from hil.poses.sources.opening import open_source
-from visthrow.onboard.policy import Policy
+from hil.simulated import MOTORS
+from visthrow import config
+from visthrow.onboard.policy import Policy, find_policy
 
 SETTINGS = "settings"  # folder of the firmware's settings beside those of the throws
 AFTER, MOST = 1.2, 25.0  # flown on after a landing; flown at most [s]
@@ -127,3 +135,30 @@ def _flown(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
         landed = plant.landing["landing_time"]
         done = loop.runner.machine.state is State.DONE or (landed is not None and plant.time > landed + AFTER)
     return {**loop.summary(), "links": [one.roster.summary() for one in loop.source.links], "autopilot": {}}
+
+
+def main() -> None:
+    """Throw; a line of JSON a seed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--firmware", required=True, metavar="PROGRAM", help="Betaflight's for a PC, to fly the plant's motors")
+    add("--config", default="betaflight_sitl", metavar="NAME", help="of configs/hil, or a file")
+    add("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    add("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
+    add("--policy", help="whose plant is flown (default: the one that throws)")
+    add("--plant", default=MOTORS, metavar="MODULE:FUNCTION", help="that makes the vehicle")
+    add("--folder", type=Path, default=Path("out/firmware"), help="of the firmware's settings and blackbox")
+    args = parser.parse_args()
+    params = config.load(HilParams, config.find("hil", args.config), args.overrides)
+    policy = Policy.load(find_policy(params.policy))
+    for seed in args.seeds:
+        flown = load_plant(args.plant, args.policy or params.policy, seed)
+        report = throw(args.firmware, args.folder / f"{seed:03d}", params, policy, flown, MocapParams(), seed)
+        summary, landed = report.pop("run"), report["landing_w"]
+        error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])
+        told = {"seed": seed, "error": error, "state": summary["state"], "reason": summary["reason"], **report}
+        print(json.dumps(told), flush=True)
+
+
+if __name__ == "__main__":
+    main()
