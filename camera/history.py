@@ -15,15 +15,9 @@ def filled(new: torch.Tensor, length: int) -> torch.Tensor:
 
 
 def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
-    """Return the history with a value put in front and the oldest dropped.
+    """Return the history, shape (E, H, ...), newest first, with a value (E, ...) put in front and the oldest dropped.
 
-    Args:
-        history: Shape (E, H, ...), newest first.
-        new: The newest value, shape (E, ...).
-        reset_mask: Environments whose history is filled with the new value, bool, shape (E,).
-
-    Returns:
-        A new tensor, shape (E, H, ...).
+    ``reset_mask``: environments whose history is filled with the new value, bool, shape (E,).
     """
     front = new.unsqueeze(1)
     mask = reset_mask.reshape(-1, *(1,) * (history.dim() - 1))
@@ -31,17 +25,10 @@ def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> 
 
 
 def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
-    """Value that is ``latency`` steps old, linear between the two stored neighbours.
+    """Value, shape (E, ...), that is ``latency`` steps old, (E,) or scalar, linear between the two stored neighbours.
 
-    Written as hat-function weights over the whole (short) history: no gather, latencies may differ by environment.
-    A latency beyond the history reads its oldest value.
-
-    Args:
-        history: Floating point, shape (E, H, ...), newest first.
-        latency: Age [steps], shape (E,) or scalar tensor.
-
-    Returns:
-        Shape (E, ...).
+    Written as hat-function weights over the whole (short) history (E, H, ...), newest first: no gather, latencies may differ by
+    environment. A latency beyond the history reads its oldest value.
     """
     weights = latency_weights(history.shape[1], latency, history)
     weights = weights.reshape(*weights.shape, *(1,) * (history.dim() - 2))

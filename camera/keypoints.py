@@ -191,13 +191,9 @@ def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[tor
 
 
 def keypoints(
-    camera: KeypointCamera,
-    pos_w: torch.Tensor,
-    rot_wb: torch.Tensor,
-    goal_w: torch.Tensor,
-    payload_w: torch.Tensor,
+    camera: KeypointCamera, pos_w: torch.Tensor, rot_wb: torch.Tensor, goal_w: torch.Tensor, payload_w: torch.Tensor,
     extrinsics: tuple[torch.Tensor, torch.Tensor] | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     """Keypoints of goal and payload as the camera sees them, without noise.
 
     Args:

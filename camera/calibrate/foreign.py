@@ -90,14 +90,9 @@ def fit_fisheye(
 
 
 def fit_rays(
-    model: str,
-    unproject: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    centre_px: tuple[float, float],
-    focal_px: tuple[float, float],
-    width: int,
-    height: int,
-    fov_deg: float | None = None,
-) -> tuple[FisheyeParams, FitReport]:
+    model: str, unproject: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], centre_px: tuple[float, float],
+    focal_px: tuple[float, float], width: int, height: int, fov_deg: float | None = None,
+) -> tuple[FisheyeParams, FitReport]:  # fmt: skip
     """Fit our model to any lens that turns pixels into rays; see :func:`fit_fisheye`.
 
     Raises ValueError: no grid point lies in the field of view, or the fit describes no camera.
