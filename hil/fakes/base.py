@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from hil.fakes.mocap import SLACK, Mocap, MocapFault, MocapParams
+from hil.fakes.mocap import SLACK, Mocap, MocapParams
 from hil.links.backends.thrust import ThrustParams
 from hil.links.device import Port, chunks
 from hil.links.mavlink_link import Link
@@ -71,8 +71,6 @@ class Options(Bounded):
     silent_after: float = float("inf")  # it says nothing any more from this time on [s]
     taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
-    mocap_fault: str = "none"  # of hil.fakes.mocap
-    fault_time: float = float("inf")  # from which it happens [s]
     prompt: bool | None = None  # a heartbeat follows a change of mode at once, or only when it is due; None: as of the kind
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
 
@@ -160,7 +158,7 @@ class Fake(ABC):
 
     Attributes:
         last_thrust: of the last period [N]. wall: the time now, within a period as well [s]. events: times and what happened.
-        port: that commands come by. witness: of what came.
+        port: that commands come by. witness: of what came. spoil: what becomes of measured poses at a time [s], as the source writes them.
         followed, ignored: set-points. release_time: when the mechanism's output moved.
     """
 
@@ -178,7 +176,7 @@ class Fake(ABC):
         self.plant, self.link, self.options = plant, link, options or Options()
         self.port: Any = port or link.port
         self.mocap = Mocap(mocap or MocapParams(), seed)
-        self.mocap_fault = MocapFault(self.options.mocap_fault, self.options.fault_time, seed)
+        self.spoil: Callable[[list[Pose], float], list[Pose]] = lambda poses, time: poses
         self.witness = Witness((plant.max_thrust, *MAX_RATES))
         # Out there the world is x north, y east, z down, the body forward, right, down, quaternions w first.
         ned = Frames(FrameParams("x,-y,-z", "x,-y,-z", "wxyz", 0.0, (0.0, 0.0, 0.0)))
@@ -335,7 +333,7 @@ class Fake(ABC):
         """Measure and send what is due now."""
         if self.mocap.due(self.plant.time):
             written = [self._to_source(pose) for pose in self.mocap.measure(self.plant.time, self.plant.state)]
-            for pose in self.mocap_fault.spoil(written, self.plant.time):
+            for pose in self.spoil(written, self.plant.time):
                 self._post(pose)
         if self.plant.time - self._announced >= ANNOUNCED:
             self._announced = self.plant.time

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from tests.bench.figures import json_lines
 from tests.bench.processes import CONFIGS, ENDED, Pair, own_cores, side_by_side
 from tests.bench.report import Report, Table
 from tests.bench.soak import STILL, never_releasing
+from tests.mocap_faults import FAULTS
 from visthrow.common.errors import VisthrowError, suggest
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.hover import GRAVITY
@@ -69,7 +69,7 @@ class Case:
 
     Attributes:
         text: what happens. group: of the table. policy: of `POLICIES`.
-        run: settings of the run. fake: arguments of the fake.
+        run: settings of the run. fake: arguments of the fake. spoiled: name and time of a fault of its motion capture.
         act: done to the run's process in mid throw. since: what times count from: `START` on the
         vehicle's clock ("fault"), the deed ("act"), or the run's latch or first tick in a state.
         refused: whether the run does not even start. ends: whether it is a way for the run to end, and so flown with any kind.
@@ -80,6 +80,7 @@ class Case:
     policy: str = "never"
     run: tuple[str, ...] = ()
     fake: tuple[str, ...] = ()
+    spoiled: tuple[str, ...] = ()
     act: Act | None = None
     since: str = "fault"
     refused: bool = False
@@ -111,8 +112,7 @@ def _option(*settings: str) -> tuple[str, ...]:
 def _mocap(name: str, text: str) -> Case:
     odometry = name == "reset"
     more = _option("pose_message=ODOMETRY") if odometry else ()
-    fake = (*_option(f"mocap_fault={name}", f"fault_time={START}"), *more)
-    return Case(text, MOCAP, run=(ODOMETRY,) if odometry else (), fake=fake)
+    return Case(text, MOCAP, run=(ODOMETRY,) if odometry else (), fake=more, spoiled=(name, str(START)))
 
 
 HERE = ("goal_w=[0.0, 0.0, 0.0]",)
@@ -170,8 +170,7 @@ CASES = {
 
 def known_cases() -> dict[str, Case]:
     """Return the faults by name."""
-    mocap = import_module("hil.fakes.mocap").FAULTS  # the onboard side is not imported by name: it must not need this one
-    return {**{name: _mocap(name, text) for name, (text, _) in mocap.items()}, **CASES}
+    return {**{name: _mocap(name, text) for name, (text, _) in FAULTS.items()}, **CASES}
 
 
 def policies(folder: Path) -> dict[str, Path]:
@@ -290,7 +289,7 @@ def _one(
         run += ["--seconds", str(ENOUGH)]
     deed = None if case.act is None else Deed(case.act, folder, speed)
     try:
-        summary, report = Pair(tuple(run), fake, *cores, kind=kind).fly(folder, deed, alone=True)
+        summary, report = Pair(tuple(run), fake, *cores, kind=kind, spoiled=case.spoiled).fly(folder, deed, alone=True)
     except VisthrowError as error:
         if not case.refused:
             raise

@@ -79,6 +79,7 @@ class Pair:
         core, fake_core: that each is kept on; None leaves it to the system.
         orderly: Ctrl-C ends both in order, and what there is by then is returned.
         kind: of autopilot; Betaflight's fake is there first, since it listens.
+        spoiled: name and time of a fault of the fake's motion capture; see `tests.mocap_faults`.
     """
 
     run: tuple[str, ...]
@@ -87,6 +88,7 @@ class Pair:
     fake_core: int | None = None
     orderly: bool = False
     kind: str = "ardupilot"
+    spoiled: tuple[str, ...] = ()
 
     def fly(
         self, folder: Path, watch: Callable[[int], None] | None = None, alone: bool = False
@@ -108,7 +110,8 @@ class Pair:
         folder.parent.mkdir(parents=True, exist_ok=True)
         run = [*COMMAND, "run", "--config", CONFIGS[self.kind], "--set", f'link.device="udp:127.0.0.1:{port}"', "--auto-arm", "--bare"]
         run += ["--set", f'betaflight.device="tcp:127.0.0.1:{msp}"', "--out", str(folder), *self.run]
-        fake = [*COMMAND, "fake", "--kind", self.kind, "--device", f"udpout:127.0.0.1:{port}", "--msp-port", str(msp)]
+        command = [sys.executable, "-m", "tests.mocap_faults", *self.spoiled, "hil"] if self.spoiled else COMMAND
+        fake = [*command, "fake", "--kind", self.kind, "--device", f"udpout:127.0.0.1:{port}", "--msp-port", str(msp)]
         fake += ["--out", str(report), *self.fake]
         with contextlib.ExitStack() as both:
             if self.kind == "betaflight":

@@ -8,12 +8,11 @@ import math
 import pytest
 
 from hil.control.states import OperatorInput
-from hil.errors import RunError
-from hil.fakes.mocap import FAULTS, MocapFault
 from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
+from tests.mocap_faults import FAULTS, MocapFault
 from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
@@ -51,7 +50,7 @@ def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
     more = ODOMETRY if name == "reset" else ()
     plant, told = LevelPlant(), []
     runner, source, clock, fake = peers(
-        plant, overrides=(*QUICK, *more), loaded=loaded, mocap_fault=name, fault_time=START,
+        plant, overrides=(*QUICK, *more), loaded=loaded, mocap_fault=(name, START),
         pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
     )  # fmt: skip
     cut(runner, source, clock, OneWord(), None, START + seconds, told.append)
@@ -101,7 +100,7 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
     at_once = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
     plant = LevelPlant()
     runner, source, clock, fake = peers(
-        plant, overrides=(*QUICK, "states.check=1.0"), loaded=at_once, mocap_fault=name, fault_time=0.0
+        plant, overrides=(*QUICK, "states.check=1.0"), loaded=at_once, mocap_fault=(name, 0.0)
     )
     cut(runner, source, clock, OneWord(), None, 3.0, lambda decision: None)
     assert fake.witness.breaches == []
@@ -128,5 +127,5 @@ def test_faults_themselves():
     assert len(made("double")) == 90
     arrivals = [p.arrival for p in made("shuffle")]
     assert arrivals != sorted(arrivals)
-    with pytest.raises(RunError, match="did you mean 'swap'"):
+    with pytest.raises(ValueError, match="did you mean 'swap'"):
         MocapFault("swop", 0.0)

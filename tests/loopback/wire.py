@@ -1,5 +1,6 @@
 """Runner and fake autopilot in one process, in lock step: no waiting, the same bits on every machine."""
 
+import math
 from collections import deque
 
 from hil.control.loop import AutoOperator, Loop
@@ -13,6 +14,7 @@ from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.opening import parties
+from tests.mocap_faults import MocapFault
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 
@@ -88,7 +90,7 @@ CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betafligh
 
 def peers(
     plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None, kind="ardupilot", tell=None,
-    write=False, key=None, **options,
+    write=False, key=None, mocap_fault=("none", math.inf), **options,
 ):
     """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
     from hil.params import HilParams
@@ -100,6 +102,7 @@ def peers(
     mine.whole = its.whole = False
     more = Options(answer=answer, **options)
     fake = make_fake(kind, plant, Link(there, *VEHICLE_ID, key=key), mocap or MocapParams(), seed, more, its)
+    fake.spoil = MocapFault(*mocap_fault, seed).spoil
     roster = Roster(parties(params, True, True))
     clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component, roster=roster, key=key)
     if params.delay.synchronise:
