@@ -7,13 +7,6 @@ reset, so that a history never mixes two episodes and never holds zeros that wer
 import torch
 
 
-def filled(new: torch.Tensor, length: int) -> torch.Tensor:
-    """History of ``length`` copies of new (E, ...): shape (E, H, ...). Raises ValueError: length is below 1."""
-    if length < 1:
-        raise ValueError(f"history length is {length}; expected at least 1 (the newest value itself)")
-    return new.unsqueeze(1).repeat_interleave(length, 1)
-
-
 def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
     """Return the history, shape (E, H, ...), newest first, with a value (E, ...) put in front and the oldest dropped.
 

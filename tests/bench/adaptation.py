@@ -77,7 +77,7 @@ def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
     notes = (
         f"Mean landing error of {THROWS} throws from hover at {TARGET} m with all noise, 95 % intervals; seconds of rollouts and learning.",
     )
-    return records.Report("train", f"Adaptation on {device.device_name(where)}", (table,), notes, {"effects": figures})
+    return records.Report("train", f"Adaptation on {records.device_name(where)}", (table,), notes, {"effects": figures})
 
 
 def run(args: argparse.Namespace) -> int:

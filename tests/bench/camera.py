@@ -14,12 +14,11 @@ import torch
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import points_c_from_w
 from tests.bench import start
-from tests.bench.report import Report, Table, finish, rate
+from tests.bench.report import Report, Table, device_name, finish, rate
 from tests.bench.sim import on_one_core
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.training.device import device_name
 
 STRETCH = 0.2  # [s], wall time of one measurement, about
 SAFE_ANGLE = math.radians(85.0)

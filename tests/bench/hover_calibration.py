@@ -10,7 +10,7 @@ import argparse
 import numpy as np
 import torch
 
-from camera.keypoints import KeypointCamera
+from camera.keypoints import KeypointCamera, keypoints
 from sim.reference.extras import ReferenceExtras
 from visthrow import config
 from visthrow.common.workers import Workers
@@ -61,7 +61,7 @@ def on_reference(flown: Experiment, name: str, count: int, seed: int) -> tuple[l
         if since >= -1e-9:
             command[:, 1:3] += sway(since)
         pos, quat, payload = (torch.from_numpy(part).float() for part in (now.pos_w, now.quat_wb, now.payload_pos_w))
-        points, valid = ob.vision_part(camera, pos, ob.rotation_from_quat(quat), goal, payload, mounts)
+        points, valid = keypoints(camera, pos, ob.rotation_from_quat(quat), goal, payload, mounts)
         points = points.numpy() * (1.0 + scale[:, None, None]) + PIXEL * rng.standard_normal((count, 8, 2))
         if since >= -STILL - 1e-9:
             poses = seen.pos_w, seen.quat_wb, seen.vel_w, seen.rate_b

@@ -16,6 +16,15 @@ FURTHER_PACKAGES = ("mujoco-warp",)
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
 
 
+def device_name(device: str) -> str:
+    """Return the model of the processor that a device is."""
+    if not device.startswith("cuda"):
+        return "CPU"
+    import torch
+
+    return torch.cuda.get_device_name(device)
+
+
 @dataclass(frozen=True)
 class Table:
     """A table as it is printed: every cell is text."""

@@ -8,9 +8,8 @@ import warp as wp
 
 from sim.hybrid import HybridSim, tether_lengths
 from tests.bench import commands
-from tests.bench.report import Report, Table, rate
+from tests.bench.report import Report, Table, device_name, rate
 from visthrow.task import Experiment, plant_of
-from visthrow.training.device import device_name
 
 BATCHES = tuple(2**k for k in range(12, 20))  # 4,096 to 524,288
 GRAPH_STEPS = 20  # control steps in the graph

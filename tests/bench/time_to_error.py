@@ -7,8 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tests.bench.report import Report, Table, rate
-from visthrow.training.device import device_name
+from tests.bench.report import Report, Table, device_name, rate
 
 TARGET = 2.0  # [m]
 

@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from tests.bench import start
-from tests.bench.report import Report, Table, add_arguments_of_measurements, finish, rate
+from tests.bench.report import Report, Table, add_arguments_of_measurements, device_name, finish, rate
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.training.device import device_name, rounded_products
+from visthrow.training.device import rounded_products
 
 WARM_UP = 3  # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
 

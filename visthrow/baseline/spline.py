@@ -118,18 +118,6 @@ def _sample_rows(samples: int) -> np.ndarray:
     return _rows((np.arange(samples) + 0.5) / samples)
 
 
-def through(start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> Spline:
-    """Spline from rest at a start [m], shape (D,), through waypoints, shape (3, D), to an end with a velocity [m/s], shape (D,).
-
-    The times are those of the four segments [s], shape (4,); PlanError where one is not positive.
-    """
-    times = np.asarray(times, dtype=float)
-    if times.shape != (SEGMENTS,) or not np.all(times > 0.0):
-        raise PlanError(f"segment times {times}; expected {SEGMENTS} above 0 s")
-    solved = _coefficients(start, np.asarray(waypoints, dtype=float)[None], end, velocity, times[None])[0]
-    return Spline(times, solved / (times[:, None] ** np.arange(ORDER))[:, :, None])
-
-
 def _coefficients(start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Coefficients in units of each segment's time, which keeps the matrix well conditioned; B paths at once.
 

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from camera.history import push
-from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
+from camera.keypoints import KEYPOINTS
 
 VEHICLE = 15
 """Width of the vehicle's own part."""
@@ -141,17 +141,6 @@ def vehicle_part(pos_w: Tensor, vel_w: Tensor, rate_b: Tensor, rot_wb: Tensor) -
 def state_part(pos_w: Tensor, goal_w: Tensor, payload_w: Tensor) -> Tensor:
     """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape (E, 5)."""
     return torch.cat([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w], dim=-1)
-
-
-def vision_part(
-    camera: KeypointCamera, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor,
-    extrinsics: tuple[Tensor, Tensor] | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Goal and payload of a vision frame.
-
-    Returns keypoints, shape (E, 8, 2), normalised image coordinates, goal corners first; validity, shape (E, 8).
-    """
-    return keypoints(camera, pos_w, rot_wb, goal_w, payload_w, extrinsics)
 
 
 def answer(frame: Tensor, previous_action: Tensor) -> Tensor:

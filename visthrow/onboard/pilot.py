@@ -16,6 +16,7 @@ from torch import Tensor
 
 from camera.history import push
 from camera.keypoints import KeypointCamera
+from camera.keypoints import keypoints as seen_keypoints
 from camera.params import CameraParams
 from visthrow import config
 from visthrow.common.constants import GRAVITY
@@ -231,7 +232,7 @@ class Pilot:
         rot, fitted = ob.rotation_from_quat(quat), 2 if self.layout.fits else 0
         seen = further[fitted:]
         if not seen and self.camera is not None:
-            seen = ob.vision_part(self.camera, pos, rot, goal, payload)
+            seen = seen_keypoints(self.camera, pos, rot, goal, payload)
         points, valid = (seen[0], seen[1]) if seen else (None, None)
         part = ob.state_part(pos, goal, payload)
         if points is not None and self.layout.name == "vision":
@@ -266,5 +267,5 @@ class Pilot:
         still, goal_w = np.zeros((self.count, 3)), np.asarray(goal_w).reshape(-1, 3)
         views = self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1)))
         pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
-        points, valid = ob.vision_part(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
+        points, valid = seen_keypoints(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()

@@ -22,15 +22,6 @@ def resolve(name: str = "auto") -> str:
     return wanted
 
 
-def device_name(device: str) -> str:
-    """Return the model of the processor that a device is."""
-    if not device.startswith("cuda"):
-        return "CPU"
-    import torch
-
-    return torch.cuda.get_device_name(device)
-
-
 @contextmanager
 def rounded_products(allowed: bool) -> Iterator[None]:
     """Whether float32 products on a GPU may have TF32's ten bits while this lasts, which networks bear and rays of keypoints do not.

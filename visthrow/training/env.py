@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from camera import history as hist
-from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints
+from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints, keypoints
 from camera.noise import StepDraw, apply_latency, apply_noise
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY
@@ -378,7 +378,7 @@ class ThrowEnv(VecEnv):
     def _see(self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints as the detector reports them: errors of mount and focal length, latency, noise, drop-out, held images."""
         memory, camera = self._memory, self.cfg.camera
-        points, valid = ob.vision_part(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
+        points, valid = keypoints(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
         if camera.noise.seen_radius < 1.0:
             valid = valid & (points.square().sum(-1) <= camera.noise.seen_radius**2)
         if camera.noise.scale_std > 0.0:

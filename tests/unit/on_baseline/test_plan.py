@@ -62,11 +62,17 @@ def test_impossible_releases_are_refused(height, speed):
         release_for(2.0, height, speed, 0.04)
 
 
+def through(start, waypoints, end, velocity, times):
+    """Spline from rest at a start [m], shape (3,), through waypoints, shape (3, 3), in segments of these times [s], shape (4,)."""
+    solved = sp._coefficients(start, waypoints[None], end, velocity, times[None])[0]
+    return sp.Spline(times, solved / (times[:, None] ** np.arange(sp.ORDER))[:, :, None])
+
+
 def test_spline_meets_ends_waypoints_and_itself():
     rng = np.random.default_rng(0)
     start, end, velocity = rng.standard_normal((3, 3))
     points, times = rng.standard_normal((3, 3)), np.array([0.2, 0.35, 0.3, 0.25])
-    path = sp.through(start, points, end, velocity, times)
+    path = through(start, points, end, velocity, times)
     knots = np.cumsum(times)
     assert np.allclose(path.sample(knots[:3], 2)[:, 0], points)
     begin, finish = path.sample(np.array([0.0]))[0], path.sample(knots[-1:])[0]
@@ -80,7 +86,7 @@ def test_spline_meets_ends_waypoints_and_itself():
 
 
 def test_derivatives_of_the_spline_are_its_slopes():
-    path = sp.through(np.zeros(3), np.arange(9.0).reshape(3, 3), np.ones(3), np.ones(3), np.full(4, 0.3))
+    path = through(np.zeros(3), np.arange(9.0).reshape(3, 3), np.ones(3), np.ones(3), np.full(4, 0.3))
     time, h = np.array([0.1, 0.5, 0.95]), 1e-6
     slopes = (path.sample(time + h) - path.sample(time - h)) / (2 * h)
     assert np.allclose(slopes[:, :5], path.sample(time)[:, 1:], rtol=1e-4, atol=1e-3)
@@ -140,8 +146,6 @@ def test_bad_plans_are_refused():
         sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([0.0, 0.0, 1.0]), PlanParams())
     with pytest.raises(PlanError, match="beside the plane"):
         sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([1.0, 0.0, 0.0]), PlanParams())
-    with pytest.raises(PlanError, match="above 0 s"):
-        sp.through(np.zeros(3), np.zeros((3, 3)), np.ones(3), np.ones(3), np.array([0.1, 0.1, 0.0, 0.1]))
     falling = np.zeros((1, 6, 3))
     falling[0, 2, 2] = -9.81
     with pytest.raises(PlanError, match="falls freely"):

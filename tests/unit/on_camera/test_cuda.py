@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from camera.history import filled, push
+from camera.history import push
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.noise import StepDraw, apply_noise
@@ -24,7 +24,7 @@ def test_graph_replay_equals_eager():
     draw = StepDraw(normal(8, 2), torch.rand(ENVIRONMENTS, 8, device="cuda"))
     reset = torch.rand(ENVIRONMENTS, device="cuda") < 0.1
     bias = torch.zeros(ENVIRONMENTS, 8, 2, device="cuda")
-    history = filled(torch.zeros(ENVIRONMENTS, 8, 2, device="cuda"), 4)
+    history = torch.zeros(ENVIRONMENTS, 4, 8, 2, device="cuda")
 
     def step():
         points, valid = keypoints(camera, *pose, extrinsics)

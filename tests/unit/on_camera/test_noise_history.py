@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from camera.history import at_latency, filled, push
+from camera.history import at_latency, push
 from camera.noise import StepDraw, apply_latency, apply_noise
 from camera.params import KeypointNoiseParams
 
@@ -19,9 +19,6 @@ def test_push_shifts_and_fills_on_reset():
     new = torch.tensor([[7.0], [8.0]])
     pushed = push(history, new, torch.tensor([False, True]))
     assert pushed[..., 0].tolist() == [[7.0, 1.0, 2.0], [8.0, 8.0, 8.0]]
-    assert filled(new, 3)[..., 0].tolist() == [[7.0, 7.0, 7.0], [8.0, 8.0, 8.0]]
-    with pytest.raises(ValueError, match="at least 1"):
-        filled(new, 0)
 
 
 def test_push_of_one_entry_and_of_bits():

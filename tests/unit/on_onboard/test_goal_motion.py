@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.keypoints import KeypointCamera
+from camera.keypoints import KeypointCamera, keypoints
 from visthrow import config
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
@@ -70,7 +70,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
     rot, valid = ob.rotation_from_quat(quat), None
     seen = ob.state_part(pos, goal, payload)
     if kind == "vision":
-        points, valid = ob.vision_part(camera, pos, rot, goal, payload)
+        points, valid = keypoints(camera, pos, rot, goal, payload)
         seen = points.flatten(1)
     frame = torch.cat([ob.vehicle_part(pos, zero, zero, rot), seen], dim=-1)
     place, weight = goal_motion.measured_goal(layout, frame, valid, camera)
@@ -81,7 +81,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
         above = torch.cat([frame[:1, :6] * 0, frame[:1, 6:9] * 0, torch.tensor([[1.0, 0, 0, 0, 1, 0]])], dim=1)
         above[0, 2] = 2.0
         over = torch.tensor([[0.03, 0.0, 0.0]])
-        points, valid = ob.vision_part(camera, above[:, :3], torch.eye(3)[None], over, torch.tensor([[0.0, 0.0, 1.5]]))
+        points, valid = keypoints(camera, above[:, :3], torch.eye(3)[None], over, torch.tensor([[0.0, 0.0, 1.5]]))
         _, weight = goal_motion.measured_goal(layout, torch.cat([above, points.flatten(1)], dim=1), valid, camera)
         assert weight.item() == pytest.approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
 

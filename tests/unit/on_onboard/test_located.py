@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from camera.keypoints import KeypointCamera
+from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from visthrow import config
 from visthrow.onboard import goal_motion
@@ -25,7 +25,7 @@ def scene():
     rot = rotation_from_vector(0.2 * torch.randn(8, 3))
     goal = torch.cat([torch.randn(8, 2), torch.zeros(8, 1)], -1)
     load = pos + torch.tensor([0.0, 0.0, -0.38]) + 0.08 * torch.randn(8, 3)
-    points, valid = ob.vision_part(camera, pos, rot, goal, load)
+    points, valid = keypoints(camera, pos, rot, goal, load)
     frame = torch.cat([ob.vehicle_part(pos, torch.zeros(8, 3), torch.zeros(8, 3), rot), points.flatten(1)], -1)
     ray = load - pos - (rot @ camera.position_b)
     return layout, camera, frame, valid, (goal - pos)[:, :2], ray / ray.norm(dim=-1, keepdim=True)
