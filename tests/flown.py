@@ -13,7 +13,7 @@ from tests.plants import paper_plant
 from tests.worlds.pilot import FreeFlight, Throw, Tracker
 from visthrow.config.effects import chosen
 from visthrow.logs.flightlog import Channel, FlightLog
-from visthrow.throws.ballistics import flown
+from visthrow.throws.plants import flown
 
 FINE = 5e-4  # integration step of the flights [s]
 TICK = 0.005  # between samples [s]

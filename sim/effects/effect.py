@@ -1,6 +1,6 @@
 """Effects: what reality may have and the simulator lacks, and what each changes in the description of a simulated flight.
 
-The equation of an effect stands in the block of :mod:`sim` that it extends (or in :mod:`sim.kernels.replay.sensing`); its table in
+The equation of an effect stands in the block of :mod:`sim` that it extends (or in :mod:`sim.kernels.replay.sampling`); its table in
 ``configs/effects`` names the numbers of a :class:`sim.effects.setting.Setting` that it changes, nothing more.
 """
 

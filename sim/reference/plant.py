@@ -315,19 +315,13 @@ class ReferencePlant:
         offset = self._errors.com_offset
         points, ball, ball_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
         return Snapshot(
-            time=self.time,
-            pos_w=state[:, 0:3] - turned(rotation, offset),
-            quat_wb=state[:, 3:7].copy(),
-            vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)),
-            rate_b=state[:, 10:13].copy(),
+            time=self.time, pos_w=state[:, 0:3] - turned(rotation, offset), quat_wb=state[:, 3:7].copy(),
+            vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)), rate_b=state[:, 10:13].copy(),
             payload_pos_w=np.where(self._landed[:, None], self._landing_point, ball),
-            payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel),
-            cable_points_w=points,
-            motor_speed=state[:, BODY + 9 : BODY + 13].copy(),
-            battery_voltage=state[:, BODY + 14].copy(),
-            attached=self._attached.copy(),
-            latched=self._latched.copy(),
-        )
+            payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel), cable_points_w=points,
+            motor_speed=state[:, BODY + 9 : BODY + 13].copy(), battery_voltage=state[:, BODY + 14].copy(),
+            attached=self._attached.copy(), latched=self._latched.copy(),
+        )  # fmt: skip
 
     @property
     def landing(self) -> Landings:
@@ -361,13 +355,9 @@ class ReferencePlant:
             )
         }
         return replace(
-            sample,
-            time=max(time, 0.0),
-            quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
-            attached=self._attached.copy(),
-            latched=self._latched.copy(),
-            **noisy,
-        )
+            sample, time=max(time, 0.0), quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
+            attached=self._attached.copy(), latched=self._latched.copy(), **noisy,
+        )  # fmt: skip
 
 
 def _array(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -15,7 +15,7 @@ from sim.reference.extras import ReferenceExtras
 from sim.reference.plant import ReferencePlant
 from sim.standalone import QuadSim
 from tests.plants import paper_plant, plain_vehicle
-from visthrow.throws.ballistics import flown
+from visthrow.throws.plants import flown
 
 EVERYTHING = frozenset(EXTENSIONS)
 """One build for all: what is built in and stands at zero changes nothing."""

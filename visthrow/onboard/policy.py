@@ -214,16 +214,10 @@ class Policy:
             if header["format_version"] == FORMAT_VERSIONS[1]:
                 estimator = Estimator(**{field.name: take(f"estimator_{field.name}") for field in fields(Estimator)})
             return Policy(
-                tuple(take(f"layer{i}_weight") for i in range(count)),
-                tuple(take(f"layer{i}_bias") for i in range(count)),
-                header["activation"],
-                header["contract"],
-                header["made_by"],
-                take("normalizer_mean") if normalized else None,
-                take("normalizer_std") if normalized else None,
-                float(take("normalizer_eps")) if normalized else 0.0,
-                estimator,
-            )
+                tuple(take(f"layer{i}_weight") for i in range(count)), tuple(take(f"layer{i}_bias") for i in range(count)),
+                header["activation"], header["contract"], header["made_by"], take("normalizer_mean") if normalized else None,
+                take("normalizer_std") if normalized else None, float(take("normalizer_eps")) if normalized else 0.0, estimator,
+            )  # fmt: skip
         except PolicyError as error:
             raise PolicyError(f"{path}: {error}") if str(path) not in str(error) else error from None
 
@@ -251,15 +245,11 @@ class Policy:
 
         normalized = "obs_normalizer._mean" in state
         return Policy(
-            tuple(take(f"mlp.{i}.weight") for i in index),
-            tuple(take(f"mlp.{i}.bias") for i in index),
-            activation.lower(),
-            json.loads(json.dumps(contract)),
-            json.loads(json.dumps(made_by or {})),
+            tuple(take(f"mlp.{i}.weight") for i in index), tuple(take(f"mlp.{i}.bias") for i in index), activation.lower(),
+            json.loads(json.dumps(contract)), json.loads(json.dumps(made_by or {})),
             take("obs_normalizer._mean").reshape(-1) if normalized else None,
-            take("obs_normalizer._std").reshape(-1) if normalized else None,
-            eps if normalized else 0.0,
-        )
+            take("obs_normalizer._std").reshape(-1) if normalized else None, eps if normalized else 0.0,
+        )  # fmt: skip
 
 
 _ABSENT = object()
