@@ -55,9 +55,15 @@ class Fisheye:
         self._constants: dict[tuple[torch.device, torch.dtype], tuple[torch.Tensor, torch.Tensor]] = {}
 
     def angle(self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Angle off the optical axis of points, shape (..., 3), camera frame, theta in [0, pi] [rad]; distance from axis and from lens.
+        """Angle off the optical axis of points.
 
-        Distances are in the points' unit, each of shape (...); ``epsilon`` is added to x^2 + y^2.
+        Args:
+            points_c: Points [any unit], shape (..., 3), camera frame.
+            epsilon: Added to x^2 + y^2 [unit of the points, squared].
+
+        Returns:
+            theta in [0, pi] [rad], distance from the axis and distance from the lens [unit of the points], each shape
+            (...).
         """
         x, y, z = points_c.unbind(-1)
         radius2 = x * x + y * y + epsilon
@@ -89,10 +95,15 @@ class Fisheye:
         return t2 * (t2 * (t2 * (t2 * (9 * k4) + 7 * k3) + 5 * k2) + 3 * k1) + 1.0
 
     def project_normalized(self, points_c: torch.Tensor, clip: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
-        """Project points, shape (..., 3), camera frame, to normalised image coordinates [-], shape (..., 2), and validity.
+        """Project points to normalised image coordinates.
 
-        Valid is what lies inside the field of view and on the sensor. ``clip``: pull points outside the field of view to its edge
-        (radius 1), along their own direction in the image.
+        Args:
+            points_c: Points [any unit], shape (..., 3), camera frame.
+            clip: Pull points outside the field of view to its edge (radius 1), along their own direction in the image.
+
+        Returns:
+            Normalised coordinates [-], shape (..., 2), and validity (bool), shape (...): inside the field of view and
+            on the sensor.
         """
         theta, radius, _ = self.angle(points_c)
         valid = theta <= self.half_fov
@@ -103,9 +114,14 @@ class Fisheye:
         return normalized, valid
 
     def project(self, points_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Project points, shape (..., 3), camera frame, to pixels [px], shape (..., 2), finite everywhere; valid: theta <= fov / 2.
+        """Project points to pixels.
 
-        Whether a valid point also falls on the sensor is `on_sensor`'s to say.
+        Args:
+            points_c: Points [any unit], shape (..., 3), camera frame.
+
+        Returns:
+            Pixels [px], shape (..., 2), finite everywhere, and validity (bool), shape (...): theta <= fov / 2. Whether
+            a valid point also falls on the sensor is `on_sensor`'s to say.
         """
         theta, radius, _ = self.angle(points_c)
         focal, centre = self._pixel_constants(points_c)
@@ -113,9 +129,14 @@ class Fisheye:
         return points_c[..., :2] * scale * focal + centre, theta <= self.half_fov
 
     def unproject(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Turn pixels [px], shape (..., 2), into unit rays, shape (..., 3), camera frame, and validity: inside the field of view.
+        """Turn pixels into unit rays.
 
-        Pixels beyond it give the ray at the edge.
+        Args:
+            pixels: Pixels [px], shape (..., 2).
+
+        Returns:
+            Unit rays [-], shape (..., 3), camera frame, and validity (bool), shape (...): inside the field of view.
+            Pixels beyond it give the ray at the edge.
         """
         focal, centre = self._pixel_constants(pixels)
         plane = (pixels - centre) / focal

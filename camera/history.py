@@ -8,9 +8,15 @@ import torch
 
 
 def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
-    """Return the history, shape (E, H, ...), newest first, with a value (E, ...) put in front and the oldest dropped.
+    """Return the history with a value put in front and the oldest dropped.
 
-    ``reset_mask``: environments whose history is filled with the new value, bool, shape (E,).
+    Args:
+        history: Shape (E, H, ...), newest first.
+        new: The newest value, shape (E, ...).
+        reset_mask: Environments whose history is filled with the new value, bool, shape (E,).
+
+    Returns:
+        A new tensor, shape (E, H, ...).
     """
     front = new.unsqueeze(1)
     mask = reset_mask.reshape(-1, *(1,) * (history.dim() - 1))
@@ -18,10 +24,17 @@ def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> 
 
 
 def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
-    """Value, shape (E, ...), that is ``latency`` steps old, (E,) or scalar, linear between the two stored neighbours.
+    """Value that is ``latency`` steps old, linear between the two stored neighbours.
 
-    Written as hat-function weights over the whole (short) history (E, H, ...), newest first: no gather, latencies may differ by
-    environment. A latency beyond the history reads its oldest value.
+    Written as hat-function weights over the whole (short) history: no gather, latencies may differ by environment.
+    A latency beyond the history reads its oldest value.
+
+    Args:
+        history: Floating point, shape (E, H, ...), newest first.
+        latency: Age [steps], shape (E,) or scalar tensor.
+
+    Returns:
+        Shape (E, ...).
     """
     weights = latency_weights(history.shape[1], latency, history)
     weights = weights.reshape(*weights.shape, *(1,) * (history.dim() - 2))

@@ -49,9 +49,14 @@ class KeypointCamera:
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
     def extrinsics(self, rotation_error: torch.Tensor, position_error: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Extrinsics with errors, rotation vectors [rad] and offsets [m], shapes (E, 3), body frame: rot_cb and position_b [m].
+        """Extrinsics with an error per environment: ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
 
-        ``rot_bc = exp(rotation_error) rot_bc_nominal``; what comes back is the ``extrinsics`` of `keypoints`.
+        Args:
+            rotation_error: Rotation vectors [rad], shape (E, 3), body frame.
+            position_error: Offsets [m], shape (E, 3), body frame.
+
+        Returns:
+            rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3): the ``extrinsics`` of `keypoints`.
         """
         turn = rotation_from_vector(rotation_error)  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
         return rotate(turn, self.rot_cb.expand(turn.shape)), self.position_b + position_error
@@ -69,9 +74,15 @@ def goal_square(side: float) -> torch.Tensor:
 
 
 def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Tensor | None = None) -> torch.Tensor:
-    """Corners [m], shape (E, 4, 3), world frame, of the ground square around the goal, on z = 0 whatever the goal's height.
+    """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
 
-    They have the order of `goal_square`, whose result on the goal's device ``square_w`` may be, to save making it.
+    Args:
+        goal_w: Goal [m], shape (E, 2) or (E, 3), world frame.
+        side: Side of the square [m].
+        square_w: `goal_square` of that side on the goal's device, to save making it.
+
+    Returns:
+        Corners [m], shape (E, 4, 3), world frame, in the order of `goal_square`.
     """
     if square_w is None:
         square_w = goal_square(side).to(goal_w)
@@ -81,15 +92,24 @@ def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Ten
 def ball_extremes_c(
     fisheye: Fisheye, ball_c: torch.Tensor, radius: float | torch.Tensor, identity: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Unit rays to the left, top, right and bottom of the outline of a ball [m], (E, 3), in the image: (E, 4, 3), camera frame.
+    """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the image.
 
-    The outline of a ball of radius r at distance d is the cone of half-angle ``a = asin(r / d)`` about its centre's ray c, exactly and
-    in every direction, past 90 deg too. The image coordinate u grows fastest along its gradient on the sphere, so the extremes of u
-    are the rays ``cos(a) c -+ sin(a) grad u / |grad u|``, and likewise for v. With ``rho = theta_d``, ``s = sin(theta)``, ``g = rho /
-    s``, ``q = (rho' cos(theta) - g) / s^2``: ``grad u = (g + q c_x^2, q c_x c_y, -rho' c_x)``. The gradient is taken at the centre:
-    the ray's place on the outline is right to first order in a, the extreme value itself, being stationary, to second. At a rope's
-    length (0.38 m) the box is off by at most 2.2e-4 in normalised coordinates. ``identity``: eye(2) on the ball's device, to save
-    making it.
+    The outline of a ball of radius r at distance d is the cone of half-angle ``a = asin(r / d)`` about its centre's ray
+    c, exactly and in every direction, past 90 deg too. The image coordinate u grows fastest along its gradient on the
+    sphere, so the extremes of u are the rays ``cos(a) c -+ sin(a) grad u / |grad u|``, and likewise for v. With
+    ``rho = theta_d``, ``s = sin(theta)``, ``g = rho / s``, ``q = (rho' cos(theta) - g) / s^2``:
+    ``grad u = (g + q c_x^2, q c_x c_y, -rho' c_x)``. The gradient is taken at the centre: the ray's place on the
+    outline is right to first order in a, the extreme value itself, being stationary, to second. At a rope's length
+    (0.38 m) the box is off by at most 2.2e-4 in normalised coordinates.
+
+    Args:
+        fisheye: The lens.
+        ball_c: Centre of the ball [m], shape (E, 3), camera frame.
+        radius: Radius of the ball [m], one or shape (E,).
+        identity: eye(2) on the ball's device, to save making it.
+
+    Returns:
+        Unit rays, shape (E, 4, 3), camera frame: left, top, right, bottom.
     """
     if identity is None:
         identity = torch.eye(2, device=ball_c.device, dtype=ball_c.dtype)
@@ -114,11 +134,17 @@ def ball_extremes_c(
 
 
 def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
-    """Edge midpoints of the axis-aligned box through four extreme points, left, top, right, bottom, both of shape (E, 4, 2).
+    """Edge midpoints of the axis-aligned box through four extreme points.
 
-    A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a real detector can take the
-    projection's place; unlike its corners they lie on or next to the ball's outline, so that the field of view decides about each of
-    them.
+    A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a real detector can
+    take the projection's place; unlike its corners they lie on or next to the ball's outline, so that the field of view
+    decides about each of them.
+
+    Args:
+        extremes: Image points left, top, right, bottom, shape (E, 4, 2).
+
+    Returns:
+        Midpoints of the left, top, right and bottom edge, shape (E, 4, 2).
     """
     left, top, right, bottom = extremes[:, 0, 0], extremes[:, 1, 1], extremes[:, 2, 0], extremes[:, 3, 1]
     u, v = (left + right) * 0.5, (top + bottom) * 0.5
@@ -131,9 +157,14 @@ def corrected_keypoints(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of a camera that is turned and whose focal length is another one, as the nominal camera would see them.
 
-    Normalised points have shape (E, K, 2), validity (E, K); cameras are turned on the body by rotation vectors [rad], (E, 3), body
-    frame, and ``scale`` is the relative error of their focal lengths, (E,). What falls outside of the nominal field of view is invalid
-    and reads zero.
+    Args:
+        camera: Nominal.
+        points: Normalised [-], shape (E, K, 2). valid: shape (E, K), bool.
+        turn_b: Rotation vectors by which the cameras are turned on the body [rad], shape (E, 3), body frame.
+        scale: Relative errors of their focal lengths [-], shape (E,).
+
+    Returns:
+        Points [-], shape (E, K, 2), and validity, shape (E, K); what falls outside of the nominal field of view is invalid and reads zero.
     """
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(points / (1.0 + scale[:, None, None])))
     turn_c = camera.rot_cb @ rotation_from_vector(turn_b) @ camera.rot_cb.T
@@ -143,10 +174,16 @@ def corrected_keypoints(
 
 
 def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Payload keypoints alone, of a ball's centre [m], shape (E, 3), camera frame: what a detector's box around it would give.
+    """Payload keypoints alone: what a detector's box around the ball would give.
 
-    Returns normalised edge midpoints (left, top, right, bottom) [-], shape (E, 4, 2), and validity, shape (E, 4): the outline's point
-    on that side is inside the field of view and on the sensor. Extremes beyond the field of view are clipped to its edge first.
+    Args:
+        camera: The camera.
+        ball_c: Centre of the ball [m], shape (E, 3), camera frame.
+
+    Returns:
+        Normalised edge midpoints (left, top, right, bottom) [-], shape (E, 4, 2), and validity, shape (E, 4): the
+        outline's point on that side is inside the field of view and on the sensor. Extremes beyond the field of view
+        are clipped to its edge first.
     """
     rays = ball_extremes_c(camera.fisheye, ball_c, camera.radius, camera._identity)
     extremes, valid = camera.fisheye.project_normalized(rays, clip=True)
@@ -154,9 +191,13 @@ def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[tor
 
 
 def keypoints(
-    camera: KeypointCamera, pos_w: torch.Tensor, rot_wb: torch.Tensor, goal_w: torch.Tensor, payload_w: torch.Tensor,
+    camera: KeypointCamera,
+    pos_w: torch.Tensor,
+    rot_wb: torch.Tensor,
+    goal_w: torch.Tensor,
+    payload_w: torch.Tensor,
     extrinsics: tuple[torch.Tensor, torch.Tensor] | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of goal and payload as the camera sees them, without noise.
 
     Args:
@@ -184,9 +225,15 @@ def keypoints(
 
 
 def by_rule(camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Apply ``invalid_reads`` to points that are clipped to the edge, shape (E, 8, 2), corners, then the box: as `keypoints` gives them.
+    """Apply ``invalid_reads`` to points that are clipped to the edge.
 
-    ``valid``: whether corner or side is in the field of view, shape (E, 8).
+    Args:
+        camera: The camera.
+        points: Normalised keypoints [-], shape (E, 8, 2): corners, then the box.
+        valid: Whether corner or side is in the field of view, shape (E, 8).
+
+    Returns:
+        Keypoints and validity as `keypoints` gives them.
     """
     if camera.edge_reads:
         return points, valid

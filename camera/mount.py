@@ -15,7 +15,14 @@ DOWNWARD_ROT_CB = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 
 def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
-    """Matrix, shape (..., 3, 3), of a rotation vector [rad], (..., 3) (Rodrigues), finite and differentiable at zero."""
+    """Rotation matrix of a rotation vector (Rodrigues), finite and differentiable at zero.
+
+    Args:
+        vector: Axis times angle [rad], shape (..., 3).
+
+    Returns:
+        Rotation matrices, shape (..., 3, 3).
+    """
     x, y, z = vector.unbind(-1)
     angle = (x * x + y * y + z * z + 1e-20).sqrt()
     a = angle.sin() / angle
@@ -41,7 +48,15 @@ def nominal_rot_cb(mount: MountParams) -> torch.Tensor:
 
 
 def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """``rot @ v`` for each row v of vectors, shape (..., K, 3), by rotations (..., 3, 3); as a matrix product, ``vectors @ rot^T``."""
+    """``rot @ v`` for each row v of vectors; as a matrix product, ``vectors @ rot^T``.
+
+    Args:
+        rot: Rotations, shape (..., 3, 3).
+        vectors: Row vectors, shape (..., K, 3).
+
+    Returns:
+        Rotated row vectors, shape (..., K, 3).
+    """
     rot = rot.unsqueeze(-3)
     x, y, z = vectors[..., 0:1], vectors[..., 1:2], vectors[..., 2:3]
     return x * rot[..., 0] + y * rot[..., 1] + z * rot[..., 2]
@@ -50,10 +65,17 @@ def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 def points_c_from_w(
     points_w: torch.Tensor, pos_w: torch.Tensor, rot_wb: torch.Tensor, rot_cb: torch.Tensor, position_b: torch.Tensor
 ) -> torch.Tensor:
-    """Bring world points [m], shape (E, K, 3), into the camera frame.
+    """Bring world points into the camera frame.
 
-    The vehicle's centre of mass [m] has shape (E, 3), world frame, its attitude, body to world, (E, 3, 3). Extrinsics, body to camera
-    and lens position [m], body frame, are of one camera or of each environment.
+    Args:
+        points_w: Points [m], shape (E, K, 3), world frame.
+        pos_w: Centre of mass of the vehicle [m], shape (E, 3), world frame.
+        rot_wb: Attitude, body to world, shape (E, 3, 3).
+        rot_cb: Extrinsic rotation, body to camera, shape (3, 3) or (E, 3, 3).
+        position_b: Lens position [m], shape (3,) or (E, 3), body frame.
+
+    Returns:
+        Points [m], shape (E, K, 3), camera frame.
     """
     points_b = rotate(rot_wb.transpose(-1, -2), points_w - pos_w.unsqueeze(-2))
     return rotate(rot_cb, points_b - position_b.unsqueeze(-2))

@@ -26,10 +26,18 @@ class StepDraw(NamedTuple):
 def apply_noise(
     params: KeypointNoiseParams, keypoints: torch.Tensor, valid: torch.Tensor, bias: torch.Tensor, draw: StepDraw
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Add noise and bias, drop points out, and set what invalid points read: what the detector reports, and its validity bits.
+    """Add noise and bias, drop points out, and set what invalid points read.
 
-    Keypoints, exact and normalised [-], with ``invalid_reads = "edge"`` clipped to the edge, and the episode's bias have shape (E, K,
-    2), validity (E, K).
+    Args:
+        params: Spreads and the rule for invalid points.
+        keypoints: Exact keypoints [-], shape (E, K, 2), normalised; with ``invalid_reads = "edge"`` clipped to the
+            edge.
+        valid: Shape (E, K), bool.
+        bias: Of this episode [-], shape (E, K, 2).
+        draw: Randomness of this step.
+
+    Returns:
+        What the detector reports [-], shape (E, K, 2), and its validity bits, shape (E, K).
     """
     noisy = keypoints + bias + draw.normals * params.step_std
     kept = draw.uniforms >= params.drop_probability
@@ -44,10 +52,15 @@ def apply_noise(
 
 
 def apply_latency(history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Keypoints as they were ``latency`` policy steps ago, shape (E, K, 2): valid where every entry that was used was.
+    """Keypoints as they were ``latency`` steps ago.
 
-    Histories are newest first (`camera.history.push`), shapes (E, H, K, 2) and (E, H, K); the latency has shape (E,) or is a scalar
-    tensor.
+    Args:
+        history: Keypoints [-], shape (E, H, K, 2), newest first (`camera.history.push`).
+        valid_history: Shape (E, H, K), bool.
+        latency: Age [policy steps], shape (E,) or scalar tensor.
+
+    Returns:
+        Keypoints [-], shape (E, K, 2), and validity, shape (E, K): every entry that the interpolation used was valid.
     """
     used = latency_weights(history.shape[1], latency, history) > 0.0
     valid = (valid_history | ~used.unsqueeze(-1)).all(1)

@@ -15,11 +15,20 @@ SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with: lines li
 
 
 def draw_overlay(camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.Tensor, image: np.ndarray | None = None) -> np.ndarray:
-    """Draw normalised keypoints, shape (8, 2), field of view and body axes on a frame, BGR, uint8, or on black; a new picture.
+    """Draw keypoints, field of view and body axes.
 
-    Goal corners are joined to a green square and the payload's edge midpoints to a red box; where one of a group is invalid only its
-    points are drawn. An invalid point is a grey cross where it reads. Raises ValueError: the image's shape or type is not the
-    camera's.
+    Goal corners are joined to a green square and the payload's edge midpoints to a red box; where one of a group is
+    invalid only its points are drawn. An invalid point is a grey cross where it reads. Raises ValueError: the image's shape or type is not
+    the camera's.
+
+    Args:
+        camera: The camera that made the keypoints.
+        keypoints: Normalised [-], shape (8, 2).
+        valid: Validity, shape (8,).
+        image: Frame to draw on, BGR, uint8, shape (H, W, 3) of the camera's size; black if left out.
+
+    Returns:
+        A new picture, BGR, uint8, shape (H, W, 3).
     """
     lens = camera.fisheye
     shape = (lens.params.height, lens.params.width, 3)

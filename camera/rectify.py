@@ -57,9 +57,15 @@ def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tenso
 
 
 def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tensor:
-    """Cut a rectified (pinhole) view, shape (B, C, view.height, view.width), out of fisheye frames (B, C, H, W) of the lens's size.
+    """Cut a rectified (pinhole) view out of fisheye frames.
 
-    It is black where the fisheye sees nothing. Raises ValueError: frames of another size, or the view is no pinhole.
+    Raises ValueError: the frames do not have the lens's size, or the view is no pinhole.
+
+    Args:
+        frames: Shape (B, C, H, W) of the lens's size.
+
+    Returns:
+        Shape (B, C, view.height, view.width), black where the fisheye sees nothing.
     """
     from kornia.geometry.transform import remap
 

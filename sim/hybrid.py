@@ -96,11 +96,22 @@ class HybridSim:
     """
 
     def __init__(
-        self, params: PlantParams, count: int, device: str = "cpu", seed: int = 0, *, vehicles: list[VehicleParams] | None = None,
-        ropes: list[RopeParams] | None = None, airs: list[AirParams] | None = None, releases: list[ReleaseParams] | None = None,
-        direct: bool = False, motors: bool = False, extensions: frozenset[str] = frozenset(), gravity: float = GRAVITY,
+        self,
+        params: PlantParams,
+        count: int,
+        device: str = "cpu",
+        seed: int = 0,
+        *,
+        vehicles: list[VehicleParams] | None = None,
+        ropes: list[RopeParams] | None = None,
+        airs: list[AirParams] | None = None,
+        releases: list[ReleaseParams] | None = None,
+        direct: bool = False,
+        motors: bool = False,
+        extensions: frozenset[str] = frozenset(),
+        gravity: float = GRAVITY,
         threads: int | None = None,
-    ):  # fmt: skip
+    ):
         """Allocate ``count`` plants.
 
         Raises ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
@@ -172,10 +183,15 @@ class HybridSim:
         self._update_payload()
 
     def place(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray | None = None, vel_w: np.ndarray | None = None,
-        rate_b: np.ndarray | None = None, cable_dir_w: np.ndarray | None = None, cable_vel_w: np.ndarray | None = None,
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray | None = None,
+        vel_w: np.ndarray | None = None,
+        rate_b: np.ndarray | None = None,
+        cable_dir_w: np.ndarray | None = None,
+        cable_vel_w: np.ndarray | None = None,
         battery_used: float = 0.0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Put every plant into a stated pose, actuators at hover, command queue filled with hover.
 
         Raises ValueError: a shape that does not fit.

@@ -67,8 +67,14 @@ class SeamSim:
         self._times, self._commands = [np.full(count, -np.inf)], [np.column_stack([weight, np.zeros((count, 3))])]
 
     def step(self, command: np.ndarray) -> Root:
-        """Give a command, thrust [N] and body rates [rad/s], shape (E, 4), which acts after the vehicle's delay; returns the root's
-        kinematics a control period later."""
+        """Give a command, which acts after the vehicle's delay, and go on for one control period.
+
+        Args:
+            command: Collective thrust [N] and body rates [rad/s], shape (E, 4).
+
+        Returns:
+            The root's kinematics then.
+        """
         count = self.bodies.count
         self._times.append(np.full(count, self.time + self.vehicle.queue.delay))
         self._commands.append(np.broadcast_to(np.asarray(command, dtype=float), (count, 4)).copy())

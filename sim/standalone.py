@@ -157,10 +157,19 @@ class QuadSim:
     """
 
     def __init__(
-        self, vehicle: VehicleParams, count: int, integrator: str = "rk4", step: float = 0.002, control_period: float = 0.02,
-        device: str = "cpu", precision: str = "float32", *, vehicles: list[VehicleParams] | None = None,
-        air: AirParams = AirParams(), gravity: float = GRAVITY,
-    ):  # fmt: skip
+        self,
+        vehicle: VehicleParams,
+        count: int,
+        integrator: str = "rk4",
+        step: float = 0.002,
+        control_period: float = 0.02,
+        device: str = "cpu",
+        precision: str = "float32",
+        *,
+        vehicles: list[VehicleParams] | None = None,
+        air: AirParams = AirParams(),
+        gravity: float = GRAVITY,
+    ):
         """Allocate ``count`` quadrotors at the origin, in hover.
 
         Raises ValueError: no environment, an unknown integrator or precision, a step or period that is not positive, vehicles of other
@@ -216,9 +225,13 @@ class QuadSim:
         wp.launch(self._reset, self.count, [self._vehicles, self.gravity, self.state, self.start, mask], device=self.device)
 
     def place(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray | None = None, vel_w: np.ndarray | None = None,
-        rate_b: np.ndarray | None = None, battery_used: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray | None = None,
+        vel_w: np.ndarray | None = None,
+        rate_b: np.ndarray | None = None,
+        battery_used: float = 0.0,
+    ) -> None:
         """Set ``start`` for every environment and reset all. Raises ValueError: a shape that does not fit.
 
         Args:

@@ -83,10 +83,15 @@ class BoardReport:
 
 
 def find_board(image: np.ndarray, board: BoardParams) -> View | None:
-    """Find a board in a grey or colour picture, uint8, shape (H, W) or (H, W, 3).
+    """Find a board in a picture.
 
-    Returns its points, row by row; of a ChArUco board those that are seen. None where no whole board (of a ChArUco board: fewer than
-    six points) is found.
+    Args:
+        image: Grey or colour picture, uint8, shape (H, W) or (H, W, 3).
+        board: The board.
+
+    Returns:
+        Its points, row by row; of a ChArUco board those that are seen. None where no whole board (of a ChArUco board: fewer
+        than six points) is found.
     """
     import cv2
 
@@ -124,11 +129,18 @@ def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.nd
 
 
 def calibrate_from_boards(images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0) -> tuple[FisheyeParams, BoardReport]:
-    """Calibrate a fisheye, of this full field of view [deg], from pictures of a board; returns it and the residuals.
+    """Calibrate a fisheye from pictures of a board.
 
-    At least three pictures of one camera, uint8, shape (H, W) or (H, W, 3), have the whole board in view. OpenCV's model folds past 90
-    deg off the axis, so every board must lie before the lens; the polynomial found there goes on past 90 deg. Raises ValueError:
-    pictures differ in size, too few show the board, or OpenCV finds no solution.
+    OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the polynomial found there
+    goes on past 90 deg. Raises ValueError: pictures differ in size, too few show the board, or OpenCV finds no solution.
+
+    Args:
+        images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3); at least three with the whole board in view.
+        board: The board.
+        fov_deg: Full field of view of the result [deg].
+
+    Returns:
+        The fisheye and the residuals, for all views and for each.
     """
     import cv2
 
@@ -154,7 +166,12 @@ def calibrate_from_boards(images: list[np.ndarray], board: BoardParams, fov_deg:
 def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
     """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the lens is left as it is.
 
-    Pictures are uint8, shape (H, W) or (H, W, 3). Raises ValueError: they are not of the lens's size, or too few show the board.
+    Raises ValueError: pictures are not of the lens's size, or too few show the board.
+
+    Args:
+        images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3), of the lens's size.
+        board: The board.
+        fisheye: The lens.
     """
     size, found = find_boards(images, board)
     if size != (fisheye.height, fisheye.width):

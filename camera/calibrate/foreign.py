@@ -67,12 +67,21 @@ FOREIGN_MODELS: dict[str, tuple[tuple[str, ...], Unprojection]] = {
 def fit_fisheye(
     model: str, values: dict[str, float], width: int, height: int, fov_deg: float | None = None
 ) -> tuple[FisheyeParams, FitReport]:
-    """Fit our model to a foreign one on a grid of pixels, by least squares of the pixel difference; returns also what was left over.
+    """Fit our model to a foreign one on a grid of pixels, by least squares of the pixel difference.
 
-    ``model``: a key of `FOREIGN_MODELS`, with its intrinsics. The principal point is taken over (all three models are symmetric about
-    it); fx, fy and k1 to k4 are fitted. The field of view is the asked one [deg], by default all that the image sees, cut to that and
-    to where theta_d stops growing: nothing is extrapolated. Raises ValueError: the model is unknown, or no grid point lies in the
-    field of view, or the fit describes no camera.
+    The principal point is taken over (all three models are symmetric about it); fx, fy and k1 to k4 are fitted. Raises ValueError: the
+    model is unknown, or no grid point lies in the field of view, or the fit describes no camera.
+
+    Args:
+        model: A key of `FOREIGN_MODELS`.
+        values: Its intrinsics.
+        width: Image width [px].
+        height: Image height [px].
+        fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
+
+    Returns:
+        The fisheye and what the fit left over. Its field of view is the asked one, cut to what the image sees and to
+        where theta_d stops growing: nothing is extrapolated.
     """
     if model not in FOREIGN_MODELS:
         raise ValueError(f"camera model {model!r} cannot be fitted; expected one of {sorted(FOREIGN_MODELS)}")
@@ -81,14 +90,26 @@ def fit_fisheye(
 
 
 def fit_rays(
-    model: str, unproject: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], centre_px: tuple[float, float],
-    focal_px: tuple[float, float], width: int, height: int, fov_deg: float | None = None,
-) -> tuple[FisheyeParams, FitReport]:  # fmt: skip
-    """Fit our model to any lens that turns pixels [px], shape (N, 2), into rays, shape (N, 3), camera frame; see :func:`fit_fisheye`.
+    model: str,
+    unproject: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    centre_px: tuple[float, float],
+    focal_px: tuple[float, float],
+    width: int,
+    height: int,
+    fov_deg: float | None = None,
+) -> tuple[FisheyeParams, FitReport]:
+    """Fit our model to any lens that turns pixels into rays; see :func:`fit_fisheye`.
 
-    ``unproject`` gives the rays and their validity. The principal point ``centre_px`` is taken over, ``focal_px`` is where fx and fy
-    start. ``model``: what the report calls the lens. Raises ValueError: no grid point lies in the field of view, or the fit describes
-    no camera.
+    Raises ValueError: no grid point lies in the field of view, or the fit describes no camera.
+
+    Args:
+        model: What the report calls the lens.
+        unproject: Rays, shape (N, 3), camera frame, and validity, shape (N,), of pixels [px], shape (N, 2).
+        centre_px: Principal point, taken over.
+        focal_px: fx and fy to start from.
+        width: Image width [px].
+        height: Image height [px].
+        fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
     """
     from scipy.optimize import least_squares
 

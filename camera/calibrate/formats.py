@@ -44,11 +44,16 @@ def format_of(path: str | Path) -> str:
 
 
 def read(path: str | Path, format: str = "auto", camera: int = 0, fov_deg: float | None = None) -> tuple[str, FisheyeParams, FitReport]:
-    """Read a calibration file: its format, the fisheye, and what a fit of another lens model left over (zero where it holds ours).
+    """Read a calibration file. Raises ValueError: the format is unknown, or its reader refuses the file.
 
-    ``format``: a key of `READERS`, or "auto". ``camera``: number of the camera in a file that holds several. ``fov_deg``: full field
-    of view where the file has none [deg]; by default what the farthest corner of the image sees. Raises ValueError: the format is
-    unknown, or its reader refuses the file.
+    Args:
+        path: The file.
+        format: A key of `READERS`, or "auto".
+        camera: Number of the camera in a file that holds several.
+        fov_deg: Full field of view where the file has none [deg]; by default what the farthest corner of the image sees.
+
+    Returns:
+        The format, the fisheye, and what a fit of another lens model left over (zero where the file holds ours).
     """
     name = format_of(path) if format == "auto" else format
     if name not in READERS:
@@ -59,13 +64,16 @@ def read(path: str | Path, format: str = "auto", camera: int = 0, fov_deg: float
 def read_ocam(path: str | Path, fov_deg: float | None = None) -> Reading:
     """Read the text file that OCamCalib's "export data" writes, and fit our model to its direct polynomial.
 
-    It holds direct polynomial, inverse polynomial (unused), centre, affine part, image size (height, width). Raises ValueError: the file
-    is missing, cut short, or describes no lens.
+    Raises ValueError: the file is missing, cut short, or describes no lens.
 
-    Convention: the file counts rows before columns, from 0 at the centre of the top left pixel; its z axis points away from the scene. An
-    affine part (c, d, e) that shears the image is beyond our model and shows in the report.
+    Convention: the file counts rows before columns, from 0 at the centre of the top left pixel; its z axis points away from
+    the scene. An affine part (c, d, e) that shears the image is beyond our model and shows in the report.
 
     Source: Scaramuzza, Martinelli, Siegwart, "A Toolbox for Easily Calibrating Omnidirectional Cameras", IROS 2006, eq. 3.
+
+    Args:
+        path: The file: direct polynomial, inverse polynomial (unused), centre, affine part, image size (height, width).
+        fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
     """
     lines = [line.split() for line in files.text_of(path, whole_lines=False).splitlines() if line.strip() and not line.startswith("#")]
     try:

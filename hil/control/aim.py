@@ -30,10 +30,12 @@ class Aim:
     """Judges the releases that a policy asks for; ``held`` counts those held back so far in this run."""
 
     def __init__(self, params: AimParams | None, ahead: float, height: float, rope: dict[str, Any]) -> None:
-        """Take what the policy was trained with; None holds nothing back.
+        """Take what the policy was trained with.
 
-        ``ahead``: from the time that a state stands for to separation, if the latch trips now [s]. ``height``: of the payload's centre
-        as it lands [m]. ``rope``: of the policy's contract: mass and drag of the payload.
+        Args:
+            params: None holds nothing back. height: of the payload's centre as it lands [m].
+            ahead: from the time that a state stands for to separation, if the latch trips now [s].
+            rope: of the policy's contract: mass and drag of the payload.
         """
         self._params, self._ahead, self._height = params, ahead, height
         self._drag = rope.get("payload_drag", 0.0) / rope["payload_mass"]

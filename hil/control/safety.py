@@ -96,7 +96,8 @@ class CheckParams:
 
 
 def failed_checks(
-    params: CheckParams, fence: FenceParams, vehicle: BodyState, payload: BodyState, goal_w: Vector, home_w: Vector, hang: float
+    params: CheckParams, fence: FenceParams, vehicle: BodyState, payload: BodyState, goal_w: Vector, home_w: Vector,
+    hang: float,
 ) -> list[str]:  # fmt: skip
     """Return what speaks against a throw, in words; ``hang`` is what the payload hangs below the vehicle at rest [m]."""
     failed = []

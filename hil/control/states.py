@@ -89,10 +89,12 @@ class Machine:
     """
 
     def __init__(self, params: StateParams, throws: int, patient: bool = False, sends: bool = True) -> None:
-        """Begin in idle; it lands after so many throws.
+        """Begin in idle.
 
-        ``patient``: idle and check may last for ever, as where poses are only looked at. ``sends``: whether commands go to a vehicle.
-        Where they do not, no fence ends what others fly before a throw is armed.
+        Args:
+            params: times. throws: after which it lands.
+            patient: idle and check may last for ever, as where poses are only looked at.
+            sends: whether commands go to a vehicle. Where they do not, no fence ends what others fly before a throw is armed.
         """
         self.params, self.most, self.patient, self.sends = params, throws, patient, sends
         self.state, self.reason = State.IDLE, "start"

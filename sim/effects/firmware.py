@@ -52,12 +52,15 @@ def calibrated_voltage(vehicle: VehicleParams, settings: Mapping[str, str], weig
 
 
 def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float) -> ControllerParams:
-    """Numbers of the block ``motor_mixing`` for a vehicle whose ``max_thrust`` is at the battery's reference voltage.
+    """Numbers of the block ``motor_mixing``. Raises ValueError: a setting is missing.
 
-    ``settings``: by their names in the blackbox's header: rollPID, pitchPID, yawPID, ff_weight, iterm_relax_cutoff, motor_idle,
-    gyro_lpf1_static_hz, gyro_lpf2_static_hz, dterm_lpf1_static_hz, dterm_lpf2_static_hz, yaw_lowpass_hz, pidsum_limit, iterm_windup.
-    ``mix_thrust``: of a motor in hover [N]. ``voltage``: at which the throttle was calibrated [V]. Raises ValueError: a setting is
-    missing.
+    Args:
+        vehicle: whose rotors the firmware drives; its ``max_thrust`` is at the battery's reference voltage.
+        settings: by their names in the blackbox's header: rollPID, pitchPID, yawPID, ff_weight, iterm_relax_cutoff, motor_idle,
+            gyro_lpf1_static_hz, gyro_lpf2_static_hz, dterm_lpf1_static_hz, dterm_lpf2_static_hz, yaw_lowpass_hz, pidsum_limit,
+            iterm_windup.
+        mix_thrust: of a motor in hover [N].
+        voltage: at which the throttle was calibrated [V].
     """
     lists = ("rollPID", "pitchPID", "yawPID", "ff_weight", "iterm_relax_cutoff", "motor_idle", "pidsum_limit", "iterm_windup")
     missing = [name for name in lists if name not in settings]

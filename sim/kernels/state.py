@@ -65,8 +65,13 @@ def allocate(t: Types, struct: type, fields: dict[str, tuple[str, bool]], count:
 def put(t: Types, struct, given: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int) -> None:
     """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment first.
 
-    ``given``: name -> values, shape (E, ...), or None for every environment's default; and that default, shape (...). Raises
-    ValueError: values of another shape.
+    Raises ValueError: values of another shape.
+
+    Args:
+        t: types of the arrays.
+        struct: of :func:`allocate`, or anything with arrays of these names.
+        given: name -> values, shape (E, ...), or None for every environment's default; and that default, shape (...).
+        count: E.
     """
     real = np.float32 if t.real is wp.float32 else np.float64
     for name, (value, default) in given.items():

@@ -34,11 +34,14 @@ class StepKernels:
 def build_step(
     t: Types, params: PlantParams, direct: bool = False, extensions: frozenset[str] = frozenset(), motors: bool = False
 ) -> StepKernels:
-    """Compose the kernel for the kinds and the number of segments of ``params``; all numbers are read at run time.
+    """Compose the kernel for the kinds and the number of segments of ``params``.
 
-    ``direct``: by-pass the blocks, see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`. ``motors``: by-pass the rate
-    controller: commands are motor-speed set-points [rad/s]. ``extensions``: of :data:`sim.kernels.structs.EXTENSIONS`; the others cost
-    nothing.
+    Args:
+        t: types of the wanted precision.
+        params: kinds and segment count are read here; all numbers are read by the kernel at run time.
+        direct: by-pass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost nothing.
+        motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
     """
     real, vec3, vec4 = t.real, t.vec3, t.vec4
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState

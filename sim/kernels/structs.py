@@ -139,9 +139,12 @@ ROPE_EXTENSIONS = ("payload_drag", "mount_damping", "swing_damping", "downwash",
 
 
 def extensions_of(
-    vehicles: Iterable[P.VehicleParams], ropes: Iterable[P.RopeParams] = (), airs: Iterable[P.AirParams] = (),
-    releases: Iterable[P.ReleaseParams] = (), laws: Iterable[P.LawParams] = (),
-) -> frozenset[str]:  # fmt: skip
+    vehicles: Iterable[P.VehicleParams],
+    ropes: Iterable[P.RopeParams] = (),
+    airs: Iterable[P.AirParams] = (),
+    releases: Iterable[P.ReleaseParams] = (),
+    laws: Iterable[P.LawParams] = (),
+) -> frozenset[str]:
     """Names of :data:`EXTENSIONS` without which one of these plants would not be simulated in full."""
     needed = {"push"} if any(True for _ in laws) else set()
     for v in vehicles:

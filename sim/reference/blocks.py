@@ -24,10 +24,12 @@ TIME_TOLERANCE = 1e-10  # times closer than this are one event [s]; a control pe
 
 
 def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Return the command that acts at ``now`` [s], shape (E,): the latest whose time has come.
+    """Return the command that acts at ``now``: the latest whose time has come.
 
-    Times at which each starts to act [s], shape (K, E), ascend along K, the first long before ``now``; thrust [N] and body rates
-    [rad/s] have shape (K, E, 4).
+    Args:
+        times: when each command starts to act [s], shape (K, E), ascending along K; the first long before ``now``.
+        commands: collective thrust [N] and body rates [rad/s], shape (K, E, 4).
+        now: [s], shape (E,).
     """
     index = np.sum(times <= now + TIME_TOLERANCE, axis=0) - 1
     return commands[index, np.arange(len(now))]
@@ -45,10 +47,18 @@ def _motor_shares(torque: np.ndarray, rotors: RotorParams, torque_ratio: float) 
 def mixer(
     thrust: np.ndarray, torque: np.ndarray, rotors: RotorParams, torque_ratio: float, f_min: float, f_max: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share thrust [N], (E,), and torque [N m], (E, 3), out to motors of f_min to f_max [N]; yaw gives way, then the rest.
+    """Share collective thrust and torque out to the motors; yaw gives way first, then roll and pitch.
 
-    Returns thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes (E,). ``torque_ratio``: nominal kappa
-    [m].
+    Args:
+        thrust: [N], shape (E,).
+        torque: [N m], shape (E, 3).
+        rotors: geometry.
+        torque_ratio: nominal kappa [m].
+        f_min: least thrust a motor [N].
+        f_max: largest thrust a motor [N], shape (E,).
+
+    Returns:
+        Thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes (E,).
 
     Convention: yaw takes the largest part of what is asked for that keeps the spread of the four within the limits.
     """
@@ -73,14 +83,27 @@ def mixer(
 
 
 def betaflight(
-    vehicle: VehicleParams, setpoint: np.ndarray, gyro: np.ndarray, integral: np.ndarray, command: np.ndarray, rate: np.ndarray,
+    vehicle: VehicleParams,
+    setpoint: np.ndarray,
+    gyro: np.ndarray,
+    integral: np.ndarray,
+    command: np.ndarray,
+    rate: np.ndarray,
     voltage: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro, feed-forward and mixer.
 
-    Takes filtered set-point and rate [rad/s], integral [N m] and true rate [rad/s], shapes (E, 3), acting command, shape (E, 4), and
-    battery voltage [V]; returns motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro and
-    integral.
+    Args:
+        vehicle: parameters.
+        setpoint: filtered set-point [rad/s], shape (E, 3).
+        gyro: filtered rate [rad/s], shape (E, 3).
+        integral: [N m], shape (E, 3).
+        command: acting command, shape (E, 4).
+        rate: true body rate [rad/s], shape (E, 3).
+        voltage: of the battery [V], shape (E,).
+
+    Returns:
+        Motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro and integral.
     """
     gains: ControllerParams = vehicle.controller
     setpoint_dot = (command[:, 1:] - setpoint) / gains.setpoint_time_constant
@@ -171,9 +194,14 @@ def battery(
 def thrust_map(
     params: ThrustParams, reference_voltage: float, speed: np.ndarray, voltage: np.ndarray, gain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return thrust [N] and aerodynamic torque [N m] of rotors at speeds [rad/s], shapes (E, 4), and a voltage [V], shape (E,).
+    """Return thrust [N] and aerodynamic torque [N m] of the rotors, shapes (E, 4).
 
-    ``gain``: error of each motor's thrust besides ``params.gain``, 1 for none, shape (E, 4).
+    Args:
+        params: thrust map.
+        reference_voltage: u_ref [V].
+        speed: [rad/s], shape (E, 4).
+        voltage: [V], shape (E,).
+        gain: error of each motor's thrust besides ``params.gain``, 1 for none, shape (E, 4).
     """
     factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
     thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None] * np.array(params.gain) * gain
@@ -194,10 +222,19 @@ def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarra
 def aerodynamics(
     params: AeroParams, arms: np.ndarray, torque_ratio: float, thrust: np.ndarray, air_velocity_b: np.ndarray, rate: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what the relative air adds: drag [N] and flapping torque [N m], changes of each rotor's thrust [N] and drag torque [N m].
+    """Return what the relative air adds.
 
-    Arms are those of the rotors' hubs from the centre of mass [m], shape (E, 4, 3), the ratio kappa [m], thrusts [N], shape (E, 4),
-    the velocity relative to the air [m/s] and the rate [rad/s] of the body frame, shapes (E, 3).
+    Args:
+        params: coefficients.
+        arms: rotor hubs from the centre of mass [m], shape (E, 4, 3).
+        torque_ratio: kappa [m].
+        thrust: of the rotors [N], shape (E, 4).
+        air_velocity_b: of the centre of mass relative to the air, body frame [m/s], shape (E, 3).
+        rate: body rate [rad/s], shape (E, 3).
+
+    Returns:
+        Drag force [N] and flapping torque [N m], shapes (E, 3); change of each rotor's thrust [N] and of its drag
+        torque [N m], shapes (E, 4).
     """
     if params.kind == "none":
         return np.zeros_like(rate), np.zeros_like(rate), np.zeros_like(thrust), np.zeros_like(thrust)
@@ -213,9 +250,15 @@ def aerodynamics(
 
 
 def composer(
-    rotors: RotorParams, arms: np.ndarray, thrust: np.ndarray, rotor_torque: np.ndarray, speed: np.ndarray, speed_dot: np.ndarray,
-    rate: np.ndarray, aero: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    rotors: RotorParams,
+    arms: np.ndarray,
+    thrust: np.ndarray,
+    rotor_torque: np.ndarray,
+    speed: np.ndarray,
+    speed_dot: np.ndarray,
+    rate: np.ndarray,
+    aero: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
     """Add up the body wrench about the centre of mass. Returns the force [N] and torque [N m], body frame, shapes (E, 3).
 
     Convention: the change of thrust by inflow enters the force as well as the torque.
@@ -241,8 +284,14 @@ def payload_force(
 ) -> np.ndarray:  # fmt: skip
     """Return the force on the payload [N], world frame, shape (E, 3).
 
-    ``drag``: 1/2 rho C_d A [kg/m]. ``along_w``: direction of the rope's last segment. ``lift_w``: force of the rotors on the vehicle
-    [N]. Velocities [m/s] and these have shape (E, 3), ``hanging``, bool, (E,).
+    Args:
+        rope: coefficients of downwash and friction.
+        drag: 1/2 rho C_d A [kg/m].
+        velocity_w: of the payload [m/s], shape (E, 3).
+        wind_w: [m/s], shape (E, 3).
+        along_w: direction of the rope's last segment, shape (E, 3).
+        lift_w: force of the rotors on the vehicle [N], shape (E, 3).
+        hanging: shape (E,), bool.
     """
     through = velocity_w - wind_w
     total = -drag * np.linalg.norm(through, axis=1, keepdims=True) * through

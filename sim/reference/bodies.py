@@ -25,7 +25,13 @@ CABLE_STEP = 2.5e-4
 
 
 class MujocoBodies:
-    """E copies of a model that has a body ``vehicle`` on a free joint and a site ``payload``; ``step``: of the integration [s]."""
+    """E copies of a model.
+
+    Args:
+        model: With a body ``vehicle`` on a free joint and a site ``payload``.
+        count: E.
+        step: Integration step [s].
+    """
 
     def __init__(self, model: "mujoco.MjModel", count: int = 1, step: float = ROPE_STEP) -> None:
         model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_RK4
@@ -66,9 +72,12 @@ def rope_and_ball(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
 
 
 def rope_and_box(body: BodyParams, rope: RopeParams, sides: Sequence[float]) -> "mujoco.MjModel":
-    """A homogeneous box of these sides [m], shape (3,), at the end of the chain, which swings about its upper face by a universal joint.
+    """A box at the end of the chain, which swings about its upper face by a universal joint.
 
-    The rope's payload mass is the box's; its inertia and offset follow from the sides.
+    Args:
+        body: Mass and inertia of the vehicle.
+        rope: Masses and lengths; the payload's mass is the box's, its inertia and offset follow from the sides.
+        sides: Of the box, homogeneous [m], shape (3,).
     """
     spec = new_spec()
     last = add_chain(spec, rope, add_vehicle(spec, body), list(rope.mount), "universal", 0.0, None, free_root=False, load=False)
@@ -82,8 +91,12 @@ def rope_and_box(body: BodyParams, rope: RopeParams, sides: Sequence[float]) -> 
 def two_cables(body: BodyParams, rope: RopeParams, sides: Sequence[float], apart: float, length: float) -> "mujoco.MjModel":
     """A box on two cables without mass, side by side along the vehicle's x axis; a cable pulls or is slack.
 
-    The box is homogeneous, of these sides [m], shape (3,); cables hang so far apart [m] on vehicle and box, each of a length [m]. Of
-    the rope mount and payload mass count.
+    Args:
+        body: Mass and inertia of the vehicle.
+        rope: Of it mount and the payload's mass.
+        sides: Of the box, homogeneous [m], shape (3,).
+        apart: Distance of the cables, on the vehicle and on the box [m].
+        length: Of each cable [m].
     """
     spec = new_spec(constraints=True)
     vehicle, (x, y, z) = add_vehicle(spec, body), rope.mount

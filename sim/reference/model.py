@@ -80,13 +80,23 @@ def add_vehicle(spec: "mujoco.MjSpec", body: BodyParams) -> "mujoco.MjsBody":
 
 
 def build_attached(
-    body: BodyParams, rope: RopeParams, joints: Literal["universal", "ball"] = "universal", armature: float = 0.0,
+    body: BodyParams,
+    rope: RopeParams,
+    joints: Literal["universal", "ball"] = "universal",
+    armature: float = 0.0,
     stretch: tuple[float, float] | None = None,
-) -> "mujoco.MjModel":  # fmt: skip
-    """Build the quadrotor with its rope: bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
+) -> "mujoco.MjModel":
+    """Build the quadrotor with its rope.
 
-    ``armature``: reflected inertia added to every hinge [kg m^2]; 0 is the physical model. ``stretch``: stiffness [N/m] and damping [N
-    s/m] of a slide along the rope between last segment and payload.
+    Args:
+        body: mass and inertia of the quadrotor.
+        rope: masses and lengths.
+        joints: kind of the rope's joints.
+        armature: reflected inertia added to every hinge [kg m^2]; 0 is the physical model.
+        stretch: stiffness [N/m] and damping [N s/m] of a slide along the rope between last segment and payload.
+
+    Returns:
+        Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
     """
     spec = new_spec()
     add_chain(spec, rope, add_vehicle(spec, body), list(rope.mount), joints, armature, stretch, free_root=False)
@@ -101,9 +111,16 @@ def build_free(rope: RopeParams, stretch: tuple[float, float] | None = None) -> 
 
 
 def add_chain(
-    spec: "mujoco.MjSpec", rope: RopeParams, parent: "mujoco.MjsBody", anchor: list[float], joints: str, armature: float,
-    stretch: tuple[float, float] | None, free_root: bool, load: bool = True,
-) -> "mujoco.MjsBody":  # fmt: skip
+    spec: "mujoco.MjSpec",
+    rope: RopeParams,
+    parent: "mujoco.MjsBody",
+    anchor: list[float],
+    joints: str,
+    armature: float,
+    stretch: tuple[float, float] | None,
+    free_root: bool,
+    load: bool = True,
+) -> "mujoco.MjsBody":
     """Rods, the last with the payload (``load``) or without; returns the last body. See :func:`build_attached`."""
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)

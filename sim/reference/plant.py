@@ -68,14 +68,25 @@ class ReferencePlant:
         self.reset(pos_w, np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3)), np.zeros((count, 3)))
 
     def reset(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray, cable_dir_w: np.ndarray | None = None,
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        rate_b: np.ndarray,
+        cable_dir_w: np.ndarray | None = None,
         cable_vel_w: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in hover.
 
-        Positions [m] and velocities [m/s] are the frame's origin's; ``cable_dir_w``: unit directions of the segments from the mount
-        outwards, shape (E, L, 3), None for hanging; ``cable_vel_w``: their time derivatives [1/s], None for zero. Raises ValueError:
-        an array of another shape.
+        Raises ValueError: an array of another shape.
+
+        Args:
+            pos_w: of the frame's origin [m], shape (E, 3).
+            quat_wb: xyzw, shape (E, 4).
+            vel_w: of the frame's origin [m/s], shape (E, 3).
+            rate_b: [rad/s], shape (E, 3).
+            cable_dir_w: unit directions of the segments from the mount outwards, shape (E, L, 3); None for hanging.
+            cable_vel_w: their time derivatives [1/s], shape (E, L, 3); None for zero.
         """
         count, segments = self.count, self.params.rope.segments
         hanging = np.tile([0.0, 0.0, -1.0], (count, segments, 1))
@@ -215,9 +226,11 @@ class ReferencePlant:
         return np.sum(force_w * self._rope_of(self._state)[0][:, 0], axis=1)
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
-        """Give a command now, thrust [N] and body rates [rad/s], shape (E, 4), and advance one control period.
+        """Give a command now and advance one control period.
 
-        It acts after the delay of the queue. ``release``: latch the release now, shape (E,), bool; a latch does not untrip.
+        Args:
+            command: collective thrust [N] and body rates [rad/s], shape (E, 4); acts after the delay of the queue.
+            release: latch the release now, shape (E,), bool; a latch does not untrip.
         """
         extras, rng, period = self.extras, self._rng, self.params.sim.control_period
         start, end = self.time, self.time + period

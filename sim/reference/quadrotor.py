@@ -33,10 +33,16 @@ def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
 
 
 def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return block states in steady hover, shape (E, 15), at rates [rad/s], shape (E, 3), with a share of the battery used, shape (E,).
+    """Return block states in steady hover, shape (E, 15).
 
-    Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that carries ``weight`` [N], shape
-    (E,), terminal voltage settled under that load.
+    Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that carries
+    ``weight``, terminal voltage settled under that load.
+
+    Args:
+        vehicle: parameters.
+        rate_b: [rad/s], shape (E, 3).
+        weight: to be carried [N], shape (E,).
+        used: fraction of the battery used, shape (E,).
     """
     count, cell, thrust = len(weight), vehicle.battery, vehicle.thrust
     state = np.zeros((count, BLOCKS))
@@ -60,14 +66,28 @@ def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarra
 
 
 def vehicle_rates(
-    vehicle: VehicleParams, errors: VehicleErrors, state: np.ndarray, command: np.ndarray, air_velocity_b: np.ndarray,
-    rate_b: np.ndarray, near_ground: np.ndarray | float = 1.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Run the seven blocks from their state, shape (E, 15), under the acting command, shape (E, 4).
+    vehicle: VehicleParams,
+    errors: VehicleErrors,
+    state: np.ndarray,
+    command: np.ndarray,
+    air_velocity_b: np.ndarray,
+    rate_b: np.ndarray,
+    near_ground: np.ndarray | float = 1.0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Run the seven blocks.
 
-    Velocity relative to the air [m/s] and rate [rad/s] are of the body frame, shapes (E, 3); ``near_ground``: factor on the rotors'
-    thrust. Returns force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's time derivative, and
-    the rotors' thrust [N], shape (E, 4).
+    Args:
+        vehicle: parameters.
+        errors: of the vehicles.
+        state: of the blocks, shape (E, 15).
+        command: acting command, shape (E, 4).
+        air_velocity_b: velocity relative to the air, body frame [m/s], shape (E, 3).
+        rate_b: [rad/s], shape (E, 3).
+        near_ground: factor on the rotors' thrust, shape (E,).
+
+    Returns:
+        Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's time derivative, and
+        the rotors' thrust [N], shape (E, 4).
     """
     used, voltage = state[:, 13], state[:, 14]
     rates = np.zeros_like(state)

@@ -18,8 +18,11 @@ from sim.reference.rotations import cross, quat_wxyz_from_matrix, rotation_from_
 class RopeDynamics:
     """Ropes of E environments, each with its own masses and lengths. Raises ValueError: different numbers of segments.
 
-    ``stretch``: stiffness [N/m] and damping [N s/m] between last segment and payload, or None. ``mount_damping``: of the uppermost
-    joint besides the ropes' own while it is on the vehicle [N m s].
+    Args:
+        body: of all vehicles.
+        ropes: one an environment, all with the same number of segments.
+        stretch: stiffness [N/m] and damping [N s/m] between last segment and payload, or None.
+        mount_damping: of the uppermost joint besides the ropes' own while it is on the vehicle [N m s].
     """
 
     def __init__(
@@ -81,14 +84,22 @@ class RopeDynamics:
         return n, cross(n, n_dot), rotation_from_direction(n)
 
     def attached(
-        self, ids: np.ndarray, body: np.ndarray, rotation: np.ndarray, wrench: tuple[np.ndarray, np.ndarray],
-        rope: tuple[np.ndarray, ...], force_w: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-        """Return accelerations of quadrotors with their ropes, of the environments ``ids``; all else has their rows only.
+        self,
+        ids: np.ndarray,
+        body: np.ndarray,
+        rotation: np.ndarray,
+        wrench: tuple[np.ndarray, np.ndarray],
+        rope: tuple[np.ndarray, ...],
+        force_w: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return accelerations of quadrotors with their ropes.
 
         Args:
-            body: columns of ``quadrotor.BODY``, shape (e, 13). rotation: rot_wb, shape (e, 3, 3).
-            wrench: force [N], world frame, and torque [N m], body frame, about the quadrotor's centre of mass, shapes (e, 3).
+            ids: environments, shape (e,); every other argument has their rows only.
+            body: columns of ``quadrotor.BODY``, shape (e, 13).
+            rotation: rot_wb, shape (e, 3, 3).
+            wrench: force [N], world frame, and torque [N m], body frame, about the quadrotor's centre of mass, shapes
+                (e, 3).
             rope: directions and their derivatives, shapes (e, L, 3), elongation [m] and its rate, shapes (e,).
             force_w: on the payload's centre [N], shape (e, 3).
 
@@ -115,9 +126,13 @@ class RopeDynamics:
     def free(
         self, ids: np.ndarray, root: tuple[np.ndarray, np.ndarray], rope: tuple[np.ndarray, ...], force_w: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return accelerations of ropes alone: of the upper end, of the directions and of the elongation; see ``attached``.
+        """Return accelerations of ropes alone: of the upper end, of the directions and of the elongation.
 
-        ``root``: position [m] and velocity [m/s] of the upper end, world frame, shapes (e, 3).
+        Args:
+            ids: environments, shape (e,); every other argument has their rows only.
+            root: position [m] and velocity [m/s] of the upper end, world frame, shapes (e, 3).
+            rope: as in ``attached``.
+            force_w: on the payload's centre [N], shape (e, 3).
         """
         n, rates, frames = self._directions(rope[0], rope[1])
         couples, _ = self._rod_couples(ids, rates, n, None)
@@ -135,9 +150,14 @@ class RopeDynamics:
         return np.zeros(len(qacc)) if self.stretch is None else qacc[:, -1]
 
     def _forward(
-        self, batch: Batch, ids: np.ndarray, qpos: list[np.ndarray], qvel: list[np.ndarray], rope: tuple[np.ndarray, ...],
+        self,
+        batch: Batch,
+        ids: np.ndarray,
+        qpos: list[np.ndarray],
+        qvel: list[np.ndarray],
+        rope: tuple[np.ndarray, ...],
         applied: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         if self.stretch is not None:
             qpos, qvel = [*qpos, rope[2][:, None]], [*qvel, rope[3][:, None]]
         batch.qpos[ids] = np.hstack(qpos)
@@ -149,7 +169,10 @@ class RopeDynamics:
     def points(self, root_pos: np.ndarray, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mount, joints and end of the rope [m], shape (E, L+1, 3), and position and velocity of the payload.
 
-        The root is the upper end [m], [m/s], shapes (E, 3), the rope as in ``attached``.
+        Args:
+            root_pos: upper end [m], shape (E, 3).
+            root_vel: its velocity [m/s], shape (E, 3).
+            rope: as in ``attached``.
         """
         n, n_dot, elongation, elongation_dot = rope
         length = self.length[:, None, None]

@@ -40,10 +40,13 @@ def quat_dot(quat: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
 
 
 def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
-    """Return rotations whose -z axis is a unit vector, shape (..., 3), turned as little as possible from hanging: shape (..., 3, 3).
+    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as possible from hanging.
 
-    Source: Frisvad, Building an orthonormal basis from a 3D unit vector without normalization, 2012, with the branch of Duff et al.
-    2017 on the sign of z, so that no direction is singular.
+    Args:
+        direction_w: unit vectors, shape (..., 3).
+
+    Source: Frisvad, Building an orthonormal basis from a 3D unit vector without normalization, 2012, with the branch of
+    Duff et al. 2017 on the sign of z, so that no direction is singular.
     """
     z = -np.asarray(direction_w, dtype=np.float64)
     sign = np.where(z[..., 2] >= 0.0, 1.0, -1.0)

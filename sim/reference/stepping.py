@@ -17,13 +17,22 @@ MOST_HALVINGS = 6
 
 
 def halving_rk4(
-    rates: Callable[[np.ndarray, np.ndarray], np.ndarray], state: np.ndarray, step: np.ndarray, direction: slice, velocity: slice,
+    rates: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    state: np.ndarray,
+    step: np.ndarray,
+    direction: slice,
+    velocity: slice,
     depth: int = 0,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Take one step of order 4 in each environment, in halves, quarters .. where the rope asks for it.
 
-    ``rates`` gives the time derivative of a state, shape (E, N), for steps [s], shape (E,); rows with a step of 0 may stand still.
-    ``direction``, ``velocity``: columns of the segments' directions and of their time derivatives. ``depth``: halvings so far.
+    Args:
+        rates: function from state and step to the state's time derivative; rows with a step of 0 may stand still.
+        state: shape (E, N).
+        step: [s], shape (E,).
+        direction: columns of the segments' directions.
+        velocity: columns of their time derivatives.
+        depth: halvings so far.
     """
     h = step[:, None]
     k1 = rates(state, step)
@@ -47,9 +56,14 @@ def halving_rk4(
 
 
 def segments_of_period(edges: list[list[float]], step: float) -> np.ndarray:
-    """Cut the spans between events into equal steps [s] of at most ``step``: shape (E, S), zeros where one needs fewer than the most.
+    """Cut the spans between events into equal steps.
 
-    ``edges``: times of the events of each environment in any order, start and end among them [s].
+    Args:
+        edges: times of the events of each environment in any order, start and end among them [s].
+        step: largest step [s].
+
+    Returns:
+        Steps [s], shape (E, S); zeros where an environment needs fewer than the one that needs most.
     """
     rows = []
     for times in edges:
@@ -67,9 +81,18 @@ def segments_of_period(edges: list[list[float]], step: float) -> np.ndarray:
 def crossing(
     pos_0: np.ndarray, vel_0: np.ndarray, pos_1: np.ndarray, vel_1: np.ndarray, step: float, height: float
 ) -> tuple[float, np.ndarray]:
-    """Find where a path passes a height going down, by the cubic through both ends of a step: share of it, 0 to 1, and the point [m].
+    """Find where a path passes a height going down, by the cubic through both ends of a step.
 
-    Positions [m] and velocities [m/s] at its ends have shape (3,); ``pos_1`` is at or below ``height``.
+    Args:
+        pos_0: at the start of the step [m], shape (3,).
+        vel_0: [m/s], shape (3,).
+        pos_1: at its end [m], shape (3,); at or below ``height``.
+        vel_1: [m/s], shape (3,).
+        step: [s].
+        height: [m].
+
+    Returns:
+        Share of the step, 0 to 1, and the point [m], shape (3,).
     """
 
     def path(s: float) -> np.ndarray:

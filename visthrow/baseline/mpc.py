@@ -110,8 +110,12 @@ class MPC:
     def step(self, state: np.ndarray, reference: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming period, shape (4,).
 
-        ``reference``: states (N + 1, 16) and inputs (N, 4) at the ends of the stages, from now on. Raises SolverError: the programme
-        was not solved; the message carries the solver's status; ValueError: a reference of another length.
+        Raises SolverError: the programme was not solved; the message carries the solver's status; ValueError: a reference of another
+        length.
+
+        Args:
+            state: now.
+            reference: states (N + 1, 16) and inputs (N, 4) at the ends of the stages, from now on.
         """
         began = time.perf_counter()
         n = self.params.stages

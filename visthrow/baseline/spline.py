@@ -140,9 +140,14 @@ def _coefficients(start: np.ndarray, waypoints: np.ndarray, end: np.ndarray, vel
 
 
 def residuals(unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES) -> dict[str, np.ndarray]:
-    """Objective of B planar paths (along the throw, up): ``duration``, ``energy``, ``penalty``, whose squares add up to its parts.
+    """Objective of B planar paths (along the throw, up) as sums of squares.
 
-    Coefficients are in units of each segment's time, shape (B, 4, 8, 2), times [s] have shape (B, 4); ``samples``: of each segment.
+    Args:
+        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2), of times [s], shape (B, 4).
+        times, params, model, samples: of each segment.
+
+    Returns:
+        ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose squares add up to each part of the objective.
     """
     count = len(times)
     path = np.einsum("tdk,bskc->dbstc", _sample_rows(samples), unit)
@@ -176,10 +181,15 @@ def optimise(
     model: Pendulum, start_w: np.ndarray, end_w: np.ndarray, velocity_w: np.ndarray, params: PlanParams,
     tick: tuple[float, float] = (0.02, 0.0),
 ) -> Spline:  # fmt: skip
-    """Plan the payload's path from hover to the release, both [m] in a vertical plane with a velocity [m/s] that is not vertical.
+    """Plan the payload's path from hover to the release.
 
-    ``tick``: period and offset [s]: the duration is the offset and a whole number of periods, so that a controller of that period can
-    release at its end. Raises PlanError: no horizontal velocity, a release beside the plane, or the optimisation does not find a path.
+    Raises PlanError: no horizontal velocity, a release beside the plane, or the optimisation does not find a path.
+
+    Args:
+        model, params: whose thrust the bounds are on.
+        start_w, end_w: [m], shape (3,), in a vertical plane with ``velocity_w`` [m/s], which is not vertical.
+        tick: period and offset [s]: the duration is the offset and a whole number of periods, so that a controller of that
+            period can release at its end.
     """
     along = np.array([*velocity_w[:2], 0.0])
     speed = float(np.linalg.norm(along))

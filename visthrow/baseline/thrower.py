@@ -40,7 +40,8 @@ def title_of(plant: str, compensation: str) -> str:
 def unit(
     plant: str, compensation: str, target: float, throws: int, seed: int = 0, *,
     height: float | None = None, speed: float | None = None, w_t: float | None = None, rho: float | None = None,
-    bounds: str = BOUNDS[0], config_name: str = "state", overrides: Sequence[str] = (), batch: int = 0,
+    bounds: str = BOUNDS[0],
+    config_name: str = "state", overrides: Sequence[str] = (), batch: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
     """Unit of so many throws with the baseline at a target [m] along x.
 

@@ -32,9 +32,11 @@ class Workers:
     """
 
     def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = "") -> None:
-        """Start at most so many processes of a function, importable by its name, which may call :func:`progress`, on each of the tasks.
+        """Start at most so many processes.
 
-        ``label``: of a line of progress on the terminal; empty for none.
+        Args:
+            function, tasks: importable by its name; it may call :func:`progress`; what it is called with.
+            processes, label: of a line of progress on the terminal; empty for none.
         """
         tasks, context = list(tasks), mp.get_context("spawn")
         self.label, self._running, self._taken = label, {}, context.Value("i", 0)

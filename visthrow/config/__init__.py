@@ -32,9 +32,16 @@ T = TypeVar("T")
 def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
     """Load a TOML file into a frozen dataclass.
 
-    ``overrides``: ``"a.b=3"``, key path and TOML value (a bare word is a string), applied in order after includes. Raises ConfigError
-    if a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the message names file, key path, what
-    came, what was expected and what exists.
+    Raises ConfigError if a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the message names file,
+    key path, what came, what was expected and what exists.
+
+    Args:
+        schema: Dataclass that the file must fill.
+        path: The file.
+        overrides: ``"a.b=3"``: key path and TOML value (a bare word is a string), applied in order after includes.
+
+    Returns:
+        The filled dataclass.
     """
     return _built(schema, _read(schema, Path(path), ()), overrides)
 

@@ -19,9 +19,15 @@ def clip_action(action: Tensor) -> Tensor:
 
 
 def command_from_action(action: Tensor, max_thrust: float | Tensor, max_rate: Tensor) -> Tensor:
-    """Thrust [N] and body rates [rad/s], shape (E, 4), of a clipped action, shape (E, 5) or (E, 4); noise past 1 is clipped again.
+    """Command of a clipped action.
 
-    ``max_thrust``: collective thrust at +1 [N], one for all or shape (E, 1). ``max_rate``: body rates at +-1 [rad/s], shape (3,).
+    Args:
+        action: normalised, shape (E, 5) or (E, 4); noise may carry it slightly past 1 and is clipped again.
+        max_thrust: collective thrust at +1 [N]; one for all, or shape (E, 1).
+        max_rate: body rates at +-1 [rad/s], shape (3,).
+
+    Returns:
+        Collective thrust [N] and body rates [rad/s], shape (E, 4).
     """
     bounded = action[:, :COMMANDS].clamp(-1.0, 1.0)
     throttle = 0.5 * (bounded[:, :1] + 1.0)

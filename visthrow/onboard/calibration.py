@@ -305,8 +305,11 @@ def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Te
 def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration:
     """Find the camera's turn and latency and the thrust, with the policy's nominal camera, float64, and contract.
 
-    The hover, some 3 s, ends in a sway; ``spreads``, of noise and of what is known, are those of the training where left out. Raises
-    CalibrationError: it shows too little, or nothing fits.
+    Raises CalibrationError: it shows too little, or nothing fits.
+
+    Args:
+        hovered: a hover of some 3 s that ends in a sway. camera, contract: see above.
+        spreads: of noise and of what is known; left out, those of the training.
     """
     problem = Problem(hovered, camera, contract, spreads or Spreads())
     x, c = problem.start()

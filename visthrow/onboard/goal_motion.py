@@ -35,10 +35,17 @@ def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:
 
 
 def fit(sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
-    """Take in one step's goal: the new sums, shape (E, 7), and the velocity so far [m/s], shape (E, 2), world frame.
+    """Take in one step's goal and give the velocity so far.
 
-    ``time``: since the throw began [s], shape (E,). ``goal_xy``: measured [m], shape (E, 2), world frame, with its inverse variance
-    ``weight`` [1/m^2], 0 where it was not seen. ``fresh``: throws that begin here, bool.
+    Args:
+        sums: of the steps before, shape (E, 7).
+        time: since the throw began [s], shape (E,).
+        goal_xy: measured goal [m], shape (E, 2), world frame.
+        weight: inverse variance of it [1/m^2], shape (E,); 0 where the goal was not seen.
+        fresh: throws that begin here, bool, shape (E,).
+
+    Returns:
+        The new sums and the velocity [m/s], shape (E, 2), world frame.
     """
     t, w = time[:, None], weight[:, None]
     new = torch.cat([w, w * t, w * t * t, w * goal_xy, w * t * goal_xy], dim=-1)
@@ -59,9 +66,14 @@ def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
 
 
 def measured_goal(layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None) -> tuple[Tensor, Tensor]:
-    """Goal in the world as one frame shows it, shape (E, 2) [m], and its inverse variance [1/m^2], shape (E,).
+    """Goal in the world as one frame shows it.
 
-    The frame has shape (E, layout.frame), with its noise; keypoints' validity, shape (E, 8), and camera are vision's.
+    Args:
+        layout: of the frame. frame: shape (E, layout.frame), with its noise.
+        valid: validity of the keypoints, shape (E, 8); vision only. camera: vision only.
+
+    Returns:
+        Position [m], shape (E, 2), world frame, and its inverse variance [1/m^2], shape (E,).
     """
     if layout.name == "state":
         offset, hanging = frame[:, VEHICLE : VEHICLE + 2], frame[:, VEHICLE + 2 : VEHICLE + 4]
@@ -96,10 +108,15 @@ def goal_in_frame(layout: Layout, frame: Tensor, valid: Tensor, camera: Keypoint
 
 
 def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor) -> Tensor:
-    """Goal - vehicle, horizontal [m], direction from lens to payload, whether the goal is known: world frame, shape (E, 2 + 3 + 1).
+    """Goal and payload in the world; arguments as of :func:`measured_goal`, and of the goal so far.
 
-    What is not known is 0. Arguments as of :func:`measured_goal`; ``goal_xy``: goal by the steps so far [m], shape (E, 2), world
-    frame; ``known``: whether one has seen it, bool, shape (E,).
+    Args:
+        layout, frame, valid, camera: see there.
+        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has seen it, bool, shape (E,).
+
+    Returns:
+        Goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the goal is known, 1; world frame, shape (E, 6).
+        What is not known is 0.
     """
     box, bits = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)), valid[:, GOAL_KEYPOINTS:]
     centre = middle(box, bits)

@@ -67,10 +67,18 @@ class HoverController:
         self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, goal_w: np.ndarray, mass: float | np.ndarray,
         yaw: float | np.ndarray = 0.0,
     ) -> np.ndarray:  # fmt: skip
-        """Return thrust along body z [N] and body rates [rad/s], shape (E, 4), that bring the vehicles to their goals.
+        """Return the command that brings the vehicles to their goals.
 
-        Positions [m] and velocities [m/s] are the world frame's, shape (E, 3), goals also (3,); attitudes xyzw; total mass, with
-        whatever hangs below [kg], and headings to hold [rad] are scalars or of shape (E,).
+        Args:
+            pos_w: Positions [m], shape (E, 3), world frame.
+            quat_wb: Attitudes, xyzw, shape (E, 4).
+            vel_w: Velocities [m/s], shape (E, 3), world frame.
+            goal_w: Positions to hold [m], shape (E, 3) or (3,), world frame.
+            mass: Total mass, with whatever hangs below [kg], scalar or shape (E,).
+            yaw: Headings to hold [rad], scalar or shape (E,).
+
+        Returns:
+            Collective thrust along body z [N] and body rates [rad/s], shape (E, 4).
         """
         params = self.params
         rot_wb = matrix_of_quat(np.asarray(quat_wb, dtype=float))

@@ -94,10 +94,16 @@ def layout_of(params: Any) -> Layout:
 
 
 def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float) -> Tensor:
-    """Histories as they would be if a step had come each period [s] before now, by straight lines between those that came.
+    """Histories as they would be if a step had come each period before now, by straight lines between those that came.
 
-    Earlier steps are newest first, shape (E, 1 + H, layout.payload), with their ages, ascending [s]; rows beyond them are copies of
-    the oldest. Returns rows that are 1, 2, ... periods old, of the same shape; what is older than all that came is the oldest.
+    Args:
+        history: measurements of earlier steps, newest first, shape (E, 1 + H, layout.payload).
+        newest: of this step, shape (E, layout.payload).
+        ages: of earlier steps, newest first, ascending [s]; rows of the history beyond them are copies of the oldest.
+        period: [s].
+
+    Returns:
+        Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than all that came is the oldest.
     """
     knots, rows, out = [0.0, *ages[: history.shape[1]]], torch.cat([newest[:, None], history], dim=1), []
     for k in range(1, 1 + history.shape[1]):

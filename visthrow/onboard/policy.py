@@ -91,9 +91,13 @@ class Policy:
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
-        """Return the deterministic action, normalised, unclipped, shape (E, A), of observations as in training, shape (E, D).
+        """Return the deterministic action. Raises PolicyError if the last axis is not D long.
 
-        Raises PolicyError if the last axis is not D long.
+        Args:
+            obs: Observations as in training, shape (E, D); taken to the policy's dtype.
+
+        Returns:
+            Normalised actions, unclipped, shape (E, A).
         """
         if self.estimator is not None:
             raise PolicyError("this policy has a memory; expected a call of step or actor rather than act")
@@ -226,11 +230,17 @@ class Policy:
         state: Mapping[str, Tensor], activation: str, contract: dict[str, Any], made_by: dict[str, Any] | None = None,
         eps: float = RSL_RL_EPS,
     ) -> "Policy":  # fmt: skip
-        """Build the policy from ``state_dict()`` of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
+        """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
 
-        It holds ``mlp.<i>.weight``, ``mlp.<i>.bias``, ``obs_normalizer._mean`` and ``._std``; the spread under ``distribution.`` plays
-        no part in the deterministic action. ``activation``: by rsl_rl's name. ``eps``: of the normaliser. Raises PolicyError if the
-        state holds anything else (another model class), or does not fit the contract.
+        Raises PolicyError if the state holds anything else (another model class), or does not fit the contract.
+
+        Args:
+            state: ``actor.state_dict()``: ``mlp.<i>.weight``, ``mlp.<i>.bias``, ``obs_normalizer._mean`` and ``._std``;
+                the spread under ``distribution.`` plays no part in the deterministic action.
+            activation: The actor's hidden activation by rsl_rl's name.
+            contract: Conditions of the training.
+            made_by: Where it comes from.
+            eps: Of the normaliser.
         """
         known = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(known))

@@ -46,9 +46,12 @@ class Pilots(ABC):
     """Who throws with E vehicles; the children decide."""
 
     def __init__(self, experiment: Experiment, goal_w: np.ndarray, first_action: np.ndarray, goal_vel_w: np.ndarray | None = None):
-        """Begin before the throw, within the experiment's bounds, after a hover under a normalised command, shape (E, 4 or 5).
+        """Begin before the throw, within the experiment's bounds.
 
-        Goals at its start [m] and their velocities [m/s], None: still, have shape (E, 3).
+        Args:
+            experiment: see above.
+            goal_w: at its start [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
+            first_action: normalised command of the hover before, shape (E, 4 or 5).
         """
         self.experiment, self.goal_w, self.first_action = experiment, goal_w, first_action
         self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w

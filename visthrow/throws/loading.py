@@ -24,13 +24,16 @@ class Loaded:
 
 
 def load_policy(name: str | Path, config_name: str | None = None, overrides: Iterable[str] = (), allow: Collection[str] = ()) -> Loaded:
-    """Load a policy, shipped or a file, and the experiment that it was trained in, or another one that fits its contract.
+    """Load a policy and the experiment that it was trained in, or another one that fits its contract.
 
-    ``config_name``: of ``configs/train``, to fly in instead of the policy's own, as its training says that it is flown; ``overrides``:
-    ``key=value`` changes of it. ``allow``: parts of the contract that may be broken, as of
-    :meth:`visthrow.onboard.policy.Policy.require`. Raises PolicyError: no such policy, or it does not carry its config and none was
-    named; MismatchError: the config breaks the policy's contract; the message names every difference; ConfigError: a wrong config or
-    override.
+    Raises PolicyError: no such policy, or it does not carry its config and none was named; MismatchError: the config breaks the policy's
+    contract; the message names every difference; ConfigError: a wrong config or override.
+
+    Args:
+        name: of a shipped policy, or a file.
+        config_name: a config of ``configs/train`` to fly in instead of the policy's own, as its training says that it is flown.
+        overrides: ``key=value`` changes of that config.
+        allow: parts of the contract that may be broken, as of :meth:`visthrow.onboard.policy.Policy.require`.
     """
     path = find_policy(name)
     policy = Policy.load(path)

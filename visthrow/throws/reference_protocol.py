@@ -119,11 +119,15 @@ class Throwing(Workers):
         self, loaded: Sequence[Loaded], targets: Sequence[float], throws: int, plant_name: str, seed: int,
         processes: int | None = None, together: bool = False, size: int = BATCH,
     ) -> None:  # fmt: skip
-        """Start so many throws of each policy at each target [m] along x, in a process a core unless ``processes`` says fewer or more.
+        """Start so many throws of each policy at each target [m] along x.
 
-        ``together``: all policies in one batch, which is cheaper for a few throws; they must share a plant. ``size``: throws of a
-        policy in a batch; fewer are sooner done where there are more cores. Other sizes, other draws. Raises ConfigError: policies of
-        different plants that are to fly together; ModuleNotFoundError: MuJoCo is not installed.
+        Raises ConfigError: policies of different plants that are to fly together; ModuleNotFoundError: MuJoCo is not installed.
+
+        Args:
+            loaded, targets, throws, plant_name, seed: of everything random.
+            processes: default one a core, and no more than there are batches.
+            together: fly all policies in one batch, which is cheaper for a few throws; they must share a plant.
+            size: throws of a policy in a batch; fewer are sooner done where there are more cores. Other sizes, other draws.
         """
         importlib.import_module("mujoco")  # said here rather than by every worker
         if together and any(plant_of(item.experiment) != plant_of(loaded[0].experiment) for item in loaded):

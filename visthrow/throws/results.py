@@ -183,8 +183,11 @@ def work(
 ) -> dict[str, Result]:  # fmt: skip
     """Do what the folder does not hold yet, in order, in so many processes at once; returns the results of all units by key.
 
-    ``function``, importable by its name, returns a unit's columns and extra figures; each result is written when it is done.
-    ``known``: results from elsewhere, by key; they count as done. ``say`` is told of the progress.
+    Args:
+        units, folder: what is wanted, and where each result is written when it is done.
+        function: of a unit, importable by its name; returns columns and extra figures.
+        known: results from elsewhere, by key; they count as done.
+        processes, say: 1 works in this one; told of the progress.
     """
     results = {**load_all([folder]), **(known or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())

@@ -49,9 +49,12 @@ class ThrowEnv(VecEnv):
     """
 
     def __init__(self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None):
-        """Build simulator and buffers of ``count`` environments, default the experiment's, and start all episodes.
+        """Build simulator and buffers and start all episodes.
 
-        The seed is of the simulator's resets; torch's own generator draws the noise and is the caller's to seed.
+        Args:
+            experiment, device: plant, camera, task; "cpu" or "cuda:0".
+            seed: of the simulator's resets; torch's own generator draws the noise and is the caller's to seed.
+            count: number of environments; default the experiment's.
         """
         self.cfg, self.device, task = experiment, device, experiment.task
         self.num_envs, self.num_actions = count or experiment.ppo.environments, act.ACTIONS

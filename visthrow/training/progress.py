@@ -31,9 +31,12 @@ class TrainLog:
     """
 
     def __init__(self, path: Path, samples: int, last: int, done: int = 0, minutes: float | None = None):
-        """Open the CSV file of a run with so many environment steps an iteration, which ends at ``last``.
+        """Open the CSV file.
 
-        ``done``: iterations that a resumed run has behind it. ``minutes``: that it may take, where they are limited.
+        Args:
+            path, samples: environment steps an iteration.
+            last, done: iteration that the run ends at, and those that a resumed run has behind it.
+            minutes: that it may take, where they are limited.
         """
         self.samples, self.last, self.done, self.minutes = samples, last, done, minutes
         rows = _rows(path, done) if done and path.exists() else []

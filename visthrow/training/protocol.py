@@ -25,9 +25,12 @@ def throw(
 ) -> Throws:  # fmt: skip
     """Throw ``count`` times in the training simulator, with all its noise, as one batch, at a target [m] along x.
 
-    The policy, a function of observations (E, D) -> actions (E, 5) on the device, begins where ``begin`` brings an environment, made
-    by ``build`` as the class makes it, and with what is observed there. The experiment's start is replaced by :func:`hover_start`. The
-    seed is of starts and noise; torch's generators are put back afterwards.
+    Args:
+        experiment: its start is replaced by :func:`hover_start`.
+        policy: function of observations (E, D) -> actions (E, 5), on the device.
+        target, count, device, seed: of starts and noise; torch's generators are put back afterwards.
+        build: makes the environment, as the class does.
+        begin: brings it to where the throws begin and returns what is observed there.
     """
     devices = [device] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=devices), torch.inference_mode():

@@ -32,7 +32,10 @@ def while_carrying(
 ) -> dict[str, Array]:
     """What ends a throw before the latch has tripped only; the payload on the ground is not in the paper, whose bounds leave it open.
 
-    Positions [m] have shape (E, 3); ``upright``: vertical component of the body's z axis, shape (E,); ``time``: since the start [s].
+    Args:
+        p, landing_height: bounds; [m].
+        pos_w, payload_w: [m], shape (E, 3). upright: vertical component of the body's z axis, shape (E,).
+        time: since the start [s], shape (E,) or one for all.
     """
     return {
         "the vehicle tilted too far": upright < math.cos(math.radians(p.tilt_deg)),
@@ -48,8 +51,9 @@ def negative(
 ) -> Tensor:  # fmt: skip
     """All negative ends of an episode. Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
 
-    Arguments as of :func:`while_carrying`; ``rot_wb`` has shape (E, 3, 3), ``status``, bits of :mod:`sim.kernels.state`, and
-    ``latched`` (E,).
+    Args:
+        p, pos_w, payload_w, time, landing_height: as of :func:`while_carrying`. rot_wb: shape (E, 3, 3).
+        status: bits of :mod:`sim.kernels.state`, shape (E,). latched: shape (E,), bool.
     """
     always = (*out_of_bounds(p, pos_w).values(), (status & (COLLISION | NONFINITE)) != 0)
     carrying = while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)

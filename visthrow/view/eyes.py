@@ -72,8 +72,9 @@ class Eyes:
     def look(self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Take and look at a picture of each vehicle: normalised keypoints, float32, shape (E, 8, 2), and validity, shape (E, 8).
 
-        Truth and what poses tell, whose attitude and height help the detector, are each a `visthrow.throws.plants.Snapshot`; goals [m]
-        have shape (E, 3), ``carried``, which payloads hang, (E,).
+        Args:
+            now: truth, a `visthrow.throws.plants.Snapshot`. measured: likewise, what poses tell: attitude and height help the detector.
+            goal_w: [m], shape (E, 3). carried: which payloads hang, shape (E,).
         """
         pictures = self.renderer.render(self._scenes(now, goal_w, np.asarray(carried)), self._looks).cpu().numpy()
         self._looks += 1

@@ -7,9 +7,11 @@ RISES = (0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0)  # valu
 
 
 def curve(rows: Sequence[tuple[str, Sequence[tuple[float, float]]]], width: int, height: int, unit: str) -> list[str]:
-    """Values over time [s] on a logarithmic axis, a mark a series; later series over earlier ones. Returns ``height + 2`` lines.
+    """Values over time on a logarithmic axis, a mark a series; later series over earlier ones. Returns ``height + 2`` lines.
 
-    Values that are not finite or not above 0 are left out. ``width``, ``height``: of the plot without its labels, in characters.
+    Args:
+        rows: mark and (time [s], value) of each series; values that are not finite or not above 0 are left out.
+        width, height: of the plot without its labels, in characters. unit: of the values, for the axis.
     """
     points = [(mark, t, v) for mark, series in rows for t, v in series if math.isfinite(v) and v > 0.0]
     values = [v for _, _, v in points] or [1.0]

@@ -62,8 +62,12 @@ class Sensors:
     def send(self, rates_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float) -> np.ndarray:
         """Send samples, let the firmware run for a period [s] with each, and wait until it has; raises `RunError` where it does not run.
 
-        Rates [rad/s], shape (N, 3), N at most 16, and the specific force [m/s^2], shape (3,), are the body frame's, the attitude is
-        xyzw. Returns motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the firmware is not ready.
+        Args:
+            rates_b: [rad/s], shape (N, 3), body frame; N at most 16.
+            force_b: specific force [m/s^2], shape (3,), body frame. quat_wb: attitude xyzw.
+
+        Returns:
+            Motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the firmware is not ready.
         """
         force, quat, packets = force_b.tolist(), quat_wb.tolist(), []
         for rate in rates_b.tolist():

@@ -9,7 +9,11 @@ import warp as wp
 def aero_rotor_drag(p: Any, vel_b: Any, rate_b: Any, thrust: Any):
     """Force [N], torque [N m] (both body frame, about the centre of mass) added to the rotors' own.
 
-    ``vel_b``: of the centre of mass through the air [m/s], body frame. ``thrust``: of each rotor in still air [N], shape (4,).
+    Args:
+        p: vehicle.
+        vel_b: velocity of the centre of mass through the air [m/s], body frame.
+        rate_b: body rate [rad/s].
+        thrust: of each rotor in still air [N], shape (4,).
     """
     a = p.aero
     force = -wp.cw_mul(type(vel_b)(a.drag_x, a.drag_y, a.drag_z), vel_b) - a.parasitic * wp.length(vel_b) * vel_b

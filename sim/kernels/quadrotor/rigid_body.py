@@ -75,11 +75,17 @@ def blend(a: Any, wa: Any, b: Any, wb: Any):
 
 
 def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset(), motors: bool = False):
-    """Compose the blocks of a vehicle's kinds, with ``extensions`` of :data:`sim.kernels.structs.EXTENSIONS`.
+    """Compose the blocks of a vehicle's kinds.
 
-    ``motors``: in place of its controller, commands are motor-speed set-points. Returns ``flow(p, air, state, command) -> t.Flow``
-    (body wrench and the derivatives of all internal states), ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and
-    ``motor_advance``.
+    Args:
+        t: types of the wanted precision.
+        vehicle: its kinds are read here.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
+        motors: in place of the vehicle's controller, commands are motor-speed set-points.
+
+    Returns:
+        ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),
+        ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and ``motor_advance``.
     """
     rate_controller = controller.motor_speeds if motors else CONTROLLERS[vehicle.controller.kind]
     motor_rate, motor_advance = MOTORS[vehicle.motor.kind]

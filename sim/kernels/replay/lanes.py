@@ -33,7 +33,12 @@ class Recording:
     """Windows and the flights that they are of, brought to a device once for all runs; the arrays must not change."""
 
     def __init__(self, windows: Mapping[str, np.ndarray], data: Mapping[str, np.ndarray]):
-        """Keep fields of ``kernel.WINDOW_FIELDS``, shape (W,), and of ``kernel.DATA_FIELDS``, flights one after the other."""
+        """Keep them.
+
+        Args:
+            windows: fields of ``kernel.WINDOW_FIELDS``, shape (W,).
+            data: fields of ``kernel.DATA_FIELDS``, flights one after the other.
+        """
         self.windows, self.data = windows, data
         self.rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
         self.seconds = windows["end"] - windows["start"]
@@ -98,10 +103,14 @@ class Replay:
     def run(
         self, starts: Mapping[str, np.ndarray], recording: Recording, lanes: Mapping[str, np.ndarray], knot_spacing: float, knots: int = 1
     ) -> Replayed:
-        """Fly all lanes, fields of ``kernel.LANE_FIELDS``, shape (lanes,), of a recording from starts.
+        """Fly all lanes.
 
-        ``starts``: fields of ``kernel.STATE_FIELDS``, shape (S, ...), rope fields (S, L, ...). ``knot_spacing``: between knots of the
-        latent forces [s]. ``knots``: rows of the knot arrays.
+        Args:
+            starts: fields of ``kernel.STATE_FIELDS``, shape (S, ...), rope fields (S, L, ...).
+            recording: what is flown.
+            lanes: fields of ``kernel.LANE_FIELDS``, shape (lanes,).
+            knot_spacing: between knots of the latent forces [s].
+            knots: rows of the knot arrays.
         """
         k, t = self.kernel, self.types
         count = len(lanes["window"])
@@ -142,8 +151,12 @@ class Replay:
     def _launch(self, device: str, begin: int, costs: np.ndarray, before: list, after: list) -> None:
         """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread and leaves the others free.
 
-        The first has the place ``begin`` in the order, which stands among the arguments between ``before`` and ``after``. ``costs``:
-        of each, in any unit; the longest come first, so that no core is left with one of them in the end.
+        Args:
+            device: to launch on.
+            begin: place of the first in the order.
+            costs: of each, in any unit; the longest come first, so that no core is left with one of them in the end.
+            before: arguments that come before the place of the first.
+            after: those that come after it.
         """
         if not len(costs):
             return

@@ -77,7 +77,12 @@ class Sampling:
 
 
 def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampling:
-    """Build what a lane does at the end of each step, of the structs of the replay."""
+    """Build what a lane does at the end of each step.
+
+    Args:
+        t: types of the wanted precision.
+        Sensing, Windows, Data: structs of the replay.
+    """
     real, vec3, quat = t.real, t.vec3, t.quat
     Vehicle, QuadState = t.Vehicle, t.QuadState
     see_pose, see_point, see_rate = build_sensing(t, Sensing)

@@ -71,13 +71,20 @@ def growing(rope: Any, u: Any):
 
 
 def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset()) -> SimpleNamespace:
-    """Recursion for a fixed number of segments L, with ``extensions`` of :data:`sim.kernels.structs.EXTENSIONS`.
+    """Recursion for a fixed number of segments.
 
-    Returns a namespace of Warp functions: ``up_first``, ``up_second`` (leaf to root: apparent mass and force of the whole chain at the
-    mount, at the state and at the predicted state), ``down_first`` (root to leaf: first stage k1 and predicted directions n2),
-    ``down_second`` (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage alone), ``payload``
-    (position and velocity of the payload's centre), ``momentum`` (linear momentum relative to the mount), ``stretched(natural, now,
-    stiffness, u, h)`` (the rope under its pull, ``now`` what it was h seconds before; with h 0 it is at rest).
+    Args:
+        t: types of the wanted precision.
+        segments: L.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
+
+    Returns:
+        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and force of the whole chain
+        at the mount, at the state and at the predicted state), ``down_first`` (root to leaf: first stage k1 and predicted
+        directions n2), ``down_second`` (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the
+        first stage alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear momentum
+        relative to the mount), ``stretched(natural, now, stiffness, u, h)`` (the rope under its pull, ``now`` what it was h
+        seconds before; with h 0 it is at rest).
     """
     L = segments
     real, vec3, Rope = t.real, t.vec3, t.Rope

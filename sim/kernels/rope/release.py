@@ -74,7 +74,9 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
 def build_step_in_flight(t: Types, acceleration):
     """Return ``step(rope, air, pos_w, vel_w, gravity_w, h)``: position and velocity of the payload alone after h seconds, by RK4.
 
-    ``acceleration(rope, air, vel_w, gravity_w)`` [m/s^2], world frame.
+    Args:
+        t: types of the wanted precision.
+        acceleration: ``(rope, air, vel_w, gravity_w)`` -> [m/s^2], world frame.
     """
     real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
 
@@ -96,11 +98,17 @@ def build_step_in_flight(t: Types, acceleration):
 
 
 def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
-    """Flight of the payload alone: in closed form in still, thin air, by RK4 of ``acceleration`` [m/s^2] under drag.
+    """Flight of the payload alone: in closed form in still, thin air, by RK4 under drag.
 
-    Returns a namespace of Warp functions ``time_to_height(rope, air, pos, vel, height, gravity)`` [s], ``after(rope, air, pos, vel,
-    gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity, time, vehicle_w, samples)`` [m], each with the arguments of the
-    functions of the same names in this module.
+    Args:
+        t: types of the wanted precision.
+        acceleration: ``(rope, air, vel_w, gravity)`` -> [m/s^2], world frame.
+        dragging: whether the air counts.
+
+    Returns:
+        Namespace of Warp functions ``time_to_height(rope, air, pos, vel, height, gravity)`` [s],
+        ``after(rope, air, pos, vel, gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity, time, vehicle_w,
+        samples)`` [m], each with the arguments of the functions of the same names in this module.
     """
     if not dragging:
         return SimpleNamespace(time_to_height=time_to_height, after=projectile, clearance=clearance)

@@ -101,10 +101,13 @@ def check(args: argparse.Namespace) -> int:
 
 
 def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tuple[bool, str]:
-    """Tell whether a configured lens fits pictures of a board, by its errors and those of the lens calibrated on the same pictures.
+    """Tell whether a configured lens fits pictures of a board.
 
-    What the configured lens leaves beyond the best lens is a systematic error. It is accepted where it is not significant (F test of
-    eight free numbers), or below the bias that training draws for each episode (``noise.bias_std``).
+    What the configured lens leaves beyond the best lens is a systematic error. It is accepted where it is not significant
+    (F test of eight free numbers), or below the bias that training draws for each episode (``noise.bias_std``).
+
+    Args:
+        camera: the configuration. given: its reprojection errors. best: those of the lens calibrated on the same pictures.
     """
     from scipy.stats import f
 
