@@ -16,7 +16,6 @@ import numpy as np
 from camera.params import CameraParams
 from hil.poses.pose import Vector
 from hil.poses.track import BodyState
-from visthrow.common.errors import VisthrowError
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard import calibration
 from visthrow.onboard.calibration import Calibration, Hovered, Spreads
@@ -39,23 +38,11 @@ class CalibrationParams(Bounded):
     spreads: Spreads = field(default_factory=Spreads)  # of poses and keypoints
 
 
-def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> Calibration | str:
-    """Return the calibration of a hover, or why there is none."""
-    import torch
-
-    from camera.keypoints import KeypointCamera
-
-    try:
-        return calibration.calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)
-    except VisthrowError as error:
-        return str(error)
-
-
 class Solver:
     """Does the sums in a process of its own, which is started before the flight."""
 
     def __init__(self, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> None:
-        """Start the process; arguments as of `solved`."""
+        """Start the process; arguments as of `visthrow.onboard.calibration.solved`."""
         self._with = camera, contract, spreads
         self._pool = ProcessPoolExecutor(1, get_context("spawn"))
         self._pool.submit(_warm).result()
@@ -63,7 +50,7 @@ class Solver:
 
     def submit(self, hovered: Hovered) -> None:
         """Begin; `poll` tells."""
-        self._coming = self._pool.submit(solved, hovered, *self._with)
+        self._coming = self._pool.submit(calibration.solved, hovered, *self._with)
 
     def poll(self) -> Calibration | str | None:
         """Return what came of it, once; None while there is nothing new."""

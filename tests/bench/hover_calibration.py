@@ -6,6 +6,7 @@ was exposed with half a pixel of noise, as the OpenCV detector has (``visthrow d
 """
 
 import argparse
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from sim.reference.extras import ReferenceExtras
 from visthrow import config
 from visthrow.common.workers import Workers
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import STILL, SWAY, CalibrationError, Hovered, Spreads, calibrate, sway
+from visthrow.onboard.calibration import STILL, SWAY, Hovered, Spreads, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.calibrated import calibrated_start
@@ -68,24 +69,15 @@ def on_reference(flown: Experiment, name: str, count: int, seed: int) -> tuple[l
             rows.append((np.full(count, plant.time), *poses, command[:, 0], points, valid.numpy()))
         plant.step(command, np.zeros(count, bool))
     hovers = [Hovered(*parts, np.array(GOAL)) for parts in zip(*(np.stack(column, 1) for column in zip(*rows)))]
-    with Workers(_solve, [(one, flown) for one in hovers], cores(), "calibrations") as workers:
-        found = dict(workers)
-    return [found[i] for i in range(count)], turn, scale
-
-
-def _solve(task: tuple[Hovered, Experiment]):
-    """Calibration with the spreads of the reference plant; None where there is none."""
-    hovered, flown = task
-    torch.set_num_threads(1)
     extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
     told = Spreads(
         pos=extras.mocap_position_sigma, vel=extras.mocap_velocity_sigma, attitude=extras.mocap_angle_sigma, heading=1.0,
         rate=extras.gyro_sigma, keypoint=PIXEL, pose_bias=1e-4, keypoint_bias=1e-4,
     )  # fmt: skip
-    try:
-        return calibrate(hovered, KeypointCamera(flown.camera, dtype=torch.float64), contract_of(flown), told)
-    except CalibrationError:
-        return None
+    solve = partial(solved, camera=flown.camera, contract=contract_of(flown), spreads=told)
+    with Workers(solve, hovers, cores(), "calibrations") as workers:
+        found = dict(workers)
+    return [None if isinstance(found[i], str) else found[i] for i in range(count)], turn, scale
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, ball_extremes_c, box_midpoints, goal_corners_w
 from camera.mount import rotation_from_vector
+from camera.params import CameraParams
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import VisthrowError
 from visthrow.onboard.observations import rotation_from_quat
@@ -339,6 +340,14 @@ def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any]
         of(found, "camera"), of(sigma, "camera"), found["latency"].item(), sigma["latency"].item(),
         1.0 + found["thrust"].item(), sigma["thrust"].item(), misfit, len(problem.time), found["scale"].item(), sigma["scale"].item(),
     )  # fmt: skip
+
+
+def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration | str:
+    """Return the calibration of a hover, as :func:`calibrate` finds it, or why there is none: a task for another process."""
+    try:
+        return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)
+    except CalibrationError as error:
+        return str(error)
 
 
 def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray, float]:

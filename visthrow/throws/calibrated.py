@@ -5,19 +5,20 @@ actor measures, with its noise, and where the goal is, as a motion-capture hall 
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
-from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.keypoints import KEYPOINTS
 from sim.cores import cores
 from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import STILL, SWAY, Calibration, CalibrationError, Hovered, calibrate, sway
+from visthrow.onboard.calibration import STILL, SWAY, Calibration, Hovered, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
@@ -79,17 +80,9 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
     return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid.numpy()
 
 
-def _solve(task: tuple) -> Calibration | None:
-    """The calibration of one hover; None where it shows too little."""
-    hovered, camera, contract = task
-    try:
-        return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract)
-    except CalibrationError:
-        return None
-
-
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
-    contract = contract_of(experiment)
-    with Workers(_solve, [(one, experiment.camera, contract) for one in hovered], cores(), "calibrations") as workers:
+    """The calibration of each hover; None where it shows too little."""
+    solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
+    with Workers(solve, hovered, cores(), "calibrations") as workers:
         found = dict(workers)
-    return [found[place] for place in range(len(hovered))]
+    return [None if isinstance(found[place], str) else found[place] for place in range(len(hovered))]

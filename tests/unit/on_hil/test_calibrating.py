@@ -11,7 +11,7 @@ import torch
 
 from camera.keypoints import KeypointCamera, goal_corners_w, keypoints
 from camera.mount import rotation_from_vector
-from hil.control.calibrating import Calibrating, CalibrationParams, solved
+from hil.control.calibrating import Calibrating, CalibrationParams
 from hil.control.runner import Runner
 from hil.control.states import OperatorInput
 from hil.links.backends.base import DryRun
@@ -20,7 +20,7 @@ from hil.poses.detection import Detection
 from hil.poses.pose import Pose
 from visthrow import config
 from visthrow.common.errors import ConfigError
-from visthrow.onboard.calibration import Calibration, Hovered, Spreads
+from visthrow.onboard.calibration import Calibration, Hovered, Spreads, solved
 from visthrow.onboard.observations import rotation_from_quat
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.loading import load_policy
