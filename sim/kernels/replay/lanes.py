@@ -1,5 +1,6 @@
 """Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the cores of a CPU."""
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -164,10 +165,14 @@ class Replay:
             wp.launch(self.kernel.replay, len(costs), [*before, begin, *after], device=device, block_dim=64)
             wp.synchronize_device(device)
             return
-        self.kernel.replay.module.load("cpu", block_dim=1)  # by one thread, as a launch there would
+        whole = wp.launch(self.kernel.replay, len(costs), [*before, begin, *after], device="cpu", record_cmd=True)
 
-        def launch(first: int, last: int) -> None:
-            wp.launch(self.kernel.replay, last - first, [*before, begin + first, *after], device="cpu")
+        def launch(first: int, last: int) -> None:  # packed once: that of each piece took longer than a lane's flight, with Python held
+            piece = copy.copy(whole)
+            piece.params, piece.fwd_args = list(whole.params), list(whole.fwd_args)
+            piece.set_dim(last - first)
+            piece.set_param_at_index(len(before), begin + first)
+            piece.launch()
 
         in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
 

@@ -253,7 +253,7 @@ def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}
     at = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3), [3, 6], DRAG)
-    assert [acts_on(at.point, j) for j in at.names] == ["vehicle force", "payload force"]
+    assert acts_on(at.point, at.names) == ["vehicle force", "payload force"]
     assert at.law()[0] == {3}
 
 
@@ -263,8 +263,8 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
     for w in model._windows:
         w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
     at = beside_a_law(model, [6, 8], DRAG)
-    assert [acts_on(at.point, j) for j in at.names] == ["payload force"] * 2
-    assert [acts_on(at.point, j, beside=[14 - j]) for j in at.names] == ["vehicle force"] * 2
+    assert acts_on(at.point, at.names) == ["payload force"] * 2
+    assert [acts_on(at.point, [j], beside=[14 - j])[0] for j in at.names] == ["vehicle force"] * 2
     assert at.law()[0] == {6, 8}
 
 

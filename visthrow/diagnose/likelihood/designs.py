@@ -152,11 +152,15 @@ def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float,
         return each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
     factors, widths = [knot_factor(window, time) for window in windows], [gram.cross.shape[1] for gram in grams]
     channels, size = len(grams[0].count), max(widths)
-    turn = np.tile(np.eye(size), (len(grams), 1, 1))
-    for whole, gram, own in zip(turn, grams, factors):
-        for begin in range(gram.nuisances, gram.nuisances + gram.latents, len(own)):
-            whole[begin : begin + len(own), begin : begin + len(own)] = own
-    right = torch.from_numpy(turn).to(device)[:, None]
+    places, values = [], []
+    for w, (gram, own) in enumerate(zip(grams, factors)):
+        knots = np.arange(gram.nuisances, gram.nuisances + gram.latents).reshape(-1, len(own))
+        places.append(((w * size + knots[:, :, None]) * size + knots[:, None]).ravel())
+        values.append(np.broadcast_to(own, (len(knots), *own.shape)).ravel())
+    right = torch.eye(size, dtype=torch.float64, device=device).repeat(len(grams), 1, 1)
+    where, what = (torch.from_numpy(np.concatenate(parts)).to(device) for parts in (places, values))
+    right.view(-1)[where] = what
+    right = right[:, None]
     inner = padded([gram.placed for gram in grams], lambda own, _: own, (channels, size, size), device)
     there = _on_both(right.mT @ inner @ right, widths)
     return [correlated_with(gram, both.of, own, both) for gram, both, own in zip(grams, there, factors)]

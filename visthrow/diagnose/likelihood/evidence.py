@@ -11,7 +11,7 @@ All functions take information I, shape (K, K), and scores s about theta = 0, sh
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import lapack
 from scipy.special import log_ndtr
 
 from visthrow.common.errors import DiagnoseError
@@ -85,23 +85,29 @@ def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarra
 
 def covariance(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
     """Posterior covariance (I + D^-1)^-1, shape (K, K)."""
+    inverse = lapack.dpotrs(_factor(information, deviation), np.eye(len(deviation)), lower=1)[0]
+    return inverse * np.outer(deviation, deviation)
+
+
+def _factor(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor of 1 + D^1/2 I D^1/2; above the diagonal stands anything. Raises DiagnoseError: not positive definite."""
     scaled = information * np.outer(deviation, deviation)
     scaled.flat[:: len(scaled) + 1] += 1.0
-    return cho_solve(cho_factor(scaled, lower=True), np.eye(len(scaled))) * np.outer(deviation, deviation)
+    factor, failed = lapack.dpotrf(scaled, lower=1, clean=0)
+    if failed:
+        raise DiagnoseError("the flights' information on the effects is not finite or not positive; the derivatives are broken")
+    return factor
 
 
 def log_evidence(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> float:
     """log Z of one set of named effects."""
     deviation = priors.deviation(active)
-    scaled = information * np.outer(deviation, deviation)
-    scaled.flat[:: len(scaled) + 1] += 1.0
-    factor = cho_factor(scaled, lower=True)
-    half = score * deviation
-    mean = cho_solve(factor, half)
-    value = 0.5 * half @ mean - np.log(np.diag(factor[0])).sum()
+    factor, half = _factor(information, deviation), score * deviation
+    mean = lapack.dpotrs(factor, half, lower=1)[0]
+    value = 0.5 * half @ mean - np.log(np.diag(factor)).sum()
     if len(active):
         at = list(active)
-        spread = cho_solve(factor, np.eye(len(scaled))[:, at])[at].diagonal()
+        spread = lapack.dpotrs(factor, np.eye(len(factor))[:, at], lower=1)[0][at].diagonal()
         mean, spread = mean[at] * deviation[at], np.sqrt(spread) * deviation[at]
         low, high = priors.low[at], priors.high[at]
         value += (_log_mass(mean, spread, low, high) - _log_mass(np.zeros(len(at)), deviation[at], low, high)).sum()

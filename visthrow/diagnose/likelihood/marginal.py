@@ -231,7 +231,10 @@ def correlated_with(gram: Gram, inner: np.ndarray, own: np.ndarray, there: There
     """The gram into which a factor of each group's knots was multiplied, with the inner products that came of it."""
     part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.copy()
     cross[:, part] = (cross[:, part].reshape(-1, len(own)) @ own).reshape(len(cross), -1)
-    factor, shown = np.kron(np.eye(gram.latents // len(own)), own), _shown(inner, gram.nuisances, gram.latent_block)
+    groups = gram.latents // len(own)
+    factor, every = np.zeros((groups, len(own), groups, len(own))), range(groups)
+    factor[every, :, every] = own  # of each group, the same
+    factor, shown = factor.reshape(gram.latents, gram.latents), _shown(inner, gram.nuisances, gram.latent_block)
     return replace(gram, inner=inner, cross=cross, factor=factor, shown=shown, there=there)
 
 

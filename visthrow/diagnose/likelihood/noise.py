@@ -7,6 +7,7 @@ variance has an inverse gamma prior about it, so that the forces have Student's 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import lapack
@@ -113,7 +114,7 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
 class _Layout:
     """Where each level stands among the parameters of the search: phases' levels, windows' shares of them, sensor scales."""
 
-    keys: list[tuple[int, str]]  # (block, phase)
+    keys: tuple[tuple[int, str], ...]  # (block, phase)
     pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
     phases: np.ndarray  # of each share, the number of its phase's level, shape (S,)
     seen: np.ndarray  # channels with samples
@@ -122,18 +123,24 @@ class _Layout:
 
     @staticmethod
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
-        """Number the parameters."""
-        keys, blocks = sorted(noise.latent_sd), len(LATENT_BLOCKS)
-        index = {key: i for i, key in enumerate(keys)}
-        present = [[b for b in range(blocks) if (b, gram.phase) in index and np.any(gram.latent_block == b)] for gram in grams]
+        """Number the parameters: of the same windows, once."""
+        count, phases = sum(gram.count for gram in grams), tuple(gram.phase for gram in grams)
+        latents, seen = designs.Same([gram.latent_block for gram in grams]), tuple(np.flatnonzero(count > 0).tolist())
+        return _Layout._numbered(latents, phases, tuple(sorted(noise.latent_sd)), seen, len(count))
+
+    @staticmethod
+    @lru_cache(maxsize=8)
+    def _numbered(latents: designs.Same, names: tuple, keys: tuple, channels: tuple[int, ...], count: int) -> "_Layout":
+        """``latents``, ``names``: blocks of each window's latents, and its phase; ``channels``: those with samples, of so many."""
+        index, blocks, seen = {key: i for i, key in enumerate(keys)}, len(LATENT_BLOCKS), np.array(channels, dtype=int)
+        present = [[b for b in range(blocks) if (b, name) in index and np.any(own == b)] for own, name in zip(latents, names)]
         pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(-1, 2)
-        phases = np.array([index[b, gram.phase] for gram, own in zip(grams, present) for b in own], dtype=int)
-        seen = np.flatnonzero(sum(gram.count for gram in grams) > 0)
+        phases = np.array([index[b, name] for name, own in zip(names, present) for b in own], dtype=int)
         first = len(keys) + len(pairs)
-        size, width, at = first + len(seen), blocks + len(grams[0].count), len(keys)
+        size, width, at = first + len(seen), blocks + count, len(keys)
         slopes, curvatures = [], []
-        for w, (gram, own) in enumerate(zip(grams, present)):
-            shared = [index[b, gram.phase] for b in own]
+        for w, (name, own) in enumerate(zip(names, present)):
+            shared = [index[b, name] for b in own]
             to = np.array([*shared, *range(at, at + len(own)), *range(first, size)], dtype=int)
             part = np.array([*own, *own, *(blocks + seen)], dtype=int)  # levels and shares of the blocks, scales
             slopes.append((w * width + part, to))

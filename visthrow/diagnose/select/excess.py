@@ -91,30 +91,32 @@ class _Phase:
         return float(best * STEP**step)
 
 
-def acts_on(point: Point, j: int, *, joint: bool = False, beside: Sequence[int] = ()) -> str:
-    """Block through which an effect moves things, or "" where it moves measurements alone.
+def acts_on(point: Point, effects: Sequence[int], *, joint: bool = False, beside: Sequence[int] = ()) -> list[str]:
+    """Block through which each of some effects moves things, or "" where it moves measurements alone.
 
     Its column is laid over the columns of each block's latent forces; the block that explains most of it, and at least half, is it.
     ``point``: with the latent forces' derivatives; ``joint``: consider the torque between vehicle and rope as well; ``beside``: effects
     that may take any size: what they can stand in for is left out.
     """
     weight = point.noise.scale**-2.0
-    total, by_block = 0.0, dict.fromkeys((*LATENT_BLOCKS, JOINT), 0.0)
+    total, by_block = np.zeros(len(effects)), {name: np.zeros(len(effects)) for name in (*LATENT_BLOCKS, JOINT)}
     for gram, window in zip(point.grams, point.windows):
         inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
-        free, column = [*range(gram.nuisances), *(size + k for k in beside)], size + j
-        own = _explained(inner, free, column)
-        total += inner[column, column] - own
+        free = np.array([*range(gram.nuisances), *(size + k for k in beside)], dtype=int)
+        columns = size + np.asarray(effects, dtype=int)
+        own = _explained(inner[np.ix_(free, free)], inner[np.ix_(free, columns)])
+        total += inner[columns, columns] - own
         for block in np.unique(gram.latent_block):
             with_block = np.concatenate((free, gram.nuisances + np.flatnonzero(gram.latent_block == block)))
-            by_block[LATENT_BLOCKS[block]] += _explained(inner, with_block.astype(int), column) - own
+            explained = _explained(inner[np.ix_(with_block, with_block)], inner[np.ix_(with_block, columns)])
+            by_block[LATENT_BLOCKS[block]] += explained - own
         if joint and (torques := joint_torques(gram, window)) is not None:
             move = np.zeros((len(inner), len(free) + torques.shape[1]))
             move[free, np.arange(len(free))] = 1.0
             move[gram.nuisances : size, len(free) :] = torques
-            by_block[JOINT] += _explained_by(move.T @ inner @ move, move.T @ inner[column]) - own
-    best = max(by_block, key=by_block.get)
-    return best if total > 0.0 and by_block[best] > 0.5 * total else ""
+            by_block[JOINT] += _explained(move.T @ inner @ move, move.T @ inner[:, columns]) - own
+    best = [max(by_block, key=lambda name: by_block[name][i]) for i in range(len(effects))]
+    return [name if total[i] > 0.0 and by_block[name][i] > 0.5 * total[i] else "" for i, name in enumerate(best)]
 
 
 def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
@@ -125,14 +127,10 @@ def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
     return np.linalg.solve(gram.factor, through_latents(window, known, JOINT))
 
 
-def _explained(inner: np.ndarray, columns: Sequence[int], target: int) -> float:
-    """Part of a column's square that other columns explain."""
-    return _explained_by(inner[np.ix_(columns, columns)], inner[columns, target])
-
-
-def _explained_by(normal: np.ndarray, right: np.ndarray) -> float:
+def _explained(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Parts of columns' squares that other columns explain, from these columns' inner products with themselves and with those."""
     normal = normal + np.diag(1e-9 * np.diag(normal) + 1e-12)
-    return float(right @ np.linalg.solve(normal, right))
+    return np.sum(right * np.linalg.solve(normal, right), axis=0)
 
 
 def too_strong(point: Point, share: float) -> tuple[str, ...]:

@@ -105,8 +105,9 @@ class SearchState:
     def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
         """Whether an effect acts in the block of one of some laws."""
         blocks = {self.problem.effects[k].block for k in laws}
-        if blocks and j not in self.acting:
-            self.acting[j] = acts_on(self.nominal, j), acts_on(self.nominal, j, joint=True)
+        if blocks and not self.acting:
+            every = range(len(self.problem.model.effects))
+            self.acting = dict(enumerate(zip(acts_on(self.nominal, every), acts_on(self.nominal, every, joint=True))))
         return bool(blocks) and self.acting[j][grammar.JOINT in blocks] in blocks
 
     def ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
@@ -232,9 +233,9 @@ class SearchState:
         effects, names = self.problem.effects, self.names
         blocks = {effects[j].block for j in self.terms}
         joint = grammar.JOINT in blocks
-        near = {j for j in names if acts_on(self.point, j, joint=joint) in blocks}
+        near = {j for j, block in zip(names, acts_on(self.point, names, joint=joint)) if block in blocks}
         near |= {j for j in set(names) - near if len(names) > 1
-                 and acts_on(self.point, j, joint=joint, beside=[k for k in names if k != j]) in blocks}  # fmt: skip
+                 and acts_on(self.point, [j], joint=joint, beside=[k for k in names if k != j])[0] in blocks}  # fmt: skip
         left = [j for j in self.active if j not in near]
         while near and (worth := {j: w for j, w in self.worth(left).items() if j in names}):
             weakest = min(worth, key=worth.get)

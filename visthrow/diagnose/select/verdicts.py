@@ -153,7 +153,7 @@ def _overall(
     if stuck:
         names = ", ".join(map(search.name, stuck))
         reasons.append(f"{names} would have to lie outside what is physically possible; the form is another")
-        return result.UNKNOWN, acts_on(point, stuck[0]) or search.problem.effects[stuck[0]].block, reasons, every
+        return result.UNKNOWN, acts_on(point, stuck[:1])[0] or search.problem.effects[stuck[0]].block, reasons, every
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
         return result.UNKNOWN, worst.block, reasons, _withdrawn(search, excessive)
@@ -170,7 +170,7 @@ def _excess(level: Level) -> str:
 
 def _withdrawn(search: Selector, excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one that left it as it was."""
-    through = {j: acts_on(search.point, j) for j in search.active}
+    through = dict(zip(search.active, acts_on(search.point, search.active)))
     inside = {j for j, block in through.items() if block in {level.block for level in excessive}}
     if len(inside) > CHAIN:
         return inside

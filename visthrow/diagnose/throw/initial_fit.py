@@ -235,9 +235,9 @@ class InitialFit:
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         if np.any(weight < 1.0):
             bend = scaled.T @ (scaled * weight[:, None])
-        normal = bend + np.eye(len(ds))
-        damped = normal + dampings[:, None, None] * np.diag(np.diag(normal))
-        slope = scaled.T @ (off * weight)
+        own, slope = bend.diagonal() + 1.0, scaled.T @ (off * weight)
+        damped = np.repeat(bend[None], len(dampings), axis=0)
+        damped.reshape(len(dampings), -1)[:, :: len(ds) + 1] = own + dampings[:, None] * own
         step = np.linalg.solve(damped, (slope - done[ds] / sd)[:, None])[..., 0]
         out = np.zeros((len(dampings), len(done)))
         out[:, ds] = step * sd
@@ -280,5 +280,12 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
 
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
-    steps = np.ones((len(states["pos_w"]), 1))
-    return stacked([states, *[moved_along(states, (d,), d.step * steps) for d in directions]])
+    count, out = len(states["pos_w"]), stacked([states] * (1 + len(directions)))
+    for field in dict.fromkeys(d.field for d in directions):
+        own = [d for d, direction in enumerate(directions) if direction.field == field]
+        rows = ((1 + np.array(own))[:, None] * count + np.arange(count)).ravel()
+        steps = np.repeat(np.diag([directions[d].step for d in own]), count, axis=0)
+        there = moved_along(rows_of(out, rows), [directions[d] for d in own], steps)
+        for name, value in there.items():
+            out[name][rows] = value
+    return out
