@@ -48,12 +48,12 @@ class Flights:
         cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in vectors. recording: for a replay.
     """
 
-    def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float], stride: int = 1):
+    def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float]):
         """Lay out flights and windows.
 
-        ``delays``: of vehicle, payload and gyro that the setting knows of [s]; ``stride``: use every so many samples.
+        ``delays``: of vehicle, payload and gyro that the setting knows of [s].
         """
-        self.flights, self.cuts, self.stride = list(flights), list(cuts), stride
+        self.flights, self.cuts = list(flights), list(cuts)
         self._known: dict[tuple[str, int], np.ndarray] = {}
         self.knots = np.array([int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts])
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
@@ -95,7 +95,7 @@ class Flights:
         if source is None:
             return np.zeros(0, dtype=int)
         span = source.between(c.start + delay + EARLY, c.end + delay)
-        return np.arange(span.start, span.stop, self.stride)
+        return np.arange(span.start, span.stop)
 
     def like(self, w: int) -> tuple[int, bool]:
         """What :meth:`alike` depends on: the same of two windows, the same answer."""

@@ -57,7 +57,7 @@ class ThrowModel:
 
     def __init__(
         self, logs: Sequence[FlightLog], plant: PlantParams, *, sensing: SensingParams | None = None, camera: CameraParams | None = None,
-        device: str = "cpu", substep: float = 0.002, stride: int = 1, only: Sequence[str] | None = None, carries: bool | None = None,
+        device: str = "cpu", substep: float = 0.002, only: Sequence[str] | None = None, carries: bool | None = None,
         simpler: bool = False,
     ):  # fmt: skip
         """Cut the flights and find the windows' initial states.
@@ -68,7 +68,6 @@ class ThrowModel:
             sensing: what is known of the sensors.
             device: "cpu" or "cuda:0".
             substep: largest integration step [s].
-            stride: use every so many measured samples.
             only: names of the effects to consider; default all that apply.
             carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
             simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
@@ -89,10 +88,10 @@ class ThrowModel:
         concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
         self._choose(concerned if only is None else _only(concerned, only))
         self._directions = directions(self.setting.plant)
-        self.flights = self._cut(flights, cuts, stride)
+        self.flights = self._cut(flights, cuts)
         states, ends = self._through(self.setting)
         if (without_slack := self._without_slack(ends)) != cuts:
-            self.flights = self._cut(flights, without_slack, stride)
+            self.flights = self._cut(flights, without_slack)
             states, _ = self._through(self.setting)
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
@@ -102,10 +101,10 @@ class ThrowModel:
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
 
-    def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut], stride: int) -> Flights:
+    def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut]) -> Flights:
         """Return these windows of flights, in the time of their sensors."""
         x = self.setting.sensing
-        return Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay), stride)
+        return Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
 
     def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
         """Take these effects: first those that are simulated by degrees, then switches, then what only cameras see."""
@@ -238,7 +237,7 @@ class ThrowModel:
         """The same model of other windows of its flights."""
         other = copy.copy(self)
         other._settled_at, other._follows, other._secants = {}, None, {}  # of other windows
-        other.flights = self._cut(self.flights.flights, cuts, self.flights.stride)
+        other.flights = self._cut(self.flights.flights, cuts)
         other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return other
 
