@@ -78,6 +78,7 @@ class Case:
     files: tuple[str, ...]  # below the folder of the data
     change: Callable[[Logs], Logs] = list
     test: tuple[str, ...] = ()  # flights that nothing is estimated from
+    of_test: Callable[[Logs], Logs] = list  # what of these
     expect: str = ""  # of a trap: a regular expression that its answer must match
     of: str = ""  # of a part: the vehicle
 
@@ -119,6 +120,11 @@ def cut(begin: float, end: float) -> Callable[[Logs], Logs]:
 def share(k: int, of: int = 3) -> Callable[[Logs], Logs]:
     """Every so-manieth log."""
     return lambda logs: logs[k::of]
+
+
+def without(k: int, of: int = 3) -> Callable[[Logs], Logs]:
+    """All others."""
+    return lambda logs: [log for i, log in enumerate(logs) if i % of != k]
 
 
 def another_thrust(logs: Logs) -> Logs:
@@ -196,6 +202,8 @@ SETS = (
     Case("set slungload, bag 16 unseen", "slungload_camera", SLUNG[1:], test=SLUNG[:1]),
     Case("set jugglebot, session 3 unseen", "jugglebot", BALLS[:1], test=BALLS[1:]),
     Case("set jugglebot, session 7 unseen", "jugglebot", BALLS[1:], test=BALLS[:1]),
+    *(Case(f"set jugglebot, third {k + 1} of session {n} unseen", "jugglebot", (file,), without(k), test=(file,), of_test=share(k))
+      for n, file in zip((7, 3), BALLS) for k in range(3)),
     Case("set pendulum", "pendulum_encoder", SWING),
     Case("set pendulum, last third unseen", "pendulum_encoder", SWING, cut(0.0, 0.667), test=(f"{SWING[0]}@0.667",)),
     *(Case(f"set crazypad {drone}, log03 unseen", UNTRIMMED, (f"{PAD}normal_flight__{drone}_log00.csv.gz",),
@@ -290,7 +298,7 @@ def run(task: tuple[Case, Path]) -> dict:
         if case.expect:
             row["ok"] = bool(re.search(case.expect, said))
         if case.test and diagnosis.theta:
-            row["unseen"] = _unseen(diagnosis, name, setup, _read(case.test, data, name), Path(folder))
+            row["unseen"] = _unseen(diagnosis, name, setup, case.of_test(_read(case.test, data, name)), Path(folder))
         return row | {"cpu_s": resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun}
 
 
@@ -300,8 +308,7 @@ def _unseen(diagnosis, name: str, setup, logs: Logs, folder: Path) -> dict[str, 
     base = str(Path(name).resolve()) if Path(name).is_file() else f"diagnose/{name}.toml"
     (folder / "extended.toml").write_text(patch.of_setup(base, setup, whole, name, ()))
     extended = setups.model_of(setups.load(folder / "extended.toml"), logs)
-    noise = diagnosis.work.after.noise
-    before, after = (on_others(model, {}, noise) for model in (setups.model_of(setup, logs), extended))
+    before, after = (on_others(model, {}, diagnosis.work) for model in (setups.model_of(setup, logs), extended))
     return {channel: [before[channel][0], after[channel][0], after[channel][2]] for channel in before}
 
 

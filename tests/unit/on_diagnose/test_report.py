@@ -12,6 +12,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
+from visthrow.diagnose.likelihood.correlation import Correlation, with_correlations
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
 from visthrow.diagnose.select import held_out, point, result, search
@@ -116,10 +117,26 @@ def test_forms_are_the_errors_written_out(found):
     columns = np.hstack((window.residual[:, None], window.effects))
     own = forms.forms([window], [0], point.noise, [columns], 2)
     v = np.concatenate(([1.0], np.linspace(-1e-3, 1e-3, len(EFFECTS))))
-    left, _, horizon = forms._predicted(window, point.noise, columns @ v[:, None])
+    left, _, horizon = forms.predicted(window, point.noise, columns @ v[:, None])
     for c in range(2):
         rows = (window.channel == c) & (horizon >= 0)
         assert own.error(v)[0, c].sum() == pytest.approx((left[rows] ** 2).sum(), rel=1e-9)
+
+
+def test_noise_that_lasts_leaves_more_than_white_noise_does(found):
+    """The floor of a prediction against draws of the noise, in the head that the initial state is fitted to and ahead of it."""
+    _, diagnosis = found
+    point, draws = diagnosis.work.after, 4000
+    white = replace(point.windows[0], correlated=())
+    (window,) = with_correlations([white], {0: Correlation(0.05, 0.95, 2)})
+    drawn = np.random.default_rng(0).normal(size=(len(window.time), draws)) * point.noise.scale[window.channel, None]
+    for rows, factor in window.correlated:
+        for own in rows.T:
+            drawn[own] = factor @ drawn[own]
+    left, floor, horizon = forms.predicted(window, point.noise, drawn * window.sigma[:, None])
+    rows = (window.channel == 0) & (horizon >= 0)
+    np.testing.assert_allclose(floor[rows], (left[rows] ** 2).mean(1), rtol=5.0 * np.sqrt(2.0 / draws))  # five deviations
+    assert floor[rows].sum() > 1.5 * forms.predicted(white, point.noise, drawn)[1][rows].sum()
 
 
 def test_prediction_does_not_look_at_what_it_predicts(found):
@@ -127,7 +144,7 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     point = diagnosis.work.after
     window = point.windows[0]
     late = window.time > window.time.min() + 0.7
-    plain, spoilt = (forms._predicted(window, point.noise, column[:, None])[0]
+    plain, spoilt = (forms.predicted(window, point.noise, column[:, None])[0]
                      for column in (window.residual, window.residual + late))  # fmt: skip
     np.testing.assert_allclose(spoilt[~late], plain[~late])
     np.testing.assert_allclose((spoilt - plain)[late, 0], 1.0 / window.sigma[late])
@@ -152,7 +169,7 @@ def test_windows_without_states_are_predicted_whole(found):
     point = found[1].work.after
     window = point.windows[0]
     bare = replace(window, nuisance=np.zeros((len(window.time), 0)), nuisance_sd=np.zeros(0))
-    left, expected, horizon = forms._predicted(bare, point.noise, window.residual[:, None])
+    left, expected, horizon = forms.predicted(bare, point.noise, window.residual[:, None])
     np.testing.assert_allclose(left[:, 0], window.residual / window.sigma)
     np.testing.assert_allclose(expected, point.noise.scale[window.channel] ** 2)
     assert horizon.min() == 0

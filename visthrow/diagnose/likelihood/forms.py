@@ -63,7 +63,7 @@ def forms(windows: Sequence[Window], groups: Sequence[int], noise: Noise, column
     count, floor = np.zeros(square.shape[:3]), np.zeros(square.shape[:3])
     for window, group, column in zip(windows, groups, columns):
         f = int(np.searchsorted(names, group))
-        left, expected, horizon = _predicted(window, noise, column)
+        left, expected, horizon = predicted(window, noise, column)
         for c in np.unique(window.channel):
             for h in range(len(HORIZONS)):
                 rows = (window.channel == c) & (horizon == h)
@@ -76,12 +76,21 @@ def forms(windows: Sequence[Window], groups: Sequence[int], noise: Noise, column
 
 def left_ahead(window: Window, noise: Noise) -> np.ndarray:
     """Residuals of a window in sigmas once its initial state is fitted to its head, shape (N,); 0 in the head."""
-    left, _, horizon = _predicted(window, noise, window.residual[:, None])
+    left, _, horizon = predicted(window, noise, window.residual[:, None])
     return np.where(horizon < 0, 0.0, left[:, 0])
 
 
-def _predicted(window: Window, noise: Noise, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns left after the fit of the initial state, noise expected there, and the horizon's index (-1 in the head)."""
+def predicted(window: Window, noise: Noise, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Predict the end of a window from its head.
+
+    Returns columns left after the fit of the initial state in sigmas, shape (N, Q), the square that noise is expected to leave there,
+    shape (N,), and the horizon's index (-1 in the head).
+
+    Args:
+        window: of N samples.
+        noise: for the sensor scales.
+        column: in the channels' units, shape (N, Q).
+    """
     sigma = window.sigma
     scale = noise.scale[window.channel]
     states = window.nuisance * window.nuisance_sd / sigma[:, None]
@@ -90,10 +99,22 @@ def _predicted(window: Window, noise: Noise, column: np.ndarray) -> tuple[np.nda
     fits = states.shape[1] > 0
     ahead = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
     head = (ahead <= 0.0) & fits
-    normal = (states[head] / scale[head, None] ** 2).T @ states[head] + np.eye(states.shape[1])
-    spread = np.linalg.inv(normal)
-    fitted = spread @ ((states[head] / scale[head, None] ** 2).T @ column[head])
-    left = column - states @ fitted
-    expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)
+    weighted = (states[head] / scale[head, None] ** 2).T
+    spread = np.linalg.inv(weighted @ states[head] + np.eye(states.shape[1]))
+    left = column - states @ (spread @ (weighted @ column[head]))
+    if window.correlated:
+        root = _root(window, scale)
+        expected = ((root - states @ (spread @ (weighted @ root[head]))) ** 2).sum(1) + ((states @ spread) ** 2).sum(1)
+    else:  # what that is where noise is white
+        expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)
     horizon = np.where(head, -1, np.minimum(np.searchsorted(HORIZONS, ahead), len(HORIZONS) - 1))
     return left, expected, horizon
+
+
+def _root(window: Window, scale: np.ndarray) -> np.ndarray:
+    """Square root of the covariance of a window's noise in sigmas, shape (N, N)."""
+    root = np.diag(scale)
+    for rows, factor in window.correlated:
+        for own in rows.T:
+            root[np.ix_(own, own)] = scale[own[0]] * factor
+    return root

@@ -85,7 +85,7 @@ def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float
     from visthrow.diagnose.reporting.gain import on_others
 
     model, _ = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))
-    errors = on_others(model, diagnosis.theta, diagnosis.work.after.noise)
+    errors = on_others(model, diagnosis.theta, diagnosis.work)
     for channel, found in errors.items():
         factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
         before, after, floor = (factor * x for x in found)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from visthrow.common.statistics import mean
-from visthrow.diagnose.likelihood.forms import forms
-from visthrow.diagnose.likelihood.marginal import Noise
+from visthrow.diagnose.likelihood.correlation import with_correlations
+from visthrow.diagnose.likelihood.forms import forms, predicted
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
@@ -103,21 +103,29 @@ def landing_gain(
     )
 
 
-def on_others(model: Model, theta: Mapping[str, float], noise: Noise) -> dict[str, tuple[float, float, float]]:
+def on_others(model: Model, theta: Mapping[str, float], work: Work) -> dict[str, tuple[float, float, float]]:
     """Prediction errors of flights that nothing was estimated from.
 
-    ``model``: of these flights, as it stood before the diagnosis; ``theta``: sizes that were found on others; ``noise``: levels that were
-    found there. Returns channel -> root mean square error before and after, and of the sensors' noise and the initial state's uncertainty
-    alone.
+    Returns channel -> root mean square error before and after, and of the sensors' noise and the initial state's uncertainty alone, in
+    the channel's unit; every component counts alike.
+
+    Args:
+        model: of these flights, as it stood before the diagnosis.
+        theta: sizes that were found on others.
+        work: of that search, whose noise is taken.
     """
-    errors = []
+    noise, errors = work.after.noise, []
     for sizes in ({}, theta):
-        windows = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
-        found = forms(windows, [w.flight for w in windows], noise, [w.residual[:, None] for w in windows], len(model.channels))
-        errors.append(found.error(np.ones(1)).sum((0, 2)))
-    count, floor = np.maximum(found.count.sum((0, 2)), 1.0), found.floor.sum((0, 2))
-    sigma = [np.median(np.concatenate([w.sigma[w.channel == c] for w in windows])) for c in range(len(model.channels))]
-    return {name: tuple(float(np.sqrt(x[c] / count[c]) * sigma[c]) for x in (*errors, floor)) for c, name in enumerate(model.channels)}
+        sums = np.zeros((3, len(model.channels)))
+        finite = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
+        for window in with_correlations(finite, work.problem.correlated):
+            left, expected, horizon = predicted(window, noise, window.residual[:, None])
+            squares = np.array([left[:, 0] ** 2, expected, window.sigma**-2.0]) * window.sigma**2
+            for total, own in zip(sums, squares[:, horizon >= 0]):
+                total += np.bincount(window.channel[horizon >= 0], own, len(total))
+        errors.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
+    (before, _), (after, floor) = errors
+    return {name: tuple(map(float, row)) for name, row in zip(model.channels, np.column_stack((before, after, floor)))}
 
 
 def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channels: int, rng: np.random.Generator):
