@@ -12,7 +12,7 @@ import numpy as np
 from hil.errors import RunError
 from hil.fakes.base import VEHICLE_ID, Fake, Options
 from hil.fakes.mocap import MocapParams
-from hil.fakes.process import AnsweringPort, ListeningPort, load_plant, make_fake, serve
+from hil.fakes.process import KINDS, AnsweringPort, ListeningPort, load_plant, make_fake, serve
 from hil.fakes.sitl.ardupilot import ArduPilotSitl
 from hil.fakes.sitl.betaflight import SLOW, BetaflightSitl
 from hil.fakes.sitl.firmware import Firmware, needed
@@ -23,6 +23,7 @@ from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from visthrow import config
+from visthrow.common.errors import suggest
 from visthrow.onboard.policy import Policy, find_policy
 
 PLANT, MOTORS, BALL = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors", "hil.simulated:make_ball"
@@ -39,6 +40,8 @@ def fake(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, or a bridge to a firmware in software, and print its report."""
     options = config.loads(Options, "", [*args.overrides, f"answer={args.answer}"], "options of the fake")
     mocap = MocapParams(rate=args.rate)
+    if args.kind not in {*KINDS, *SITL}:
+        raise RunError(f"--kind {args.kind}; {suggest(args.kind, {*KINDS, *SITL})}")
     plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
     link = Link(open_port(check_device(args.device)), *VEHICLE_ID, key=key_of(args))
     with ExitStack() as ends:

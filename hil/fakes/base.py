@@ -369,11 +369,11 @@ class Fake(ABC):
 
     def report(self) -> dict[str, Any]:
         """Return what happened to the payload, on the plant's clock, and to the messages."""
-        w = self.witness
+        w, last = self.witness, self._last_command
         return {
             **self.plant.landing, "followed": self.followed, "ignored": self.ignored, "releases": w.releases,
             "release_time": self.release_time, "armed": self.armed, "commands": w.commands, "worst": w.worst,
-            "breaches": w.breaches, "events": self.events, "last_command": self._last_command,
+            "breaches": w.breaches, "events": self.events, "last_command": last if math.isfinite(last) else None,
             "end_w": self.plant.state["pos_w"].tolist(), "time": self.plant.time,
         }  # fmt: skip
 

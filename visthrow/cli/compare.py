@@ -146,7 +146,7 @@ def check(targets: Sequence[float], throws: int) -> None:
         raise ConfigError(f"--throws {throws}; expected 1 or more")
     for target in targets:
         if not (math.isfinite(target) and 0.0 <= target <= 3.0):
-            raise ConfigError(f"--targets {target:g}; expected distances from 0 to 3 m, policies are trained on goals within 2 m")
+            raise ConfigError(f"--targets {target:g}; expected distances from 0 to 3 m, which a vehicle may not leave")
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
 

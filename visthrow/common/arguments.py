@@ -5,6 +5,8 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
+from visthrow.common.errors import suggest
+
 Commands = Mapping[str, tuple[str, str]]
 """Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``; it is imported only when chosen."""
 
@@ -64,4 +66,9 @@ class _Lazy(argparse.ArgumentParser):
         if self._module is not None:
             module, self._module = self._module, None
             importlib.import_module(module).add_arguments(self)
-        return super().parse_known_args(args, namespace)
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown and self._subparsers is None:  # else the command's own parser would say it, without its options
+            options = [option for option in self._option_string_actions if option.startswith("--")]
+            near = f"; {suggest(unknown[0].split('=')[0], options)}" if unknown[0].startswith("-") else ""
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
+        return found, unknown

@@ -72,8 +72,12 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
         if not chosen:
             raise LogError(f"{file}: no part '{pattern}' among {len(names)}; {suggest(pattern, names)}")
         return chosen
+    raise _missing(path)
+
+
+def _missing(path: Path) -> LogError:
     near = sorted(p.name for p in path.parent.iterdir()) if path.parent.is_dir() else []
-    raise LogError(f"{path}: no such file; in that folder: {', '.join(near[:20]) or 'nothing'}")
+    return LogError(f"{path}: no such file; in that folder: {', '.join(near[:20]) or 'nothing'}")
 
 
 def _of_folder(path: Path) -> list[FlightLog]:
@@ -90,9 +94,11 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
     from visthrow.logs.readers import recordings, table
 
     path, ending = Path(path), Path(path).suffix.lower()
+    known = (".npz", *BLACKBOX, *AUTOPILOTS)
+    if ending not in known and not path.is_file():
+        raise _missing(path)
     if path.name.lower().endswith(TABLES):
         return table.read_table(path)
-    known = (".npz", *BLACKBOX, *AUTOPILOTS)
     if ending in recordings.READERS or (ending not in known and recordings.is_card(path)):
         return recordings.read_recording(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS))
@@ -111,4 +117,5 @@ def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
     if table.is_export(columns):
         return [table.log_of_export(columns, path)]
     names = ", ".join(list(columns)[:12])
-    raise LogError(f"{path}: a table with the columns {names}, ...: it needs a mapping; give --config NAME (configs/diagnose)")
+    raise LogError(f"{path}: a table with the columns {names}, ...: it needs a mapping; give --config NAME (configs/diagnose), or "
+                   "let `visthrow diagnose map FILE --out mine.toml` propose one")

@@ -92,6 +92,8 @@ def _bounds(log: FlightLog) -> tuple[float, float, float]:
     ]
     x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
     top = max(path[:, 2].max() for path in paths)
+    if top <= 0.0:
+        raise LogError(f"vehicle and payload were below the floor all the time, {-top:.1f} m or more: there is nothing to draw")
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 
 

@@ -108,8 +108,10 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
     try:
         theta = {str(name): float(size) for name, size in report["theta"].items()}
         covariance = [[float(x) for x in row] for row in report["covariance"]]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error!r}") from error
+    except KeyError as error:
+        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: it has no {error}") from error
+    except (TypeError, ValueError, AttributeError) as error:
+        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error}") from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
     return theta, covariance

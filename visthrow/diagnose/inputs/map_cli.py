@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 from visthrow.common.errors import LogError
@@ -26,6 +27,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs.proposal import propose
     from visthrow.logs import table_of
 
+    if args.mass is not None and not 0.0 < args.mass < math.inf:
+        raise LogError(f"--mass {args.mass:g}; expected kilograms above 0")
     found = propose(table_of(args.file), args.file, args.mass)
     text = toml_of(found, Path(args.file).name)
     if args.out:

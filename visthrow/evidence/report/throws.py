@@ -32,8 +32,8 @@ def throws_section(thrown: ResultSet) -> Section:
                     continue
                 rows.append(_row(name, target, plant, found))
     lead = Text(
-        "Throws of the shipped policies from hover. In training goals lie within 2 m, so 2.5 m is out of distribution. The "
-        "training simulator has all noise of the training; the reference plants were never seen in it."
+        "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and 2.5 m (`vision`): for the first "
+        "2.5 m is out of distribution. The training simulator has all noise of the training; the reference plants were never seen in it."
     )
     head = ("policy", "target [m]", "plant", "throws", "landed", "landing error [m], mean and 95 % interval", "deviation [m]",
             "duration [s]", "bias along / left [m]", "the paper's vehicle: error [m], duration [s]")  # fmt: skip
