@@ -169,7 +169,7 @@ class Replay:
 
         def launch(first: int, last: int) -> None:  # packed once: that of each piece took longer than a lane's flight, with Python held
             piece = copy.copy(whole)
-            piece.params, piece.fwd_args = list(whole.params), list(whole.fwd_args)
+            piece.params = list(whole.params)
             piece.set_dim(last - first)
             piece.set_param_at_index(len(before), begin + first)
             piece.launch()

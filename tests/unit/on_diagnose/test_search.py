@@ -334,6 +334,16 @@ def test_additions_are_differences_of_the_evidence():
         assert pairs[i, j] == pytest.approx(evidence.log_evidence(information, score, free, [2, i, j]) - base, abs=1e-8)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -3.0])
+@pytest.mark.parametrize("where", [(0, 0), (1, 0)])
+def test_information_that_no_flights_can_give_is_refused(bad, where):
+    information = np.eye(3) * 4.0
+    information[where] = information[where[::-1]] = 9.0 * bad
+    priors = evidence.Priors(np.ones(3), np.full(3, 6.0), np.full(3, -9.0), np.full(3, 9.0), np.ones(3, dtype=bool))
+    with pytest.raises(DiagnoseError, match="information on the effects is not finite or not positive"):
+        evidence.log_evidence(information, np.ones(3), priors, [0, 1])
+
+
 def test_evidence_is_the_integral():
     """One effect: closed form against quadrature, bounds and floor included."""
     from scipy.integrate import quad

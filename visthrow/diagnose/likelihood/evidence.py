@@ -90,11 +90,11 @@ def covariance(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
 
 
 def _factor(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor of 1 + D^1/2 I D^1/2; above the diagonal stands anything. Raises DiagnoseError: not positive definite."""
+    """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal. Raises DiagnoseError: not positive definite, not finite."""
     scaled = information * np.outer(deviation, deviation)
     scaled.flat[:: len(scaled) + 1] += 1.0
     factor, failed = lapack.dpotrf(scaled, lower=1, clean=0)
-    if failed:
+    if failed or not np.isfinite(np.trace(factor)):  # LAPACK goes on with NaN, which reaches the last row
         raise DiagnoseError("the flights' information on the effects is not finite or not positive; the derivatives are broken")
     return factor
 
