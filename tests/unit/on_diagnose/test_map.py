@@ -21,6 +21,7 @@ from visthrow.logs import read, table_of
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
+from visthrow.logs.units import UNITS
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 SETS = {
@@ -109,6 +110,77 @@ def test_what_is_not_known_is_asked(tmp_path):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
     with pytest.raises(LogError, match=r"ending '\.ulg'; a mapping is for"):
         table_of(tmp_path / "a.ulg")
+
+
+@pytest.mark.parametrize(("length", "angle"), [("m", "rad"), ("cm", "rad"), ("mm", "rad"), ("m", "deg"), ("mm", "deg")])
+def test_gravity_says_the_units_that_no_name_says(length, angle):
+    """A gentle flight, whose degrees could be radians: in the right units it accelerates level as it leans."""
+    columns = flight(20.0, scale=0.05)
+    angles = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, :0:-1] / UNITS[angle][1]
+    path = columns["pos_w"] / UNITS[length][1]
+    found = propose({"time": columns["time"], **named("pos", path), "roll": angles[:, 0], "pitch": angles[:, 1],
+                     "yaw": 0.0 * angles[:, 0]}, "a.csv")  # fmt: skip
+    assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": length, "quat_wb": angle}
+    assert f"{length} by gravity" in found.why["pos_w"]
+    assert f"{angle} by gravity" in found.why["quat_wb"]
+    assert not found.questions
+
+
+def test_a_hover_in_millimetres_is_no_flight_of_a_kilometre():
+    """It spans 42 of its units and no name says which; the captured position beside it is in metres."""
+    file = REAL / "payload_cf_single" / "log206.csv.gz"
+    found = propose(table_of(file), file.name)
+    units = {c.name: c.unit for c in found.mapping.channels}
+    assert (units["pos_w"], units["mocap_pos_w"], units["payload_pos_w"]) == ("mm", "m", "mm")
+    assert "mm by gravity" in found.why["pos_w"]
+    assert found.flyer["cable"]["length"] == pytest.approx(0.51, abs=0.01)
+    assert not any("physics speaks against" in question for question in found.questions)
+
+
+def test_what_falls_says_its_unit_and_a_hall_what_it_can():
+    throws = table_of(REAL / "jugglebot_throws" / "session7.csv.gz")
+    bare = {name.removesuffix("_mm"): cells for name, cells in throws.items()}
+    found = propose(bare, "a.csv")
+    assert [(c.name, c.unit) for c in found.mapping.channels] == [("pos_w", "mm")]
+    assert "falls freely" in found.why["pos_w"]
+    slow = {"time": 0.01 * np.arange(2000)}
+    for reach, unit, asked in ((3.0, "m", False), (15.0, "m", True), (400.0, "mm", True), (3e6, "m", True)):
+        sway = reach * np.sin(0.2 * slow["time"])
+        found = propose(slow | named("pos", np.column_stack([sway, 0.5 * sway, 0.2 * sway])), "a.csv")
+        assert found.mapping.channels[0].unit == unit
+        assert any(f"'{unit}' is a guess" in question for question in found.questions) == asked
+
+
+def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
+    file = REAL / "payload_cf_single" / "log206.csv.gz"
+    with pytest.raises(LogError, match=r"36\.9 is 36\.9 kg, but .* carries 0\.0408 kg in N: grams\? Expected kilograms: --mass 0\.0369"):
+        propose(table_of(file), file.name, mass=36.9)
+    found = propose(table_of(file), file.name, mass=0.0369)
+    assert "N by the mass: it carries 0.04077 kg" in found.why["thrust_command"]
+    assert not any("thrust" in question for question in found.questions)
+    grams = table_of(file)
+    grams["ctrlLee.thrustSI"] = grams["ctrlLee.thrustSI"] / UNITS["gf"][1]
+    found = propose(grams, file.name, mass=0.0369)
+    assert {c.name: c.unit for c in found.mapping.channels}["thrust_command"] == "gf"
+    assert found.flyer["thrust_map"] == [0.0, 1.0, 0.0]
+    both = propose(grams, file.name, mass=36.9)  # 41 kgf carry it as well as 41 gf carry 36.9 g
+    assert any("36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?" in question for question in both.questions)
+    apart = {name: cells for name, cells in table_of(file).items() if not name.startswith("acc")}
+    apart["ctrlLee.thrustSI"] = 1e3 * apart["ctrlLee.thrustSI"]
+    strange = propose(apart, file.name, mass=4.0)
+    assert any("no unit explains that" in question for question in strange.questions)
+
+
+def test_a_mass_that_nothing_can_doubt_is_asked_about():
+    file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
+    found = propose(table_of(file), file.name, mass=27.0)
+    assert any("the vehicle weighs 27 kg? Nothing in the log is in newtons" in question for question in found.questions)
+    ball = REAL / "jugglebot_throws" / "session7.csv.gz"
+    assert any("--mass is not used" in question for question in propose(table_of(ball), ball.name, mass=0.1).questions)
+
+
+def named(stem: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    return {f"{stem}_{letter}": column for letter, column in zip("xyz", values.T)}
 
 
 def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):

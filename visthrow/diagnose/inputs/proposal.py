@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
+from visthrow.diagnose.inputs import unit_evidence
 from visthrow.logs.check import physics, relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
@@ -36,7 +37,7 @@ _HINTS = (
     ("position", r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$"),
 )  # fmt: skip
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
-_FASTEST, _WIDEST = 40.0, 60.0  # of vehicles in a room [m/s], [m]
+_TURN = 7.0  # above a full turn in radians: degrees
 
 
 @dataclass
@@ -178,14 +179,20 @@ class _Chooser:
         self.time, self.found = time, found
         self.groups = [g for g in groups if np.any(np.nanstd(g.values, axis=0) > 0.0)]
         self.taken: set[int] = set()
+        self.attitudes: dict[str, Channel] = {}  # the vehicle's, by the units that its angles may be in
         self.made: dict[str, tuple[ChannelMap, Channel]] = {}
+        self.by: dict[tuple[str, ...], str] = {}  # what says the unit of a path that no name says, by its columns
 
     def channels(self) -> list[ChannelMap]:
         """All that are recognised, the vehicle's path first."""
         self._quaternions()
-        self._positions()
-        self._velocities()
         self._angles()
+        if not self.attitudes and "quat_wb" in self.made:
+            entry, channel = self.made["quat_wb"]
+            self.attitudes = {entry.unit: channel}
+        self._positions()
+        self._ask_angles()
+        self._velocities()
         self._rates()
         self._forces()
         self._inputs()
@@ -253,25 +260,54 @@ class _Chooser:
             if name:
                 wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
                 why = f"three columns that move smoothly, by {wide:.3g} {unit} (sd)"
+                why += f"; {self.by[group.columns]}" if group.columns in self.by else ""
                 self._take(name, group, unit, why, frame="" if name == "pos_w" else "world")
         if len(vehicles) > 1:
             listed = "; ".join(", ".join(g.columns) for g, _ in vehicles)
             self.found.questions.append(f"several positions ({listed}): which is the vehicle's, and by which sensor? The first is taken")
         if pay is not None:
-            self._take("payload_pos_w", *pay)
+            group, unit, why = pay
+            self._take("payload_pos_w", group, unit, why + (f"; {self.by[group.columns]}" if group.columns in self.by else ""))
 
     def _length_unit(self, group: Group) -> str:
-        """Unit of a position: as named, else that in which it is no faster and wider than a room; "" where none fits."""
-        if group.unit in ("mm", "cm", "m"):
-            return group.unit
-        good = np.all(np.isfinite(group.values), axis=1)
-        wide = float(np.max(np.ptp(group.values[good], axis=0))) if np.any(good) else 0.0
-        if wide <= 0.0:
-            return ""
-        unit = "mm" if wide > _WIDEST else "m"
-        if unit == "m" and wide > 0.3 * _WIDEST:
-            self.found.questions.append(f"{', '.join(group.columns)} span {wide:.3g}: metres are a guess")
+        """Unit of a position: as named, else by physics, else that in which it stays in a hall; "" where it does not move."""
+        named = group.unit if group.unit in unit_evidence.LENGTHS else ""
+        if not np.nanmax(np.ptp(group.values[np.all(np.isfinite(group.values), axis=1)], axis=0), initial=0.0) > 0.0:
+            return named
+        fit, far = unit_evidence.by_hall(group.values)
+        leans = unit_evidence.by_lean(self.time, group.values, self.attitudes, [named] if named else unit_evidence.LENGTHS)
+        if len(leans) > 1:
+            leans = [lean for lean in leans if lean[0] in fit] or leans
+        if len({angle for _, angle, _ in leans}) == 1:
+            self._settle_angles(leans[0][1], group)
+        if named:
+            return named
+        if len({unit for unit, _, _ in leans}) == 1:
+            self.by[group.columns] = f"{leans[0][0]} by gravity: it accelerates by {leans[0][2]:.2g} times what its lean makes"
+            return leans[0][0]
+        if unit := unit_evidence.by_fall(self.time, group.values):
+            self.by[group.columns] = f"{unit} by gravity: a part of it falls freely"
+            return unit
+        unit = next(iter(fit), "m")
+        self.by[group.columns] = f"{unit} by the size of a hall: {far:.3g} from the origin"
+        if len(fit) != 1:
+            others = f"{' and '.join(fit[1:])} fit a hall too" if fit else "no unit fits a hall"
+            self.found.questions.append(f"{', '.join(group.columns)} reach {far:.3g} from the origin: '{unit}' is a guess; {others}")
         return unit
+
+    def _settle_angles(self, unit: str, path: Group) -> None:
+        """Take the unit of the vehicle's angles that a path's accelerations show."""
+        if len(self.attitudes) > 1:
+            entry = replace(self.made["quat_wb"][0], unit=unit)
+            self.attitudes = {unit: self.attitudes[unit]}
+            self.made["quat_wb"] = (entry, self.attitudes[unit])
+            self.found.why["quat_wb"] += f"; {unit} by gravity: {path.columns[0]} and its neighbours accelerate as they lean"
+
+    def _ask_angles(self) -> None:
+        if len(self.attitudes) > 1:
+            entry = self.made["quat_wb"][0]
+            listed = ", ".join(entry.columns)
+            self.found.questions.append(f"angles {listed}: {entry.unit} is taken; are they in {' or '.join(self.attitudes)}?")
 
     def _payload(self, paths: list[tuple[Group, str]]) -> tuple[Group, str, str] | None:
         """The path below another one that keeps its distance from it."""
@@ -329,11 +365,12 @@ class _Chooser:
             if "quat_wb" in self.made or not self._hinted(group, "euler") or not self._smooth(group):
                 continue
             largest = float(np.nanpercentile(np.abs(group.values), 99))
-            unit = group.unit if group.unit in ("deg", "rad") else "deg" if largest > 7.0 else "rad"
-            if largest < 7.0 and not group.unit:
-                listed = ", ".join(group.columns)
-                self.found.questions.append(f"angles {listed} reach {largest:.3g}: radians are taken; small ones may be degrees")
+            unit = group.unit if group.unit in ("deg", "rad") else "deg" if largest > _TURN else "rad"
             self._take("quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler")
+            if "quat_wb" in self.made and largest <= _TURN and not group.unit:
+                entry = self.made["quat_wb"][0]
+                degrees, _ = make_channel(self.time, group.values, replace(entry, unit="deg"), "table")
+                self.attitudes = {unit: self.made["quat_wb"][1], "deg": degrees}
 
     def _rates(self) -> None:
         attitude = self.made.get("quat_wb", (None, None))[1]
@@ -392,7 +429,6 @@ class _Chooser:
             elif re.search(r"thrust", stem) and "thrust_command" not in self.made:
                 unit = group.unit if group.unit in ("N", "gf") else "N"
                 self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
-                self.found.questions.append(f"thrust '{group.stem}': newtons of all motors together, as taken?")
 
 
 def _corrected(table: Table, source: str, found: Proposal, weighed: float | None) -> None:
@@ -411,7 +447,68 @@ def _corrected(table: Table, source: str, found: Proposal, weighed: float | None
         found.mapping = replace(found.mapping, channels=tuple(entries))
         found.why["rate_b"] += f"; axes by physics: {row.text}"
     found.questions += [f"physics speaks against {row.channel}: {row.text}" for row in wrong]
+    full = _weighed(full, found, weighed)
     found.flyer = _flyer(full, found, weighed)
+    if weighed is not None and found.flyer is None:
+        found.questions.append("--mass is not used: a flying model needs a thrust or motors, an attitude and a position; not all are found")
+
+
+def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLog:
+    """Hold the thrust against the mass. Returns the log with its thrust in the unit in which it carries what was weighed.
+
+    Raises LogError: in grams it fits, in kilograms it does not.
+    """
+    entry = next((c for c in found.mapping.channels if c.name == "thrust_command"), None)
+    carried = _carried(log)
+    if entry is None or carried is None:
+        if weighed is not None and weighed >= 1e3 * unit_evidence.LIGHTEST:
+            text = f"the vehicle weighs {weighed:g} kg? Nothing in the log is in newtons, to compare; for grams write {weighed / 1e3:g}"
+            found.questions.append(text)
+        return log
+    named = _SUFFIX.get(_words(entry.columns[0])[-1]) == entry.unit
+    units = (entry.unit,) if named else unit_evidence.THRUSTS
+    one = carried / UNITS[entry.unit][1]  # if a number of its column were a newton
+    if weighed is None:
+        if not named:
+            each = ", ".join(f"{one * UNITS[unit][1]:.3g} kg in {unit}" for unit in units)
+            found.questions.append(f"thrust '{entry.columns[0]}': newtons of all motors together, as taken? It carries {each}")
+        return log
+    unit = unit_evidence.by_mass(one, weighed, units)
+    in_grams = unit_evidence.by_mass(one, 1e-3 * weighed, units) if weighed >= 1e3 * unit_evidence.LIGHTEST else ""
+    if not unit and in_grams:
+        raise LogError(
+            f"--mass {weighed:g} is {weighed:g} kg, but the thrust '{entry.columns[0]}' carries {one * UNITS[in_grams][1]:.3g} kg "
+            f"in {in_grams}: grams? Expected kilograms: --mass {weighed / 1e3:g}"
+        )
+    if not unit:
+        found.questions.append(
+            f"thrust '{entry.columns[0]}' carries {carried:.3g} kg in {entry.unit}, and the vehicle weighs {weighed:g} kg: no unit "
+            "explains that; is it of one motor, of another vehicle, or no force?"
+        )
+        return log
+    found.why[entry.name] += f"; {unit} by the mass: it carries {one * UNITS[unit][1]:.4g} kg"
+    if in_grams:
+        found.questions.append(f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or {weighed:g} g and {in_grams}?")
+    if unit == entry.unit:
+        return log
+    mine = [replace(c, unit=unit) if c is entry else c for c in found.mapping.channels]
+    found.mapping = replace(found.mapping, channels=tuple(mine))
+    channel, times = log[entry.name], UNITS[unit][1] / UNITS[entry.unit][1]
+    return FlightLog({**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta)
+
+
+def _carried(log: FlightLog) -> float | None:
+    """What a thrust in newtons carries, by the accelerometer or at the usual thrust of the flight [kg]; None without one."""
+    if (mass := thrust.mass_of(log)) is not None or "thrust_command" not in log:
+        return mass
+    total = log["thrust_command"].samples()[1]
+    usual = _usual(total) if len(total) else 0.0
+    return usual / physics.GRAVITY if usual > 0.0 else None
+
+
+def _usual(total: np.ndarray) -> float:
+    """Middle of a thrust while it flies."""
+    return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
 
 
 def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | None:
@@ -425,7 +522,7 @@ def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | Non
         gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))
     name, _, total = applied
     motors = 1 if name in ("thrust_command", "throttle") else 4
-    hover = float(np.median(total[total > 0.5 * np.percentile(total, 90)])) / motors
+    hover = _usual(total) / motors
     share = 0.85 if gap else 1.0  # of the vehicle in what flies, until both are weighed
     whole = weighed / share if weighed else mass or 1.0
     first = 1.0 if mass else whole * physics.GRAVITY / motors / hover

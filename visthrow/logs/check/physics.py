@@ -242,11 +242,11 @@ def _exchanged_body(time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray
     return Row("frames", both, "bad", f"acc_b fits {_better(found)}", {"axes": found.axes, "of": "acc_b", "nats": found.nats})
 
 
-def accelerations(time: np.ndarray, path: np.ndarray, unit: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and accelerations [m/s^2], shape (N, 3), of positions (unit m) or velocities."""
+def accelerations(time: np.ndarray, path: np.ndarray, unit: str, span: float = _SPAN) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and accelerations [m/s^2], shape (N, 3), of positions (unit m) or velocities, over about ``span`` seconds each."""
     if unit == "m":
-        time, path = relations.derivative(time, path, _SPAN)
-    return relations.derivative(time, path, _SPAN)
+        time, path = relations.derivative(time, path, span)
+    return relations.derivative(time, path, span)
 
 
 def _pushed(found: relations.Relation, acc: np.ndarray, pushed: np.ndarray, both: str, sensed: bool) -> list[Row]:

@@ -20,7 +20,7 @@ _AGAINST = 8.0  # nats by which no thrust at all must explain the force better, 
 _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
 _LATEST, _MOTORS = 0.16, 0.07  # motors and their filters take 0 to 0.12 s, usually 0.07 [s]
 _CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
-_MASS_WARN, _MASS_BAD = 0.15, 1.0  # of the logarithm of thrust over weight: a battery's charge; another unit or map
+_MASS_WARN, MASS_BAD = 0.15, 1.0  # of the logarithm of thrust over weight: a battery's charge; another unit or map
 IDLE_SPEED, IDLE_SHARE = 100.0, 0.12  # a vehicle whose rotors stay below has not flown [rad/s], [1]
 _UNEVEN = 0.4  # of the logarithm of a rotor over the others: an arm's weight or a cut blade makes 0.25 of a speed
 
@@ -139,7 +139,7 @@ def _weight(mass: float, known: Known, both: str) -> Row:
     off, ratio = float(np.log(mass / known.mass)), mass / known.mass
     text = f"thrust over force {mass:.4g} kg, {ratio:.3g} times the model's {known.mass:.4g} kg"
     unit = min(UNITS, key=lambda unit: abs(np.log(ratio * UNITS[unit])))
-    if abs(off) > _MASS_BAD and abs(np.log(ratio * UNITS[unit])) < _UNIT:
+    if abs(off) > MASS_BAD and abs(np.log(ratio * UNITS[unit])) < _UNIT:
         return Row("units", both, "bad", f"{text}: in {unit}", {"mass_kg": mass, "model_kg": known.mass})
     verdict = "warn" if abs(off) > _MASS_WARN else "ok"
     text += ": the thrust map is of another vehicle, battery or channel" if verdict == "warn" else ""
