@@ -1,10 +1,10 @@
 """``visthrow hil``: poses of a motion-capture system in, commands of a trained policy out."""
 
 import argparse
-import contextlib
 import importlib
-from collections.abc import Callable
 from typing import Any
+
+from visthrow.common.arguments import ABOVE_ZERO, PORT, WHOLE
 
 ACTIONS = {
     "run": ("flight:fly", "fly, or run dry, by a config of configs/hil"),
@@ -30,19 +30,6 @@ While a run goes on, type 'arm' (one throw), 'land' or 'abort' and Enter; Ctrl-C
 """
 
 
-def checked(kind: type, good: Callable[[float], bool], expected: str) -> Callable[[str], float]:
-    """Return what reads a number of the command line that must be good."""
-
-    def parse(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            if good(value := kind(text)):
-                return value
-        raise argparse.ArgumentTypeError(f"'{text}'; expected {expected}")
-
-    return parse
-
-
-ABOVE_ZERO, SEED = checked(float, lambda x: x > 0.0, "a number above 0"), checked(int, lambda x: x >= 0, "a whole number of 0 or more")
 FLIES = ("run", "record", "calibrate")
 FLAG, OVERRIDES = {"action": "store_true"}, {"dest": "overrides", "action": "append", "default": []}
 KINDS = "ardupilot, px4, betaflight, crazyflie; or a bridge to software: betaflight-sitl, ardupilot-sitl, px4-sih"
@@ -54,7 +41,7 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
     (("run", "check", "record", "calibrate"), "--set", "KEY=VALUE", None, OVERRIDES),
     (("run", "check", "record", "calibrate"), "--seconds", None, "end after this time", {"type": ABOVE_ZERO}),
     (("run", "check", "record", "calibrate"), "--speed", None, "of the clock; below 1 with a fake of the same speed",
-     {"type": float, "default": 1.0}),
+     {"type": ABOVE_ZERO, "default": 1.0}),
     (("run", "check", "record", "calibrate"), "--sign", "KEYFILE", "sign MAVLink messages, and hear none that is not signed", {}),
     (FLIES, "--out", "FOLDER", "of the run (default: a new one in runs/hil)", {}),
     (FLIES, "--view", None, "serve a live view to this machine's browser", FLAG),
@@ -67,24 +54,24 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
     (("view",), "folder", "FOLDER", "of a run", {}),
     (("view",), "--live", None, "serve the run while it goes on, on 127.0.0.1 alone", FLAG),
     (("view",), "--out", "FILE", FILE, {}),
-    (("view",), "--web-port", "N", "of the live view (default: 9090)", {"type": int, "default": 9090}),
-    (("view",), "--data-port", "N", "of its data (default: 9876)", {"type": int, "default": 9876}),
-    (("fake",), "--rate", "HZ", "poses a second of each body", {"type": float, "default": 100.0}),
+    (("view",), "--web-port", "N", "of the live view (default: 9090)", {"type": PORT, "default": 9090}),
+    (("view",), "--data-port", "N", "of its data (default: 9876)", {"type": PORT, "default": 9876}),
+    (("fake",), "--rate", "HZ", "poses a second of each body", {"type": ABOVE_ZERO, "default": 100.0}),
     (("fake",), "--firmware", "PROGRAM", "of --kind betaflight-sitl: Betaflight's for a PC, to fly the plant's motors", {}),
     (("fake",), "--folder", "FOLDER", "of the firmware's settings and blackbox", {"default": "out/firmware"}),
     (("fake",), "--plant", "MODULE:FUNCTION", f"that makes the vehicle (default: {PLANTS})", {}),
     (("fake",), "--device", None, "the runner's port", {"default": "udpout:127.0.0.1:14560"}),
     (("fake",), "--sign", "KEYFILE", "as of `hil run`", {}),
     (("fake",), "--policy", "POLICY", "whose plant is flown", {"default": "vision"}),
-    (("fake",), "--seed", None, "of start, noise and loss", {"type": SEED, "default": 0}),
+    (("fake",), "--seed", None, "of start, noise and loss", {"type": WHOLE, "default": 0}),
     (("fake",), "--seconds", None, "end after this time", {"type": ABOVE_ZERO, "default": 60.0}),
     (("fake",), "--after", None, "end this long after the payload's landing [s]", {"type": ABOVE_ZERO, "default": 10.0}),
-    (("fake",), "--speed", None, "of the clock", {"type": float, "default": 1.0}),
+    (("fake",), "--speed", None, "of the clock", {"type": ABOVE_ZERO, "default": 1.0}),
     (("fake",), "--answer", None, "to the release: accepted, in-progress, denied, silent, stuck", {"default": "accepted"}),
     (("fake",), "--kind", None, f"of autopilot: {KINDS}", {"default": "ardupilot"}),
     (("fake",), "--autopilot", None, "where px4-sih hears PX4 itself: its port for ground stations", {"default": "udp:127.0.0.1:14550"}),
     (("fake",), "--config", "NAME", "of the run that the firmware is set up for", {"default": "betaflight_sitl"}),
-    (("fake",), "--msp-port", None, "where the fake Betaflight or Crazyflie listens", {"type": int, "default": 14561}),
+    (("fake",), "--msp-port", None, "where the fake Betaflight or Crazyflie listens", {"type": PORT, "default": 14561}),
     (("fake",), "--option", "KEY=VALUE", "of hil.fakes.Options: silent_after=12, command_delay=0.03, parameters.GUID_OPTIONS=0, ...",
      OVERRIDES),
     (("fake",), "--out", "FILE", "write the report here", {}),

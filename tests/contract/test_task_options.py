@@ -8,7 +8,7 @@ import torch
 
 from sim.hybrid import rope_variants, tether_lengths
 from visthrow import cli, config
-from visthrow.common.errors import MismatchError
+from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import ReferenceAdapter
@@ -123,10 +123,14 @@ def test_departures_are_refused_unless_allowed_and_then_named():
     with pytest.raises(MismatchError, match=r"rope\.length"):
         load_policy("state", "state", change, allow=["vehicle"])
     with pytest.raises(MismatchError, match=r"vehicle\.motor\.time_constant"):
-        load_policy("state", "state", change, allow=["rope.length", "vehicle.mot"])
+        load_policy("state", "state", change, allow=["rope.length", "vehicle.motor.kind"])
+    with pytest.raises(ConfigError, match=r"allow 'vehicle\.mot': .* did you mean 'vehicle\.motor'"):
+        load_policy("state", allow=["vehicle.mot"])
     loaded = load_policy("state", "state", change, allow=["rope.length", "vehicle.motor"])
     assert loaded.departures == {"rope.length": 0.4, "vehicle.motor.time_constant": 0.05}
     assert load_policy("state").departures == {}
+    others = ["camera.mount", "rope.payload_drag", "vehicle.body.com_offset[2]"]  # of vision, or at its default: a contract may have them
+    assert load_policy("state", allow=others).departures == {}
 
 
 def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):

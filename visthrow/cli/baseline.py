@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import add_common, add_out
+from visthrow.common.arguments import WHOLE, add_common, add_out
 from visthrow.common.workers import status
 
 TARGETS = (1.5, 2.0, 2.5)
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
     parser.add_argument("--quick", action="store_true", help="two throws, one speed and two weights, own model alone")
-    parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
+    parser.add_argument("--seed", type=WHOLE, default=0, help="of starts and noise (default: 0)")
     parser.add_argument("--config", default="state", metavar="NAME", help="train config whose plant is flown (default: state)")
     add_out(parser, "out/baseline", "for page, tables, pictures and the single results")
     add_common(parser, device=False)

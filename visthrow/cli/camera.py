@@ -2,6 +2,7 @@
 
 import argparse
 
+from visthrow.common.arguments import ABOVE_ZERO, NUMBER
 from visthrow.view.camera import BOARD
 
 FORMATS = ("opencv", "kalibr", "ros", "basalt", "ocam")
@@ -36,7 +37,7 @@ def _add_calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", default="auto", metavar="NAME", help=f"of the calibration file: auto (the default), {formats}")
     parser.add_argument("--camera", type=int, default=0, metavar="N", help="number of the camera in a file of several (default: 0)")
     fov = "full field of view; default: the file's own, else what the image's corners see; for pictures 180"
-    parser.add_argument("--fov-deg", type=float, metavar="DEG", help=fov)
+    parser.add_argument("--fov-deg", type=ABOVE_ZERO, metavar="DEG", help=fov)
     like = "camera config that gives mount, noise and sizes (default: fisheye)"
     parser.add_argument("--like", default="fisheye", metavar="NAME", help=like)
 
@@ -46,10 +47,10 @@ def _add_show(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("picture", nargs="?", metavar="FILE", help="picture of that camera; without it the scene is rendered")
     parser.add_argument("--board", nargs="+", metavar="WORD", help=f"in the picture: {BOARD}")
     target = "target ahead and to the left (default: 1 0)"
-    parser.add_argument("--target", type=float, nargs=2, default=[1.0, 0.0], metavar="M", help=target)
-    parser.add_argument("--height", type=float, default=1.333, metavar="M", help="of the hovering vehicle (default: 1.333)")
-    parser.add_argument("--hangs", type=float, default=0.383, metavar="M", help="of the payload's centre below it (default: 0.383)")
-    parser.add_argument("--straight", type=float, metavar="DEG", help="also write a rectified view this wide, below 180")
+    parser.add_argument("--target", type=NUMBER, nargs=2, default=[1.0, 0.0], metavar="M", help=target)
+    parser.add_argument("--height", type=ABOVE_ZERO, default=1.333, metavar="M", help="of the hovering vehicle (default: 1.333)")
+    parser.add_argument("--hangs", type=ABOVE_ZERO, default=0.383, metavar="M", help="of the payload's centre below it (default: 0.383)")
+    parser.add_argument("--straight", type=ABOVE_ZERO, metavar="DEG", help="also write a rectified view this wide, below 180")
     parser.add_argument("--out", default="out/camera.png", metavar="FILE", help="picture to write (default: out/camera.png)")
 
 

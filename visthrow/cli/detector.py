@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from visthrow import config
-from visthrow.common.arguments import add_common
+from visthrow.common.arguments import ABOVE_ZERO, NUMBER, WHOLE, add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.training.device import resolve
 
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     train.add_argument("name", nargs="?", default="small", metavar="NAME", help="of configs/detector, or a file (default: small)")
     train.add_argument("--out", default="runs/detector", metavar="FOLDER", help="for checkpoint and weights (default: runs/detector)")
     train.add_argument("--textures", metavar="FOLDER", help="photographs for ground and walls (default: those of scikit-image)")
-    train.add_argument("--minutes", type=float, metavar="N", help="stop after so long; --resume goes on")
+    train.add_argument("--minutes", type=ABOVE_ZERO, metavar="N", help="stop after so long; --resume goes on")
     train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     add_common(train, json=False)
     check = actions.add_parser("check", help="recall and pixel error by nuisance, beside the OpenCV detector")
@@ -65,19 +65,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check.add_argument("--frames", type=int, default=100, metavar="N", help="a nuisance (default: 100)")
     check.add_argument("--known", default="pose", choices=KNOWN, help="what the detectors are told; track: as in flight (default: pose)")
     check.add_argument("--textures", metavar="FOLDER", help="photographs (default: those of scikit-image that were not trained on)")
-    check.add_argument("--seed", type=int, default=0, help="of the scenes")
+    check.add_argument("--seed", type=WHOLE, default=0, help="of the scenes")
     check.add_argument("--out", metavar="FILE", help="picture of the first frames of each nuisance with what was found, .png")
     add_common(check)
     throw = actions.add_parser("throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate")
     throw.add_argument("--policy", default="vision", metavar="POLICY", help="a shipped name or a file (default: vision)")
     throw.add_argument("--by", default="contours", choices=("learnt", "contours"), help="detector (default: contours)")
     throw.add_argument("--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)")
-    throw.add_argument("--target", type=float, default=2.0, metavar="M", help="distance (default: 2.0)")
+    throw.add_argument("--target", type=NUMBER, default=2.0, metavar="M", help="distance (default: 2.0)")
     throw.add_argument("--throws", type=int, default=20, metavar="N", help="each in a hall of its own (default: 20)")
     throw.add_argument("--jobs", type=int, default=1, metavar="N", help="processes; the throws do not depend on them (default: 1)")
     throw.add_argument("--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic")
-    throw.add_argument("--nuisances", type=float, default=0.5, metavar="X", help="0: clean, 1: as bad as in training (default: 0.5)")
-    throw.add_argument("--seed", type=int, default=0, help="of everything random")
+    throw.add_argument("--nuisances", type=NUMBER, default=0.5, metavar="X", help="0: clean, 1: as bad as in training (default: 0.5)")
+    throw.add_argument("--seed", type=WHOLE, default=0, help="of everything random")
     add_common(throw)
 
 

@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.jobs is not None and args.jobs < 1:
         raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
     out, jobs = Path(args.out), args.jobs or device.cores()
-    records = Path(args.records) if args.records else RECORDS
+    records = _records(args.records) if args.records else RECORDS
     folders = [_folder(name) for name in args.results]
     writable(out)
     if args.quick:
@@ -63,10 +63,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _records(name: str) -> Path:
+    """Folder of records, as ``visthrow sweep collect`` makes one. Raises StorageError: there is none."""
+    from visthrow.evidence.report.result_set import PARTS
+
+    if not any((Path(name) / part).is_dir() for part in PARTS):
+        came = "none of these in it" if Path(name).is_dir() else "no such folder"
+        raise StorageError(f"--records {name}: {came}; expected a folder of {', '.join(PARTS)}, as 'visthrow sweep collect' makes it")
+    return Path(name)
+
+
 def _folder(name: str) -> Path:
+    """Folder or file of results of throws. Raises StorageError: there is none."""
     path = Path(name)
-    if not path.exists():
-        raise StorageError(f"--results {name}: no such folder; expected one with results of throws, as runs/sweep/throws")
+    if not path.is_file() and not any(path.glob("*.json")):
+        came = "no *.json in it" if path.is_dir() else "no such folder"
+        raise StorageError(f"--results {name}: {came}; expected one with results of throws, as runs/sweep/throws")
     return path
 
 

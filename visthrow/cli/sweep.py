@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from visthrow.common.arguments import NUMBER
+
 DEFAULT_OUT = "runs/sweep"
 ACTIONS = ("run", "status", "collect", "work")
 
@@ -32,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     devices = "one training at once on each: cuda:0,cuda:1; with a cluster how many (default: auto)"
     add("--devices", metavar="NAMES", default="auto", help=devices)
     add("--jobs", type=int, metavar="N", help="throws on the reference plant at once (default: one a core)")
-    add("--minutes", type=float, help="end after so long with checkpoints; on a cluster the length of a job")
+    add("--minutes", type=NUMBER, help="end after so long with checkpoints; on a cluster the length of a job")
     add("--slurm", metavar="KEY=VALUE", action="append", help="submit jobs, with this option of sbatch; may be repeated")
     add("--records", metavar="FOLDER", help="collect: where to (default: records beside the results)")
     add("--units", metavar="NAMES", help="work: which, with commas between")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Any
 
-from visthrow.common.arguments import add_common
+from visthrow.common.arguments import NUMBER, WHOLE, add_common
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,15 +22,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     names = "a name of configs/train (state, vision, laptop, laptop_vision, paper, ...) or a TOML file of your own"
     parser.add_argument("config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder")
-    parser.add_argument("--seed", type=int, help="of everything random (default: 1, or that of the resumed run)")
+    parser.add_argument("--seed", type=WHOLE, help="of everything random (default: 1, or that of the resumed run)")
     parser.add_argument("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")
     parser.add_argument(
         "--from", dest="start", metavar="POLICY",
         help="start from this policy, a shipped name or a file, with the short schedule of configs/ppo/adapt.toml",
     )  # fmt: skip
     parser.add_argument("--iterations", type=int, metavar="N", help="stop after iteration N (default: the configuration's last)")
-    parser.add_argument("--minutes", type=float, metavar="T", help="stop after this time")
-    parser.add_argument("--until", type=float, metavar="ERROR", help="stop once throws at 2.0 m land so near on average [m]")
+    parser.add_argument("--minutes", type=NUMBER, metavar="T", help="stop after this time")
+    parser.add_argument("--until", type=NUMBER, metavar="ERROR", help="stop once throws at 2.0 m land so near on average [m]")
     parser.add_argument(
         "--evaluate-every", type=int, metavar="N",
         help="throw 200 times every N iterations (default: a twentieth of the time on a terminal, with --until and --view)",

@@ -1,8 +1,10 @@
 """Commands and the options that they share, and the exit status of a process."""
 
 import argparse
+import contextlib
 import importlib
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from visthrow.common.errors import suggest
@@ -12,6 +14,24 @@ Commands = Mapping[str, tuple[str, str]]
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+
+
+def checked(kind: type, good: Callable[[float], bool], expected: str) -> Callable[[str], float]:
+    """Return what reads a number of the command line that must be good."""
+
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if good(value := kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"'{text}'; expected {expected}")
+
+    return parse
+
+
+NUMBER = checked(float, math.isfinite, "a finite number")
+ABOVE_ZERO = checked(float, lambda x: 0.0 < x < math.inf, "a number above 0")
+WHOLE = checked(int, lambda x: x >= 0, "a whole number of 0 or more")
+PORT = checked(int, lambda x: 0 < x < 65536, "a port, 1 to 65535")
 
 
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
@@ -35,7 +55,7 @@ def add_conditions(parser: argparse.ArgumentParser, whose: str) -> None:
     """Add what throws are flown under: ``--plant``, ``--seed``, ``--config``, ``--allow``."""
     add = parser.add_argument
     add("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, the default), reference, or reference-realistic")
-    add("--seed", type=int, default=0, help="of starts, noise and plant (default: 0)")
+    add("--seed", type=WHOLE, default=0, help="of starts, noise and plant (default: 0)")
     add("--config", metavar="NAME", help=f"fly in this train config instead of {whose} own")
     allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length), which is told; may be repeated"
     add("--allow", action="append", default=[], metavar="KEY", help=allow)

@@ -168,7 +168,7 @@ class Policy:
         Returns:
             What differs by allowance: dotted key -> the value here, None where there is nothing.
         """
-        trained, now = _flat(self.contract, sections), _flat(contract_now, sections)
+        trained, now = flattened(self.contract, sections), flattened(contract_now, sections)
         known = sorted(trained.keys() | now.keys())
         differing = [key for key in known if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))]
         allowed = [key for key in differing if any(re.match(rf"{re.escape(name)}(?![^.\[])", key) for name in allow)]
@@ -306,7 +306,7 @@ def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
     return header
 
 
-def _flat(tree: Mapping[str, Any], sections: Collection[str] | None) -> dict[str, Any]:
+def flattened(tree: Mapping[str, Any], sections: Collection[str] | None = None) -> dict[str, Any]:
     """Flatten nested dictionaries and lists to dotted keys; an empty one stays as a value."""
     flat: dict[str, Any] = {}
 

@@ -296,11 +296,12 @@ def plant_of(experiment: Experiment) -> PlantParams:
     return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim, experiment.air, experiment.laws)
 
 
-def contract_of(experiment: Experiment) -> dict[str, Any]:
+def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any]:
     """What whoever flies a policy must share with its training; see :mod:`visthrow.onboard.policy`.
 
     The camera enters for vision policies only. Noise and randomisation are training matters and stay out. An entry whose
     field has a default enters where it differs from that: a policy from before the field was there fits what it is off in.
+    ``whole``: every entry that a contract may have, whatever the policy sees and flies.
     """
     from visthrow import config
     from visthrow.onboard.observations import layout_of
@@ -308,16 +309,16 @@ def contract_of(experiment: Experiment) -> dict[str, Any]:
 
     layout = layout_of(experiment.task.observation)
     contract = {
-        "observation": {**config.to_dict(experiment.task.observation, defaults=False), "dimension": layout.dimension},
-        "action": {**config.to_dict(experiment.task.action, defaults=False), "dimension": 5},
+        "observation": {**config.to_dict(experiment.task.observation, defaults=whole), "dimension": layout.dimension},
+        "action": {**config.to_dict(experiment.task.action, defaults=whole), "dimension": 5},
         "control_period": experiment.sim.control_period,
         "release": {"lag": experiment.release.lag, "threshold": experiment.release.threshold},
-        "vehicle": config.to_dict(experiment.vehicle, defaults=False),
-        "rope": config.to_dict(experiment.rope, defaults=False),
+        "vehicle": config.to_dict(experiment.vehicle, defaults=whole),
+        "rope": config.to_dict(experiment.rope, defaults=whole),
     }
-    if experiment.task.observation.layout == "vision":
+    if whole or experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
-    if experiment.fleet is not None:  # for any vehicle: conditions of one are not the policy's
+    if experiment.fleet is not None and not whole:  # for any vehicle: conditions of one are not the policy's
         contract["fleet"] = {"rope_length": experiment.fleet.rope_length, "total_mass": experiment.fleet.total_mass}
         contract["action"] = {"max_rate": list(experiment.task.action.max_rate), "dimension": 5}
         contract = {key: value for key, value in contract.items() if key not in ("vehicle", "rope", "release")}

@@ -1,5 +1,6 @@
 """A policy together with the experiment that it is flown in."""
 
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -7,8 +8,8 @@ from typing import Any
 
 from visthrow import config
 from visthrow.common import toml_text
-from visthrow.common.errors import MismatchError, PolicyError
-from visthrow.onboard.policy import Policy, find_policy
+from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
+from visthrow.onboard.policy import Policy, find_policy, flattened
 from visthrow.task import Experiment, contract_of
 from visthrow.task.fleet import specialised
 
@@ -27,7 +28,7 @@ def load_policy(name: str | Path, config_name: str | None = None, overrides: Ite
     """Load a policy and the experiment that it was trained in, or another one that fits its contract.
 
     Raises PolicyError: no such policy, or it does not carry its config and none was named; MismatchError: the config breaks the policy's
-    contract; the message names every difference; ConfigError: a wrong config or override.
+    contract; the message names every difference; ConfigError: a wrong config or override, or a part that no contract has.
 
     Args:
         name: of a shipped policy, or a file.
@@ -43,9 +44,12 @@ def load_policy(name: str | Path, config_name: str | None = None, overrides: Ite
         experiment = config.load(Experiment, config.find("train", config_name), [*own, *overrides])
     else:
         experiment = trained_in(policy, path, overrides)
+    now = contract_of(experiment)
+    for part in allow:
+        _check_part(part, (policy.contract, now, contract_of(experiment, whole=True)))
     try:
         within = _within(policy, experiment)
-        departures = policy.require(contract_of(experiment), allow=(*allow, *within))
+        departures = policy.require(now, allow=(*allow, *within))
         departures = {key: value for key, value in departures.items() if key.split("[")[0] not in within}
     except MismatchError as error:
         allowing = " ".join(f"--allow {key}" for key in error.keys)
@@ -53,6 +57,15 @@ def load_policy(name: str | Path, config_name: str | None = None, overrides: Ite
     if experiment.fleet is not None:  # one vehicle is flown, that of the config
         policy, experiment = specialised(policy, replace(experiment, fleet=replace(experiment.fleet, count=0)))
     return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment, departures)
+
+
+def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
+    """Raise ConfigError where a part that may be broken is in no contract."""
+    keys = {key for contract in contracts for key in flattened(contract)}
+    known = {key[: mark.start()] for key in keys for mark in re.finditer(r"[.\[]|$", key)}
+    if part not in known:
+        sections = sorted(name for name in known if "." not in name)
+        raise ConfigError(f"allow '{part}': a contract has {', '.join(sections)} and their entries, but not that; {suggest(part, known)}")
 
 
 def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) -> Experiment:

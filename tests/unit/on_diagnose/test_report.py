@@ -17,6 +17,7 @@ from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
 from visthrow.diagnose.select import held_out, point, result, search
 from visthrow.diagnose.throw.landing import Landings
+from visthrow.logs.flightlog import FlightLog
 
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
@@ -481,7 +482,12 @@ def test_flights_are_numbers():
     from visthrow.common.errors import DiagnoseError
     from visthrow.diagnose.inputs.opening import numbers
 
-    assert numbers("0, 3") == (0, 3)
-    assert numbers("") == ()
+    logs = [FlightLog({}, {"source": f"runs/{name}.npz"}) for name in "abcd"]
+    assert numbers("0, 3", logs) == (0, 3)
+    assert numbers("", logs) == ()
     with pytest.raises(DiagnoseError, match="such as 0,3"):
-        numbers("first")
+        numbers("first", logs)
+    with pytest.raises(DiagnoseError, match=r"no flight 7; there are 0 \(a\.npz\), 1 \(b\.npz\)"):
+        numbers("1,7", logs)
+    with pytest.raises(DiagnoseError, match="leaves no flight"):
+        numbers("0,1,2,3", logs)

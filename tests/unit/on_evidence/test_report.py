@@ -189,8 +189,12 @@ def test_the_command_reports_from_records(tmp_path, full, capsys):
     assert "realistic reference plant" in printed
     assert "0 trainings" in printed
     assert (out / "report.html").stat().st_size > 50_000
-    assert cli.main(["report", "--results", str(tmp_path / "none"), "--out", str(out)]) == 2
-    assert "no such folder" in capsys.readouterr().err
+    for option in ("--results", "--records"):
+        assert cli.main(["report", option, str(tmp_path / "none"), "--out", str(tmp_path / "other")]) == 2
+        assert "no such folder" in capsys.readouterr().err
+        assert cli.main(["report", option, str(tmp_path), "--out", str(tmp_path / "other")]) == 2
+        assert "in it; expected" in capsys.readouterr().err
+        assert not (tmp_path / "other").exists()
 
 
 def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch):

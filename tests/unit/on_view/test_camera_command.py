@@ -222,6 +222,7 @@ def test_the_format_is_told_from_the_text(kind, tmp_path):
         (["{folder}", "--out", "{out}"], r"--board \(missing\); expected --board chessboard"),
         (["{folder}", "--board", "charuco", "7", "5", "0.04", "--out", "{out}"], "marker of 0.0 m; expected a side above 0"),
         (["{folder}", "--board", "chessboard", "7", "5", "0.04", "--out", "{out}"], "no picture in"),
+        (["{ocam}", "--out", "{notes}"], r"notes\.txt; expected a file that ends in \.toml"),
     ],
 )
 def test_wrong_input_is_named(words, message, tmp_path, capsys):
@@ -232,3 +233,4 @@ def test_wrong_input_is_named(words, message, tmp_path, capsys):
     filled = [w.format(notes=notes, ocam=ocam, folder=folder, out=tmp_path / "c.toml") for w in words]
     assert main(["camera", "calibrate", *filled]) == 2
     assert re.search(message, capsys.readouterr().err)
+    assert notes.read_text() == "not a calibration\n"

@@ -166,6 +166,24 @@ def test_config_mistakes(arguments, said, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["camera", "show", "fisheye", "--target", "nan", "0"], "--target: 'nan'; expected a finite number"),
+        (["camera", "show", "fisheye", "--height", "-1"], "--height: '-1'; expected a number above 0"),
+        (["train", "state", "--minutes", "inf"], "--minutes: 'inf'; expected a finite number"),
+        (["diagnose", "map", "a.csv", "--mass", "-2"], "--mass: '-2'; expected a number above 0"),
+        (["fly", "--seed", "-1"], "--seed: '-1'; expected a whole number of 0 or more"),
+        (["hil", "check", "--speed", "0"], "--speed: '0'; expected a number above 0"),
+        (["hil", "fake", "--msp-port", "70000"], "--msp-port: '70000'; expected a port, 1 to 65535"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(words)
+    assert said in capsys.readouterr().err
+
+
 def test_devices_that_are_not_there_are_refused():
     assert device.resolve("cpu") == "cpu"
     assert device.resolve("auto") in ("cpu", "cuda:0")

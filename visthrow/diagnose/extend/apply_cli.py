@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visthrow import config
+from visthrow.common.arguments import NUMBER
 from visthrow.common.errors import DiagnoseError
 
 DEFAULT_PLANTS = 64
@@ -36,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--laws", type=int, default=0, metavar="N",
         help="write the laws of the N-th best explanation outside the catalogue, which belong together, as well (default: 0, none)",
     )
-    parser.add_argument("--hover", type=float, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1")
-    parser.add_argument("--delay", type=float, metavar="S", help="with a blackbox: from a command to the mixer, where it is known [s]")
+    parser.add_argument("--hover", type=NUMBER, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1")
+    parser.add_argument("--delay", type=NUMBER, metavar="S", help="with a blackbox: from a command to the mixer, where it is known [s]")
     parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
 
 

@@ -2,9 +2,9 @@
 
 import argparse
 import json
-import math
 from pathlib import Path
 
+from visthrow.common.arguments import ABOVE_ZERO
 from visthrow.common.errors import LogError
 
 
@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose check flight.csv --config mine.toml\n"
     )
     parser.add_argument("file", metavar="FILE", help="a table, or a recording of another tool")
-    parser.add_argument("--mass", metavar="KG", type=float, help="of the vehicle alone, from a scale")
+    parser.add_argument("--mass", metavar="KG", type=ABOVE_ZERO, help="of the vehicle alone, from a scale, in kilograms")
     parser.add_argument("--out", metavar="FILE", help="write the mapping to this file")
 
 
@@ -27,8 +27,6 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs.proposal import propose
     from visthrow.logs import table_of
 
-    if args.mass is not None and not 0.0 < args.mass < math.inf:
-        raise LogError(f"--mass {args.mass:g}; expected kilograms above 0")
     found = propose(table_of(args.file), args.file, args.mass)
     text = toml_of(found, Path(args.file).name)
     if args.out:

@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from visthrow.common.arguments import WHOLE, add_common
 from visthrow.common.errors import ConfigError, DiagnoseError, suggest
 from visthrow.diagnose.models.interface import Model
+from visthrow.logs.check.run import label
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_PLANT = "state"
@@ -15,8 +17,6 @@ THROW = "throw"  # name of the model that is no setup's own: the whole throw
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that explain, plan and blind share."""
-    from visthrow.common.arguments import add_common
-
     parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
     parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how tables are read, and which model")
     parser.add_argument(
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the configured value behind this effect was measured with this deviation, such as mass_quad=0.0003 from a scale",
     )  # fmt: skip
     parser.add_argument("--without", metavar="FLIGHTS", default="", help="numbers of flights to leave out, from 0, by commas")
-    parser.add_argument("--seed", type=int, default=0, help="of the null worlds and bootstraps (default: 0)")
+    parser.add_argument("--seed", type=WHOLE, default=0, help="of the null worlds and bootstraps (default: 0)")
     add_common(parser)
 
 
@@ -108,9 +108,16 @@ def _only(model: Model, names: Sequence[str]) -> Model:
     return _Part(model, [known.index(name) for name in names])
 
 
-def numbers(text: str) -> tuple[int, ...]:
-    """Flights named on the command line. Raises DiagnoseError: something else than numbers between commas."""
+def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:
+    """Flights named on the command line. Raises DiagnoseError: no numbers between commas, no such flight, or all of them."""
     try:
-        return tuple(int(part) for part in text.split(",") if part.strip())
+        found = tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:
         raise DiagnoseError(f"--without {text}; expected numbers of flights between commas, such as 0,3") from error
+    listed = ", ".join(f"{i} ({label(log, i)})" for i, log in enumerate(logs))
+    for number in found:
+        if not 0 <= number < len(logs):
+            raise DiagnoseError(f"--without {text}: no flight {number}; there are {listed}")
+    if len(set(found)) == len(logs):
+        raise DiagnoseError(f"--without {text} leaves no flight; there are {listed}")
+    return found

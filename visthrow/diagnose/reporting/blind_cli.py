@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
 from visthrow.common.errors import DiagnoseError
 
 
@@ -17,8 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow diagnose blind flights/*.npz --verify 5      and five hidden in the measurements, each searched for anew\n"
     )
     shared(parser)
-    parser.add_argument("--verify", type=int, default=0, metavar="N", help="also hide N effects in the measurements themselves")
-    parser.add_argument("--floors", type=float, default=10.0, help="size of those, in floors (default: 10)")
+    parser.add_argument("--verify", type=WHOLE, default=0, metavar="N", help="also hide N effects in the measurements themselves")
+    parser.add_argument("--floors", type=ABOVE_ZERO, default=10.0, help="size of those, in floors (default: 10)")
     add_out(parser, "out/blind", "of picture and JSON")
 
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.reporting.explain_cli import explained
 
     model, logs = opening.open_model(args)
-    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without), laws=False)
+    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     hidden = blind.hide(diagnosis, seed=args.seed)

@@ -39,7 +39,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.reporting import report
 
     model, logs = opening.open_model(args)
-    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without), lambda x: print(x, flush=True))
+    without = opening.numbers(args.without, logs)
+    diagnosis = explained(model, logs, setup.known(args.config), args.seed, without, lambda x: print(x, flush=True))
     gain = None
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.made_with(args))

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
 from visthrow.common.errors import DiagnoseError, suggest
 
 
@@ -21,9 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared(parser)
     parser.add_argument("--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all")
     parser.add_argument("--about", metavar="NAMES", default="", help="plan for these effects, by commas; default: all unclear ones")
-    parser.add_argument("--steps", type=int, default=6, help="generations of the optimiser; 0: only rank manoeuvres (default: 6)")
+    parser.add_argument("--steps", type=WHOLE, default=6, help="generations of the optimiser; 0: only rank manoeuvres (default: 6)")
     parser.add_argument("--hall", metavar="X,Y,Z", default="5,5,2.6", help="room that the path stays in [m] (default: 5,5,2.6)")
-    parser.add_argument("--speed", type=float, default=3.0, help="of the vehicle at most [m/s] (default: 3)")
+    parser.add_argument("--speed", type=ABOVE_ZERO, default=3.0, help="of the vehicle at most [m/s] (default: 3)")
     add_out(parser, "out/plan", "of references and JSON")
 
 
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
     model, logs = opening.open_model(args)
     limits = _limits(args)
-    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without), laws=False)
+    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")

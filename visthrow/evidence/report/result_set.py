@@ -15,6 +15,8 @@ SHIPPED = ("state", "vision")  # the paper's two policies, as they come with the
 
 ANY = object()  # any departures
 
+PARTS = ("throws", "training", "findings")  # folders of a folder of records
+
 
 @dataclass(frozen=True)
 class ResultSet:
@@ -69,13 +71,13 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), not
     A later one counts over an earlier one; what an older protocol flew is left out. StorageError for what cannot be read.
     """
     records = [Path(place) for place in records]
-    found = load_all([*(place / "throws" for place in records), *folders]).values()
+    found = load_all([*(place / PARTS[0] for place in records), *folders]).values()
     runs: dict[str, dict] = {}
     findings: dict[str, str] = {}
     for place in records:
-        for path in sorted((place / "training").glob("*.json")):
+        for path in sorted((place / PARTS[1]).glob("*.json")):
             runs.update({run.get("name", f"{run['run']}-{run['train_seed']}"): run for run in runs_of(path)})
-        for path in sorted((place / "findings").glob("*.md")):
+        for path in sorted((place / PARTS[2]).glob("*.md")):
             findings[path.stem] = path.read_text(encoding="utf-8").strip()
     today = [result for result in found if result.unit.get("protocol") == PROTOCOL]
     return ResultSet(tuple(join(today)), tuple(runs.values()), findings, note)

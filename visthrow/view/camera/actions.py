@@ -62,6 +62,9 @@ def pictures_of(names: list[str]) -> tuple[list[Path], list[np.ndarray]]:
 
 def calibrate(args: argparse.Namespace) -> int:
     """Write a camera config."""
+    out = Path(args.out)
+    if out.suffix != ".toml":
+        raise ConfigError(f"--out {out}; expected a file that ends in .toml, as every configuration")
     like = config.load(CameraParams, config.find("camera", args.like))
     first = Path(args.source[0])
     if args.board or first.is_dir() or first.suffix.lower() in PICTURES:
@@ -81,7 +84,6 @@ def calibrate(args: argparse.Namespace) -> int:
             said += ", the same model: nothing was fitted"
     text = f"# Camera {said}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
     params = dataclasses.replace(like, fisheye=lens)
-    out = Path(args.out)
     atomic_write(out, (text + config.dumps(params)).encode())
     print(f"{said}\n{sentence(lens)}\n{out}  train with it: visthrow train vision --set camera={out}")
     return 0
@@ -138,6 +140,9 @@ def sentence(lens: FisheyeParams) -> str:
 
 def show(args: argparse.Namespace) -> int:
     """Write the picture, print what is in view."""
+    out = Path(args.out)
+    if out.suffix.lower() not in PICTURES:
+        raise ConfigError(f"--out {out}; expected a picture, one of {', '.join(PICTURES)}")
     params = config.load(CameraParams, config.find("camera", args.config))
     camera, lens = KeypointCamera(params), Fisheye(params.fisheye)
     pos_w, rot_wb = torch.tensor([0.0, 0.0, args.height]), torch.eye(3)
@@ -147,9 +152,6 @@ def show(args: argparse.Namespace) -> int:
     drawn = draw_overlay(camera, points[0], valid[0], image)
     if args.board:
         _draw_board(drawn, image, lens, args)
-    out = Path(args.out)
-    if out.suffix.lower() not in PICTURES:
-        raise ConfigError(f"--out {out}; expected a picture, one of {', '.join(PICTURES)}")
     pictures = {out: drawn}
     if args.straight:
         pictures[out.with_name(f"{out.stem}_straight{out.suffix}")] = _straight(drawn, lens, args.straight)
