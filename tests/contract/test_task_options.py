@@ -129,7 +129,7 @@ def test_departures_are_refused_unless_allowed_and_then_named():
     loaded = load_policy("state", "state", change, allow=["rope.length", "vehicle.motor"])
     assert loaded.departures == {"rope.length": 0.4, "vehicle.motor.time_constant": 0.05}
     assert load_policy("state").departures == {}
-    others = ["camera.mount", "rope.payload_drag", "vehicle.body.com_offset[2]"]  # of vision, or at its default: a contract may have them
+    others = ["camera.mount", "rope.payload_drag", "vehicle.body.com[2]"]  # of vision, or at its default: a contract may have them
     assert load_policy("state", allow=others).departures == {}
 
 
