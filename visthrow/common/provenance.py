@@ -3,6 +3,7 @@
 import os
 import platform
 import re
+import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
@@ -37,8 +38,13 @@ def commit() -> str:
 
 
 def command() -> str:
-    """Return the command line with absolute folders left out."""
-    return " ".join(_FOLDERS.sub("", argument) for argument in sys.argv)
+    """Return the command line as a shell takes it, with absolute folders left out: ``visthrow train``, ``python -m tests.bench.train``."""
+    program, *words = (_FOLDERS.sub("", argument) for argument in sys.argv)
+    module = getattr(sys.modules["__main__"], "__spec__", None)
+    if program.endswith(".py"):
+        name = module.name.removesuffix(".__main__") if module else ""
+        program = f"python -m {name}" if name else f"python {program}"
+    return " ".join([program, *map(shlex.quote, words)])
 
 
 def versions() -> dict[str, str]:

@@ -9,6 +9,7 @@ from visthrow.view.parts import aligned
 
 FOLDER = Path(__file__).with_name("records") / "bench"
 KEYS = {"bench", "title", "provenance", "tables", "notes", "figures"}
+"""Of every record. One that another version measured has the command of today besides, ``today``."""
 
 
 def body(record: dict[str, Any]) -> str:
@@ -25,7 +26,14 @@ def origin(record: dict[str, Any]) -> str:
     if processors.get("gpu"):
         machine += f"; {', '.join(processors['gpu'])}"
     versions = ", ".join(f"{name} {version}" for name, version in came["versions"].items())
-    return f"`{came['command']}`, {came['time']}, commit {came['commit'][:12]}\n\n{machine}\n\n{versions}"
+    return f"{made_by(record)}\n\n{machine}\n\n{versions}"
+
+
+def made_by(record: dict[str, Any]) -> str:
+    """Command, time and commit of a record, and the command that measures it today where that is another."""
+    came = record["provenance"]
+    text = f"`{came['command']}`, {came['time']}, commit {came['commit'][:12]}"
+    return f"{text}; today, from a clone: `{record['today']}`" if record.get("today") else text
 
 
 def load(path: Path) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """Benchmarks run with tiny sizes, count what the kernel does, and keep well-formed records; no time is judged."""
 
+import importlib
 import json
 import os
+import shlex
 import sys
 from pathlib import Path
 
@@ -9,12 +11,13 @@ import numpy as np
 import pytest
 
 from tests.bench import camera as bench_camera
-from tests.bench import commands, fleet, mpc, report, sim_gpu, time_to_error, train
+from tests.bench import commands, fleet, mpc, report, sim_gpu, start, time_to_error, train
 from tests.bench import mujoco_warp as bench_mujoco_warp
 from tests.bench import sim as sim_cpu
 from visthrow import cli, config
 from visthrow.common.errors import StorageError, VisthrowError
 from visthrow.evidence import measurements
+from visthrow.onboard.policy import find_policy
 from visthrow.task import Experiment, plant_of
 
 
@@ -131,6 +134,33 @@ def test_shipped_records_are_well_formed():
         assert record["provenance"]["versions"]["warp-lang"], path.name
         assert measurements.body(record).startswith(f"### {record['title']}")
         assert measurements.origin(record)
+
+
+TORCHRUN = "torchrun --nproc-per-node 2 -m visthrow.cli"
+RECORDS = sorted(measurements.FOLDER.glob("*.json"))
+
+
+@pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
+def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
+    """Its options are taken, its configurations are there and take their changes, its policies are there or made by the line before."""
+    monkeypatch.setattr(start, "main", lambda parser, run, argv: parser.parse_args(argv))
+    record = measurements.load(path)
+    assert f"today, from a clone: `{record['today']}`" in measurements.origin(record)
+    made = []
+    for line in record["today"].split("; "):
+        words = shlex.split(line.replace(TORCHRUN, "visthrow"))
+        if words[0] == "visthrow":
+            args = cli.build_parser().parse_args(words[1:])
+            made.append(f"{args.out}/policy.npz")
+            names = [args.config]
+        else:
+            assert words[:2] == ["python", "-m"]
+            args = importlib.import_module(words[2]).main(words[3:])
+            names = getattr(args, "configs", [])
+        for name in names:
+            config.load(Experiment, config.find("train", name), args.overrides)
+        for name in {*getattr(args, "policies", []), *([args.policy] if hasattr(args, "policy") else [])} - {*made}:
+            find_policy(name)
 
 
 def test_records_refuse_what_they_are_not(kept):

@@ -5,6 +5,7 @@ import json
 import socket
 import sys
 import tomllib
+import types
 from dataclasses import dataclass
 
 import pytest
@@ -32,6 +33,17 @@ def test_record_is_complete_and_free_of_names(monkeypatch):
     text = json.dumps({key: record[key] for key in record if key != "command"})
     for private in (socket.gethostname(), f"/{getpass.getuser()}/", "/home/"):
         assert private not in text
+
+
+def test_a_command_is_one_that_a_shell_takes(monkeypatch):
+    main = types.ModuleType("__main__")
+    main.__spec__ = types.SimpleNamespace(name="tests.bench.train")
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    monkeypatch.setattr(sys, "argv", ["/root/tests/bench/train.py", "state", "--set", 'algorithm="first_order"'])
+    assert provenance.command() == "python -m tests.bench.train state --set 'algorithm=\"first_order\"'"
+    main.__spec__.name = "visthrow.cli.__main__"
+    monkeypatch.setattr(sys, "argv", ["/root/visthrow/cli/__main__.py", "demo"])
+    assert provenance.command() == "python -m visthrow.cli demo"
 
 
 def test_commit_of_a_copy_without_history_is_what_it_was_told(monkeypatch, tmp_path):

@@ -93,7 +93,7 @@ def _steps() -> list[Grid | Text]:
     grids = []
     for record in found:
         cpu, (table,) = record["provenance"]["processors"]["cpu"], record["tables"]
-        note = f"`{record['provenance']['command']}`, commit {record['provenance']['commit'][:12]}. {record['notes'][0]}"
+        note = f"{measurements.made_by(record)}. {record['notes'][0]}"
         rows = tuple(map(tuple, table["rows"]))
         grids.append(Grid(f"Step of the controller, one core of an {cpu}", tuple(table["header"]), rows, note, heads=2))
     return grids
