@@ -32,6 +32,7 @@ PLANT, MOTORS, BALL = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_p
 SITL = {"betaflight-sitl": MOTORS, "ardupilot-sitl": MOTORS, "px4-sih": BALL}
 """Kinds of fake that are a bridge to a firmware in software, and what makes the vehicle behind it."""
 
+MSP_PORT = "--msp-port PORT, and in the run --set {kind}.device={device}:127.0.0.1:PORT"  # of one that is taken
 BRIDGE_ID = (254, 190)  # MAVLink ids of the bridge where it listens to an autopilot itself
 BALL_LAG = 0.06  # from the mechanism's output to separation below PX4's vehicle [s], as `visthrow.throws.wire_plant.MECHANISM`
 
@@ -43,14 +44,16 @@ def fake(args: argparse.Namespace) -> int:
     if args.kind not in {*KINDS, *SITL}:
         raise RunError(f"--kind {args.kind}; {suggest(args.kind, {*KINDS, *SITL})}")
     plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
-    link = Link(open_port(check_device(args.device)), *VEHICLE_ID, key=key_of(args))
+    link = Link(open_port(check_device(args.device), "--device udpout:127.0.0.1:PORT"), *VEHICLE_ID, key=key_of(args))
     with ExitStack() as ends:
         if args.kind in SITL:
             flown = _bridge(args, (plant, link, mocap, args.seed, options), ends)
         else:
-            port = ListeningPort(args.msp_port) if args.kind == "betaflight" else None
-            if args.kind == "crazyflie":
-                port = AnsweringPort(check_device(f"udp:127.0.0.1:{args.msp_port}"))
+            port, other = None, MSP_PORT.format(kind=args.kind, device="tcp" if args.kind == "betaflight" else "udpout")
+            if args.kind == "betaflight":
+                port = ListeningPort(args.msp_port, other)
+            elif args.kind == "crazyflie":
+                port = AnsweringPort(check_device(f"udp:127.0.0.1:{args.msp_port}"), other)
             flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
             print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
         ends.callback(flown.close)
@@ -83,7 +86,7 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
     elif args.kind == "ardupilot-sitl":
         flown, said = ArduPilotSitl(*vehicle, params.ardupilot), "waiting for ArduPilot: --model json:127.0.0.1"
     else:
-        flown = Px4Sih(*vehicle, params.px4, Link(open_port(check_device(args.autopilot)), *BRIDGE_ID))
+        flown = Px4Sih(*vehicle, params.px4, Link(open_port(check_device(args.autopilot), "--autopilot udp:127.0.0.1:PORT"), *BRIDGE_ID))
         said = f"waiting for PX4 on {args.autopilot}"
     print(said, file=sys.stderr, flush=True)
     return flown

@@ -20,7 +20,7 @@ from hil.fakes.crazyflie import FakeCrazyflie
 from hil.fakes.mocap import MocapParams
 from hil.fakes.px4 import FakePx4
 from hil.links.clock import Clock
-from hil.links.device import LARGEST_DATAGRAM, UdpPort
+from hil.links.device import LARGEST_DATAGRAM, UdpPort, refused
 from hil.links.mavlink_link import Link
 from visthrow.common.errors import suggest
 
@@ -46,14 +46,17 @@ class ListeningPort:
 
     whole, sender, peer = False, None, None
 
-    def __init__(self, number: int) -> None:
-        """Listen on a port of the loopback address; raises `LinkError` where it is taken, or there is none of that number."""
+    def __init__(self, number: int, other: str = "") -> None:
+        """Listen on a port of the loopback address; raises `LinkError` where it is taken, or there is none of that number.
+
+        ``other``: as of `hil.links.device.refused`.
+        """
         if not 1 <= number <= 65535:
             raise LinkError(f"tcp port {number}; expected 1 to 65535")
         try:
             self._server = socket.create_server(("127.0.0.1", number), backlog=1)
         except OSError as error:
-            raise LinkError(f"cannot listen on tcp port {number}: {error.strerror}") from error
+            raise refused(f"tcp:127.0.0.1:{number}", number, error, other) from error
         self._server.setblocking(False)
         self._peer: socket.socket | None = None
 

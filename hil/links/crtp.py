@@ -114,4 +114,4 @@ class CflibPort:
 
 def open_crtp(device: str, remote: bool) -> Any:
     """Open the port of a device; raises `LinkError` where it is refused, or cannot be opened."""
-    return CflibPort(device) if device.startswith(CFLIB) else open_port(check_device(device, remote=remote))
+    return CflibPort(device) if device.startswith(CFLIB) else open_port(check_device(device, remote=remote), "--set crazyflie.device=...")

@@ -4,6 +4,7 @@
 port. HOST is a numeric address; other than loopback ones only where the config says so.
 """
 
+import errno
 import ipaddress
 import os
 import re
@@ -94,13 +95,32 @@ class _Opened:
         self._open.close()
 
 
+def refused(port: str, number: int, error: OSError, other: str = "") -> LinkError:
+    """Return the error that says why a port of this machine cannot be listened on and, where another program has it, what to do.
+
+    Args:
+        port: Its name, as ``udp:127.0.0.1:14560``.
+        number: Its number.
+        error: What the system said.
+        other: Option that names another port.
+    """
+    if error.errno == errno.EADDRNOTAVAIL:
+        return LinkError(f"cannot listen on {port}: no such address on this machine; expected one of its own, or 0.0.0.0 for all of them")
+    if error.errno != errno.EADDRINUSE:
+        return LinkError(f"cannot listen on {port}: {error.strerror}")
+    return LinkError(
+        f"cannot listen on {port}: another program has it, perhaps a second `visthrow hil`, a ground station or a simulator; "
+        f"`ss -{port[0]}lnp 'sport = :{number}'` shows which. End it, or take another port{other and ': ' + other}"
+    )
+
+
 class UdpPort(_Opened):
     """A UDP socket; one that listens hears everybody, and says who sent what."""
 
     whole = True
 
-    def __init__(self, device: Device) -> None:
-        """Open it; raises `LinkError` where the address is taken or not this machine's."""
+    def __init__(self, device: Device, other: str = "") -> None:
+        """Open it; raises `LinkError` where the address is taken or not this machine's. ``other``: as of `refused`."""
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._open = socket.socket(family, socket.SOCK_DGRAM)
         self._open.setblocking(False)
@@ -111,7 +131,7 @@ class UdpPort(_Opened):
                 self._open.bind((device.host, device.port))
         except OSError as error:
             self._open.close()
-            raise LinkError(f"cannot open {device.kind}:{device.host}:{device.port}: {error.strerror}") from error
+            raise refused(f"{device.kind}:{device.host}:{device.port}", device.port, error, other) from error
 
     def read(self) -> bytes | None:
         try:
@@ -180,6 +200,11 @@ class SerialPort(_Stream):
         self._get, self._put = lambda: self._open.read(self._open.in_waiting or 1), self._open.write
 
 
-def open_port(device: Device) -> Port:
-    """Open the port of a checked device string; raises `LinkError` where it cannot be opened."""
-    return {"udp": UdpPort, "udpout": UdpPort, "tcp": TcpPort, "serial": SerialPort}[device.kind](device)
+def open_port(device: Device, other: str = "") -> Port:
+    """Open the port of a checked device string; raises `LinkError` where it cannot be opened.
+
+    ``other``: the option that names another device; it stands in the message of a port that is taken.
+    """
+    if device.kind in ("udp", "udpout"):
+        return UdpPort(device, other)
+    return TcpPort(device) if device.kind == "tcp" else SerialPort(device)

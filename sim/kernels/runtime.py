@@ -1,35 +1,9 @@
-"""Start of Warp: quiet, forward only, without the notice that a machine has no GPU."""
-
-import os
-import sys
-import tempfile
+"""Start of Warp for the simulator: forward only, and quiet."""
 
 import warp as wp
 
-NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+from camera.warp_start import start
 
-
-def start() -> None:
-    """Initialise Warp once. Its native library reports a missing CUDA driver on stderr at every start; a CPU run needs no GPU.
-
-    Everything else that it prints is passed on.
-    """
-    wp.config.log_level = wp.LOG_WARNING
-    wp.config.enable_backward = False
-    wp.config.max_unroll = 4  # longer unrolled loops cost half a minute of compile time and gain nothing
-    sys.stderr.flush()
-    saved = os.dup(2)
-    with tempfile.TemporaryFile() as caught:
-        os.dup2(caught.fileno(), 2)
-        try:
-            wp.init()
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-        caught.seek(0)
-        rest = b"".join(line for line in caught if NO_DRIVER not in line)
-    if rest:
-        os.write(2, rest)
-
-
+wp.config.enable_backward = False
+wp.config.max_unroll = 4  # longer unrolled loops cost half a minute of compile time and gain nothing
 start()

@@ -15,7 +15,7 @@ ONBOARD = ("visthrow.config", "visthrow.common", "visthrow.onboard", "visthrow.l
 
 MAY_USE = {
     "camera": {"camera"},
-    "sim": {"sim"},
+    "sim": {"sim", "camera.warp_start"},
     "visthrow": {"visthrow", "sim", "camera"},
     "hil": {"hil", "camera", *ONBOARD},
 }

@@ -27,9 +27,11 @@ class Renderer:
         """
         import warp as wp
 
+        from camera.warp_start import start
+
         if samples < 1:
             raise ValueError(f"renderer: samples {samples}; expected 1 or more")
-        wp.config.log_level = wp.LOG_WARNING
+        start()
         self.lens, self.device, self.samples = lens, device, samples
         pixels = pyramid(photographs() if files is None else files)
         self.textures = len(pixels)

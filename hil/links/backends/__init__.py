@@ -44,7 +44,7 @@ def make_backend(
         device = check_device(vehicle.device, remote=vehicle.remote)
         if device.kind not in ("tcp", "serial"):
             raise RunError(f"betaflight.device {vehicle.device}: MSP is a stream; expected tcp:... or serial:...")
-        port = open_port(device)
+        port = open_port(device, "--set betaflight.device=...")
         backend = Betaflight(port if folder is None else LoggedPort(port, folder / MSP_LOG), vehicle, write, tell)
     elif name == "crazyflie":
         backend = Crazyflie(open_crtp(vehicle.device, vehicle.remote), vehicle)

@@ -64,8 +64,8 @@ def open_source(
         return Recorded(poses), None, True
     own = source.kind == "mavlink" and source.device is not None
 
-    def opened(device: str, tlog: str, who: list[Party]) -> Link:
-        port = open_port(check_device(device, remote=params.link.remote))
+    def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
+        port = open_port(check_device(device, remote=params.link.remote), f"--set {named}=udp:127.0.0.1:PORT, {SENDER}")
         roster = Roster(who, params.link.allow, tell)
         link = Link(port, params.link.system, params.link.component, TlogWriter(folder / tlog), roster, key)
         if params.delay.synchronise:
@@ -74,12 +74,12 @@ def open_source(
 
     link = None
     if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
-        link = opened(params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
+        link = opened("link.device", params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
     if source.kind == "mocap":
         return open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link), link, False
     if not own:
         return MavlinkSource(link, source.senders, clock.now), link, False
-    poses = opened(source.device, POSES_TLOG, parties(params, True, False))
+    poses = opened("source.device", source.device, POSES_TLOG, parties(params, True, False))
     return MavlinkSource(poses, source.senders, clock.now, link), link, False
 
 
@@ -91,6 +91,7 @@ def open_mocap(
     return {"natnet": NatNetSource, "ros2": Ros2Source}.get(params.system, MotionCaptureSource)(params, bodies, clock, link)
 
 
+SENDER = "and that port in what sends the poses (visthrow hil fake --device udpout:127.0.0.1:PORT)"  # of a port that is taken
 LEAST = 50  # poses below which nothing is said
 _KINDS = {"pos": ("m", "world"), "quat": ("1", "world"), "vel": ("m/s", "world"), "rate": ("rad/s", "body")}
 

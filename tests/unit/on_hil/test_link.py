@@ -3,6 +3,8 @@
 import math
 import os
 import socket
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +16,11 @@ from hil.links.mavlink_link import Link, attitude_target, pose_from_message, qua
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Roster
 from hil.links.writer import TlogWriter
+from hil.params import HilParams
+from hil.poses.sources.opening import open_source
 from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
+from visthrow import config
 
 FLOAT32 = 2e-7
 """What a quantity near 1 loses on the wire."""
@@ -113,6 +118,20 @@ def test_loopback_only_unless_told_otherwise():
     assert check_device("serial:/dev/ttyACM0:921600").port == 921600
     with pytest.raises(LinkError, match="cannot connect"):
         open_port(check_device("tcp:127.0.0.1:9"))
+
+
+def test_a_port_that_is_taken_says_who_may_have_it_and_what_names_another():
+    number = free_port()
+    first = open_port(check_device(f"udp:127.0.0.1:{number}"))
+    params = config.load(HilParams, config.find("hil", "fake"), [f"link.device=udp:127.0.0.1:{number}"])
+    with pytest.raises(LinkError) as caught:
+        open_source(params, Path("unused"), time.monotonic)
+    first.close()
+    for words in ("another program has it", f"`ss -ulnp 'sport = :{number}'` shows which", "--set link.device=udp:127.0.0.1:PORT",
+                  "hil fake --device udpout:127.0.0.1:PORT"):  # fmt: skip
+        assert words in str(caught.value)
+    with pytest.raises(LinkError, match="no such address on this machine"):
+        open_port(check_device("udp:192.0.2.1:14550", remote=True))  # of the range for examples
 
 
 def test_what_the_fields_mean():

@@ -1,6 +1,8 @@
 """``visthrow camera``: a config from every kind of calibration, which then trains and flies; whether a lens fits its pictures."""
 
 import re
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -190,6 +192,14 @@ def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, caps
     assert coloured.sum() > 35 * 8, "35 corners and the keypoints are drawn in colour on a grey picture"
     assert np.ptp(before.astype(int), axis=-1).max() == 0
     assert cv2.imread(str(tmp_path / "seen_straight.png")).shape == (320, 320, 3)
+
+
+def test_a_rendered_scene_says_nothing_of_a_missing_gpu(tmp_path):
+    """In a process of its own: Warp's library writes to stderr when it starts, once."""
+    words = [sys.executable, "-m", "visthrow.cli", "camera", "show", "fisheye", "--out", str(tmp_path / "a.png")]
+    shown = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "in view: 4 of 4 keypoints of the goal" in shown.stdout
+    assert shown.stderr == ""
 
 
 def test_ocam_agrees_with_its_own_inverse_polynomial(tmp_path):
