@@ -25,11 +25,14 @@ from camera.params import CameraParams, FisheyeParams, MountParams
 from hil.errors import SourceError
 from hil.poses.detection import Detection, rotation_of
 from hil.poses.pose import Quaternion, Vector
-from visthrow.common.errors import ConfigError
+from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bound, Bounded
 
 STAMPS = "stamps.csv"
 """Beside the pictures of a folder, or named as a video is with this ending: a line ``file,time_s`` (``frame,time_s``) each."""
+
+DETECTORS: dict[str, type[Detector]] = {"contours": Detector, "learnt": LearntDetector}
+"""Name -> what looks at a picture. A program adds its own before it calls `visthrow.cli.main`."""
 
 SAME_PLACE = 0.01  # between the lens of the pictures and that of training [m]: directions of near things would differ by more than a degree
 
@@ -46,7 +49,7 @@ class ImageParams(Bounded):
     fisheye: FisheyeParams | None = None  # the lens; left out, that of training
     mount: MountParams | None = None  # left out, that of training
     detector: DetectorParams = field(default_factory=DetectorParams)
-    by: Literal["contours", "learnt"] = "contours"  # colour and shape with OpenCV, or the learnt networks
+    by: str = "contours"  # of DETECTORS: colour and shape with OpenCV, the learnt networks, or one that a program added
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,7 +72,9 @@ class Eyes:
     hint: Hint | None = None
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
-        """Take lens and mount of the pictures; raises `ConfigError` for a lens that is not where that of training is."""
+        """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a lens that is not where that of training is."""
+        if params.by not in DETECTORS:
+            raise ConfigError(f"images.by '{params.by}'; {suggest(params.by, DETECTORS)}")
         self._params = params
         lens, mount = params.fisheye or training.fisheye, params.mount or training.mount
         apart = math.dist(mount.position_b, training.mount.position_b)
@@ -78,8 +83,7 @@ class Eyes:
                 f"images.mount.position_b is {1e3 * apart:.0f} mm from that of training; expected {1e3 * SAME_PLACE:g} at most: "
                 "another lens at the same place can be converted, another place cannot"
             )
-        kind = LearntDetector if params.by == "learnt" else Detector
-        self.detector = kind(Fisheye(lens), training.payload_radius, training.goal_side, params.detector)
+        self.detector = DETECTORS[params.by](Fisheye(lens), training.payload_radius, training.goal_side, params.detector)
         self._rot_cb = nominal_rot_cb(mount).numpy()
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.

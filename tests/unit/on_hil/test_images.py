@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import Seen
+from camera.detectors.contours import BallSeen, Detector, Seen
 from camera.detectors.following import GATE, LOST
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
@@ -20,7 +20,7 @@ from hil.control.recording.record import lines
 from hil.errors import SourceError
 from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
-from hil.poses.sources.images import STAMPS, Eyes, Hint, ImageParams, LiveImages, RecordedImages
+from hil.poses.sources.images import DETECTORS, STAMPS, Eyes, Hint, ImageParams, LiveImages, RecordedImages
 from tests.drawn import render_scene
 from visthrow import config
 from visthrow.cli import main
@@ -65,6 +65,24 @@ def quaternion(vector) -> tuple[float, ...]:
 @pytest.fixture(scope="module")
 def pictures():
     return [picture(i) for i in range(FRAMES)]
+
+
+class Blind(Detector):
+    """A detector of somebody else's: it reports a ball on the axis, whatever it is shown."""
+
+    def detect(self, image, known=None):
+        self.check(image)
+        return Seen(BallSeen(np.array([0.0, 0.0, 1.0]), 0.1, 1.0), None)
+
+
+def test_a_detector_of_ones_own_is_named_by_the_configuration(pictures, monkeypatch):
+    params = ImageParams("camera", fisheye=SMALL, by="blind")
+    with pytest.raises(ConfigError, match=r"images.by 'blind'; known: contours, learnt"):
+        Eyes(params, training())
+    monkeypatch.setitem(DETECTORS, "blind", Blind)
+    seen = Eyes(params, training()).look(pictures[0], 1.5)
+    assert (seen.stamp, seen.corners) == (1.5, None)
+    assert seen.ball == pytest.approx((0.0, 0.0, 1.0, 0.1))
 
 
 @pytest.fixture(scope="module")
