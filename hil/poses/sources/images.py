@@ -72,7 +72,7 @@ class Eyes:
     hint: Hint | None = None
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
-        """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a lens that is not where that of training is."""
+        """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a lens that is not at training's place."""
         if params.by not in DETECTORS:
             raise ConfigError(f"images.by '{params.by}'; {suggest(params.by, DETECTORS)}")
         self._params = params
