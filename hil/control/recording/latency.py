@@ -26,6 +26,8 @@ OF_CLOCK = ("transport", "arrival", "late", "ack")
 
 LEAST, GROWTH, BINS = 1e-6, 1.01, 1640  # lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per cent
 CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
+_WIDTH, _ROW, _BELOW, _ABOVE = 8.6, 0.88, 0.6, 0.3  # of the picture, of a stage's row, and the margins for axis and title [inch]
+_BAR = 0.72  # height of the highest bar, in rows; the rest is for the words above it
 
 
 class Stage:
@@ -105,7 +107,10 @@ def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]
 
 
 def draw(path: str | Path, stages: Stages, title: str) -> None:
-    """Draw a histogram a stage, on one axis of time, as a PNG file; raises `StorageError` where it cannot be written."""
+    """Draw a histogram a stage, one below the other over one axis of time, as a PNG file; raises `StorageError` where it cannot be written.
+
+    A run ends with this: one axis with fixed margins is drawn four times as fast as an axis a stage whose labels are measured.
+    """
     from visthrow.common import style
     from visthrow.common.storage import atomic_write
     from visthrow.view.parts import png_of
@@ -115,17 +120,23 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
 
     shown = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
     rows = max(len(shown), 1)
-    figure, axes = plt.subplots(rows, 1, figsize=(8.6, 0.9 + 0.88 * rows), sharex=True, squeeze=False)
-    for axis, (name, stage) in zip(axes[:, 0], shown.items()):
-        _histogram(axis, name, stage)
-    axes[-1, 0].set_xscale("log")
-    axes[-1, 0].set_xlabel("time [ms]; thin lines: p50, p95, p99; triangle: the longest")
+    height = _BELOW + _ROW * rows + _ABOVE
+    figure, axis = plt.subplots(figsize=(_WIDTH, height))
+    figure.subplots_adjust(left=1.05 / _WIDTH, right=1.0 - 0.2 / _WIDTH, bottom=_BELOW / height, top=1.0 - _ABOVE / height)
+    for row, (name, stage) in enumerate(shown.items()):
+        _histogram(axis, row, name, stage)
+    axis.set_xscale("log")
+    axis.set_xlabel("time [ms]; thin lines: p50, p95, p99; triangle: the longest")
+    axis.set_ylim(rows - 1.0, -1.0)
+    axis.set_yticks(range(len(shown)), list(shown))
+    axis.tick_params("y", length=0.0)
+    axis.spines[["left", "bottom"]].set_visible(False)
     figure.suptitle(title, x=0.02, ha="left", fontsize=11.5)
-    figure.tight_layout(h_pad=0.25)
     atomic_write(path, png_of(figure))
 
 
-def _histogram(axis: Any, name: str, stage: Stage) -> None:
+def _histogram(axis: Any, row: int, name: str, stage: Stage) -> None:
+    """Draw upwards from ``row``; the highest bar is :data:`_BAR` rows high."""
     from visthrow.common import style
 
     group = 8  # bins of one per cent to a bar
@@ -133,11 +144,9 @@ def _histogram(axis: Any, name: str, stage: Stage) -> None:
     edges = 1e3 * LEAST * GROWTH ** (group * np.arange(len(counts) + 1))
     used = np.flatnonzero(counts)
     part = slice(used[0], used[-1] + 1)
-    axis.stairs(counts[part], edges[used[0] : used[-1] + 2], fill=True, color=style.COLOURS[0], alpha=0.75)
-    for share in (0.5, 0.95, 0.99):
-        axis.axvline(1e3 * stage.percentile(share), color=style.INK, lw=0.8)
-    axis.plot(1e3 * max(stage.most, LEAST), 0.0, "v", color=style.COLOURS[1], ms=7, clip_on=False, zorder=4)
-    axis.set_ylabel(name, rotation=0, ha="right", va="center")
-    axis.set_title(STAGES[name], loc="left", fontsize=8.0, pad=2.0)
-    axis.set_yticks([])
-    axis.spines["left"].set_visible(False)
+    heights = row - _BAR * counts[part] / counts.max()
+    axis.stairs(heights, edges[used[0] : used[-1] + 2], baseline=row, fill=True, color=style.COLOURS[0], alpha=0.75)
+    axis.vlines([1e3 * stage.percentile(share) for share in (0.5, 0.95, 0.99)], row, row - _BAR, color=style.INK, lw=0.8)
+    axis.plot(1e3 * max(stage.most, LEAST), row, "v", color=style.COLOURS[1], ms=7, clip_on=False, zorder=4)
+    axis.axhline(row, color=style.QUIET, lw=0.8)
+    axis.text(0.0, row - _BAR - 0.02, STAGES[name], transform=axis.get_yaxis_transform(), fontsize=8.0, va="bottom")

@@ -59,5 +59,7 @@ def test_report_and_picture(tmp_path, monkeypatch):
     assert np.ptp(picture) > 200
     assert all(word not in lines[0] for word in ("clock", "real"))
     assert "transport, arrival, late, ack: by the run's clock, at 0.2 of real time" in table(stages.summary(), 0.2)[0]
-    assert [axis.get_title("left") for axis in figures[0].axes] == [STAGES[name] for name in ("poll", "observation", "total")]
+    (axis,) = figures[0].axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["poll", "observation", "total"]
+    assert [text.get_text() for text in axis.texts] == [STAGES[name] for name in ("poll", "observation", "total")]
     draw(tmp_path / "empty.png", Stages(), "nothing flown")
