@@ -81,13 +81,13 @@ class Workers:
             status("")
 
 
-def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1) -> Iterator[tuple[int, Any]]:
-    """Yield each task's place in the order and its result as they are done; in this process where one will do."""
+def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1, label: str = "") -> Iterator[tuple[int, Any]]:
+    """Yield each task's place in the order and its result as they are done; in this process, without the label, where one will do."""
     tasks = list(tasks)
     if processes <= 1 or len(tasks) <= 1:
         yield from ((index, function(task)) for index, task in enumerate(tasks))
     else:
-        with Workers(function, tasks, processes) as workers:
+        with Workers(function, tasks, processes, label) as workers:
             yield from workers
 
 

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from camera.keypoints import KEYPOINTS
 from sim.cores import cores
 from visthrow.common.errors import ConfigError
-from visthrow.common.workers import Workers
+from visthrow.common.workers import done
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.calibration import STILL, SWAY, Calibration, Hovered, solved, sway
@@ -24,6 +24,7 @@ from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
 
 SETTLE = 3.0  # after the sway, until the swing that it leaves has died down [s]
+FEW = 8  # calibrations of half a second each: here they are done before other processes have started
 
 
 def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | None = None) -> Callable[[ThrowEnv], TensorDict]:
@@ -83,6 +84,5 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
     """The calibration of each hover; None where it shows too little."""
     solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
-    with Workers(solve, hovered, cores(), "calibrations") as workers:
-        found = dict(workers)
+    found = dict(done(solve, hovered, cores() if len(hovered) > FEW else 1, "calibrations"))
     return [None if isinstance(found[place], str) else found[place] for place in range(len(hovered))]

@@ -84,9 +84,8 @@ class FlyerModel(NumericModel):
         since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
         faded = 1.0 + self.of(lanes, "thrust_fade") * since
         real = thrust * self._scale(lanes) * (1.0 + curve * (thrust / hover - 1.0)) * faded[..., None]
-        dynamics = _Dynamics(self, lanes)
-        path = integrate(lambda half, state: dynamics(half, state, real[half], forces[half]), dynamics.start(lanes), self.steps,
-                         np.full((len(lanes.owner), 1), p.step))  # fmt: skip
+        dynamics = _Dynamics(self, lanes, real, forces)
+        path = integrate(dynamics, dynamics.start(lanes), self.steps, np.full((len(lanes.owner), 1), p.step))
         return np.concatenate([path, real[::2].swapaxes(0, 1)], 2)
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
@@ -154,8 +153,10 @@ class FlyerModel(NumericModel):
 class _Dynamics:
     """Forces and torques of lanes, without the motors' lag."""
 
-    def __init__(self, model: FlyerModel, lanes: Lanes) -> None:
+    def __init__(self, model: FlyerModel, lanes: Lanes, thrust: np.ndarray, latent: np.ndarray) -> None:
+        """Take the lanes' sizes; ``thrust`` [N], shape (half steps, B, motors); ``latent`` as :func:`latent_force` gives it."""
         p = model.params
+        self.thrust, self.total, self.latent = thrust, thrust.sum(2, keepdims=True), latent
 
         def get(name: str) -> np.ndarray:
             return model.of(lanes, name)
@@ -164,10 +165,11 @@ class _Dynamics:
         self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
         self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
         self.lean = get("estimator_lean")[:, None]
+        self.turns, self.half = bool(np.any(self.turn) or np.any(self.lean)), -1
         tilt = np.stack([get("frame_tilt_y"), -get("frame_tilt_x"), 0.0 * mass[:, 0] - 1.0], 1)
         self.gravity = p.gravity * tilt
         self.wind = np.stack([get("wind_x"), get("wind_y"), 0.0 * mass[:, 0]], 1)
-        self.late = get("attitude_delay") / (0.5 * p.step)
+        self.shift = model._spare + get("attitude_delay") / (0.5 * p.step)
         self.drag = np.stack([p.drag_xy + get("rotor_drag_xy")] * 2 + [p.drag_z + get("rotor_drag_z")], 1)
         self.parasitic, self.lift = get("parasitic")[:, None], get("translational_lift")[:, None]
         if p.cable is not None:
@@ -178,12 +180,14 @@ class _Dynamics:
             self.inertia = np.array(p.torque.inertia) * (1.0 + np.stack([get("inertia_xy")] * 2 + [get("inertia_z")], 1))
             self.com = np.stack([get("com_x"), get("com_y")], 1)
 
-    def _attitude(self, half: int) -> np.ndarray:
-        """Rotations at a half step, shape (B, 3, 3)."""
-        at = half + self.model._spare + self.late
-        left = np.clip(at.astype(int), 0, self.model._rot.shape[1] - 2)
-        share = (at - left)[:, None, None]
-        return (1.0 - share) * self.model._rot[self.owner, left] + share * self.model._rot[self.owner, left + 1]
+    def _turn_to(self, half: int) -> None:
+        """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in a row are asked for at each."""
+        self.half, at = half, half + self.shift
+        left = np.minimum(np.maximum(at.astype(int), 0), self.model._rot.shape[1] - 2)
+        share, before = (at - left)[:, None, None], self.model._rot[self.owner, left]
+        self.rot = before + share * (self.model._rot[self.owner, left + 1] - before)
+        if self.turns:
+            self.off = self.turn + self.lean * self.model._lean[self.owner, half + self.model._spare]
 
     def start(self, lanes: Lanes) -> np.ndarray:
         """States from the unknowns at the window's start."""
@@ -202,26 +206,26 @@ class _Dynamics:
             parts.append(lanes.nuisance[:, at : at + 3])
         return np.concatenate(parts, 1)
 
-    def __call__(self, half: int, state: np.ndarray, thrust: np.ndarray, latent: np.ndarray) -> np.ndarray:
+    def __call__(self, half: int, state: np.ndarray) -> np.ndarray:
         """Derivative of all but the motors' thrusts."""
-        rot = self._attitude(half)
-        vel = state[:, 3:6]
-        vel_b = np.einsum("bji,bj->bi", rot, vel - self.wind)
-        total = np.sum(thrust, 1, keepdims=True)
+        if half != self.half:
+            self._turn_to(half)
+        total, latent, vel = self.total[half], self.latent[half], state[:, 3:6]
+        vel_b = np.einsum("bji,bj->bi", self.rot, vel - self.wind)
         level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
         speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
         force_b = -(self.drag + self.parasitic * speed) * vel_b
         force_b[:, 2:3] += total * (1.0 + self.lift * level)
-        lean = self.lean * self.model._lean[self.owner, half + self.model._spare]
-        force_b = force_b + cross(self.turn + lean, force_b)
-        force = np.einsum("bij,bj->bi", rot, force_b) + latent[0]
+        if self.turns:
+            force_b = force_b + cross(self.off, force_b)
+        force = np.einsum("bij,bj->bi", self.rot, force_b) + latent[0]
         parts = [vel]
         if self.p.cable is None:
             parts.append(force / self.mass + self.gravity)
         else:
             parts += self._with_cable(state, vel, force, latent[1])
         if self.p.torque is not None:
-            parts.append(self._turning(state[:, self.model._rate_at : self.model._rate_at + 3], thrust, total, latent[-1]))
+            parts.append(self._turning(state[:, self.model._rate_at : self.model._rate_at + 3], self.thrust[half], total, latent[-1]))
         return np.concatenate(parts, 1)
 
     def _with_cable(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:

@@ -6,6 +6,7 @@ metres and leaves the payload well below the rotors; :meth:`Reference.limits` sa
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -28,12 +29,12 @@ class Reference:
     thrust_factor: np.ndarray  # on the commanded thrust, shape (N,)
     release: np.ndarray  # bool, shape (N,)
 
-    @property
+    @cached_property
     def vel_w(self) -> np.ndarray:
         """[m/s], shape (N, 3)."""
         return np.gradient(self.pos_w, PERIOD, axis=0)
 
-    @property
+    @cached_property
     def acc_w(self) -> np.ndarray:
         """[m/s^2], shape (N, 3)."""
         return np.gradient(self.vel_w, PERIOD, axis=0)
