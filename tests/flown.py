@@ -7,9 +7,8 @@ import numpy as np
 from sim.effects.effect import apply
 from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
-from sim.kernels.structs import EXTENSIONS
 from sim.params import PlantParams
-from tests.plants import paper_plant
+from tests.plants import EVERYTHING, paper_plant
 from tests.worlds.pilot import FreeFlight, Throw, Tracker
 from visthrow.config.effects import chosen
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -45,7 +44,7 @@ def fly(
     references += [Throw(rng, speed, rng.uniform(-np.pi, np.pi)) for speed in np.linspace(6.0, 10.0, throws)]
     plant = setting.plant
     steps = dataclasses.replace(plant.sim, control_period=TICK, substep=FINE, precision="float64")
-    sim = HybridSim(dataclasses.replace(plant, sim=steps), len(references), extensions=frozenset(EXTENSIONS) - {"push"})
+    sim = HybridSim(dataclasses.replace(plant, sim=steps), len(references), extensions=EVERYTHING)
     known = paper_plant()
     pilot = Tracker(references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng)
     sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=0.2)

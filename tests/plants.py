@@ -3,10 +3,13 @@
 import dataclasses
 from pathlib import Path
 
+from sim.kernels.structs import EXTENSIONS
 from sim.params import PlantParams, ReleaseParams, RopeParams, SimParams, VehicleParams
 from visthrow import config
 
 SCENES = Path(__file__).parent / "data" / "scenes"
+EVERYTHING = frozenset(EXTENSIONS)
+"""One kernel for all tests of extensions: what is built in and stands at zero changes nothing."""
 
 
 def paper_plant() -> PlantParams:

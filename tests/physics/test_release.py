@@ -155,7 +155,8 @@ def test_outputs_stay_after_the_landing_step():
 
 def test_the_vehicle_flies_on_alone():
     """After separation it climbs by its own thrust over its own mass: no rope pulls, drag off."""
-    calm = dataclasses.replace(paper_plant().vehicle.aero, kind="none")
+    aero = paper_plant().vehicle.aero
+    calm = dataclasses.replace(aero, **{f.name: 0.0 for f in dataclasses.fields(aero) if f.name != "kind"})
     ideal = dataclasses.replace(paper_plant().vehicle.battery, kind="ideal")
     params = plant(0.0, "float64", aero=calm, battery=ideal)
     sim = HybridSim(params, 1)

@@ -8,6 +8,7 @@ import pytest
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
 from sim.units import Units, in_units
+from tests.plants import EVERYTHING
 from visthrow import config
 from visthrow.task import Experiment, TaskParams, plant_of
 from visthrow.task.fleet import TASK
@@ -36,7 +37,7 @@ def plant() -> PlantParams:
 
 def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
     """A hard throw of a plant that is stated in these units; all that comes of it in SI units."""
-    sim = HybridSim(p, 1)
+    sim = HybridSim(p, 1, extensions=EVERYTHING)
     sim.place(np.array([[0.0, 0.0, 2.0]]) / units.length)
     force, rate = units.size((1, 1, -2)), 1.0 / units.time
     rng = np.random.default_rng(0)

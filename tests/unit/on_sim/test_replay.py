@@ -12,9 +12,8 @@ from sim.cores import _pool
 from sim.hybrid import HybridSim
 from sim.kernels.replay import kernel as rk
 from sim.kernels.replay.lanes import _BUILDS, Recording, Replay, _shared_out
-from sim.kernels.structs import EXTENSIONS
 from sim.params import SensingParams
-from tests.plants import paper_plant
+from tests.plants import EVERYTHING, paper_plant
 
 PERIODS, RELEASED_AT = 40, 20
 ROUNDING = 1e-11  # m, rad: of the same operations in another order, after 400 steps in float64
@@ -33,7 +32,7 @@ def one(value):
 @pytest.fixture(scope="module")
 def flight():
     """A flight of the simulator: start, commands, and states at the ends of the periods."""
-    sim = HybridSim(plant(), 1, extensions=frozenset(EXTENSIONS) - {"push"})
+    sim = HybridSim(plant(), 1, extensions=EVERYTHING)
     tilt = np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
     sim.place(pos_w=np.array([[0.0, 0.0, 1.5]]), cable_dir_w=np.tile(tilt, (1, 15, 1)))
     own = [name for name in rk.STATE_FIELDS if not name.startswith(("payload", "slack"))]
