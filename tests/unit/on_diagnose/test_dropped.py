@@ -20,12 +20,12 @@ ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
 
 
 @cache
-def model_of(lost: float, **theta: float) -> ThrowModel:
-    return ThrowModel(fly(setting_with(theta), seed=4, free=1, throws=3, seconds=3.0, lost=lost), paper_plant(), only=ONLY)
+def model_of(lost: float, throws: int = 3, **theta: float) -> ThrowModel:
+    return ThrowModel(fly(setting_with(theta), seed=4, free=1, throws=throws, seconds=3.0, lost=lost), paper_plant(), only=ONLY)
 
 
 def test_a_column_is_what_the_missing_command_changes():
-    model = model_of(SHARE)
+    model = model_of(SHARE, throws=1)
     columns = model.without_commands({}, range(len(model.windows({}))))
     (setting, states), flights = model.begun({}), model.flights
     w = int(model._retained[len(columns) // 2])
@@ -50,7 +50,7 @@ def test_a_column_is_what_the_missing_command_changes():
 
 
 def test_a_problem_with_lost_commands_says_the_same_both_ways():
-    model = model_of(SHARE)
+    model = model_of(SHARE, throws=1)
     windows = model.windows({})
     problem = replace(Problem.of(model, windows, tuple(range(len(windows)))), lost=SHARE)
     point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
