@@ -70,13 +70,13 @@ CASES = {
     "payload_drag": {"rope": {"payload_drag": 0.05}},
     "wind": {"air": {"wind_w": (1.0, -0.5, 0.2)}},
     "drag in wind": {"rope": {"payload_drag": 0.03}, "air": {"wind_w": (-2.0, 0.0, 0.0)}},
-    "gain": {"thrust": {"gain": (1.03, 1.02, 1.04, 1.03)}, "rope": {"segments": 4}},
-    "drag torque": {"thrust": {"torque_gain": 1.8, "gain": (1.03, 0.97, 1.03, 0.97)}, "rope": {"segments": 4}},
-    "com": {"body": {"com": (2e-3, -1e-3, 3e-3)}, "rope": {"segments": 4}},
-    "ground": {"air": {"ground_effect": 1000.0}, "rope": {"segments": 4}},  # at 1.5 m a hundredth of a per cent each
-    "motors": {"motor": {"kind": "asymmetric", "time_constant_down": 0.2}, "rope": {"segments": 4}},
-    "friction": {"rope": {"swing_damping": 0.05, "segments": 4}},
-    "jet": {"rope": {"downwash": 0.05, "segments": 4}},
+    "gain": {"thrust": {"gain": (1.03, 1.02, 1.04, 1.03)}, "rope": {"segments": 1}},
+    "drag torque": {"thrust": {"torque_gain": 1.8, "gain": (1.03, 0.97, 1.03, 0.97)}, "rope": {"segments": 1}},
+    "com": {"body": {"com": (2e-3, -1e-3, 3e-3)}, "rope": {"segments": 1}},
+    "ground": {"air": {"ground_effect": 1000.0}, "rope": {"segments": 1}},  # at 1.5 m a hundredth of a per cent each
+    "motors": {"motor": {"kind": "asymmetric", "time_constant_down": 0.25}, "rope": {"segments": 1}},
+    "friction": {"rope": {"swing_damping": 0.05, "segments": 1}},
+    "jet": {"rope": {"downwash": 0.05, "segments": 1}},
     "mount": {"rope": {"mount_damping": 2e-3, "segments": 1}},
 }
 """Parameters of which both plants have the equation; what the vehicle does knows nothing of the number of segments."""
@@ -117,7 +117,7 @@ def let_go(plant, ask: int = 3):
 
 def test_release_by_pull_and_kick_are_the_reference_plants():
     """A payload lets go by the rope's pull, which is less than its weight out there, with the kick on top of what it had."""
-    plant = changed(fine(paper_plant()), rope={"segments": 4}, release={"lag": 0.05})
+    plant = changed(fine(paper_plant()), rope={"segments": 1}, release={"lag": 0.05})
     (plain, _), _ = let_go(plant)
     early = changed(plant, release={"lag_tension": 0.05})
     opened, calm = let_go(early)
@@ -134,12 +134,12 @@ def test_release_by_pull_and_kick_are_the_reference_plants():
     np.testing.assert_allclose(shot[0], shot[1], atol=5e-3)
 
 
-@pytest.mark.parametrize(("segments", "near"), [(1, 2e-4), (4, 4e-4)])  # of several rods, half the first one's load is left out
-def test_a_payload_that_swings_through_pulls_by_more_than_its_weight(segments, near):
+@pytest.mark.parametrize("segments", [1, 15])
+def test_a_payload_that_swings_through_pulls_by_more_than_its_weight(segments):
     plant = changed(fine(paper_plant()), rope={"segments": segments}, release={"lag": 0.05})
     (plain, _), _ = let_go(plant, ask=15)
     late, _ = let_go(changed(plant, release={"lag_tension": 0.05}), ask=15)
-    assert late[0] == pytest.approx(late[1], abs=near)
+    assert late[0] == pytest.approx(late[1], abs=2e-4)  # of several rods, half the first one's load is left out
     assert late[0] - plain > 5e-3
 
 
