@@ -12,7 +12,7 @@ from hil.control.calibrating import Solver
 from hil.control.loop import Lander, Loop
 from hil.control.realtime import keep, prepare
 from hil.control.recording.latency import Stages
-from hil.control.recording.record import Recorder, pack
+from hil.control.recording.record import Recorder, begun, pack
 from hil.control.recording.report import finish, summary_text
 from hil.control.recording.view import start_viewer
 from hil.control.runner import Runner
@@ -66,21 +66,22 @@ def fly(args: argparse.Namespace) -> int:
         require_fake(params)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     policy, console = Policy.load(find_policy(params.policy)), Console()
-    source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), console.say)
-    clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
-    require_reach(params, policy.contract)
-    backend = make_backend(params, link, args.action == "run" and args.write_parameters, console.say, folder)
-    runner = Runner(params, policy, backend, mechanism_lag(params))
-    runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
-    refused = prepare(params.realtime)
-    runner.warm_up()
-    recorder = Recorder(folder, params)
+    with begun(folder):
+        source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), console.say)
+        clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
+        require_reach(params, policy.contract)
+        backend = make_backend(params, link, args.action == "run" and args.write_parameters, console.say, folder)
+        runner = Runner(params, policy, backend, mechanism_lag(params))
+        runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
+        refused = prepare(params.realtime)
+        runner.warm_up()
+        eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
+        recorder = Recorder(folder, params)
     for text in refused or keep(params.realtime):  # the recorder's thread holds what the flying one waits for; others do not
         console.say(f"note: {text}")
     operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), console.say)
     print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer, stages = start_viewer(folder) if args.view else None, Stages()
-    eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
     solver = None if runner.calibrating is None else Solver(params.camera, policy.contract, params.calibration.spreads)
     operator = Lander(operator, runner.calibrating) if calibrates else operator
     loop = Loop(runner, source, clock, operator, recorder, console.decision, stages, eyes, solver)

@@ -24,6 +24,7 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from visthrow import config
 from visthrow.common.errors import suggest
+from visthrow.common.storage import writable
 from visthrow.onboard.policy import Policy, find_policy
 
 PLANT, MOTORS, BALL = "visthrow.throws.wire_plant:make", "visthrow.throws.wire_plant:make_motors", "hil.simulated:make_ball"
@@ -39,11 +40,14 @@ BALL_LAG = 0.06  # from the mechanism's output to separation below PX4's vehicle
 
 def fake(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, or a bridge to a firmware in software, and print its report."""
+    out = None if args.out is None else Path(args.out)
     options = config.loads(Options, "", [*args.overrides, f"answer={args.answer}"], "options of the fake")
     mocap = MocapParams(rate=args.rate)
     if args.kind not in {*KINDS, *SITL}:
         raise RunError(f"--kind {args.kind}; {suggest(args.kind, {*KINDS, *SITL})}")
     plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
+    if out is not None:
+        writable(out.parent)
     link = Link(open_port(check_device(args.device), "--device udpout:127.0.0.1:PORT"), *VEHICLE_ID, key=key_of(args))
     with ExitStack() as ends:
         if args.kind in SITL:
@@ -57,7 +61,7 @@ def fake(args: argparse.Namespace) -> int:
             flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
             print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
         ends.callback(flown.close)
-        report = serve(flown, MonotonicClock(args.speed), args.seconds, None if args.out is None else Path(args.out), args.after)
+        report = serve(flown, MonotonicClock(args.speed), args.seconds, out, args.after)
     periods = report["time"] / plant.period
     if args.kind in SITL and report["late_periods"] > SLOW * periods:
         print(

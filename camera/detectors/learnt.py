@@ -105,7 +105,7 @@ class Networks(nn.Module):
                     raise ValueError(f"format version {header['format_version']}, this program reads {FORMAT}")
                 names = [name for name in arrays.files if name != "header"]
                 found.load_state_dict({name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names})
-        except (OSError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
+        except (OSError, EOFError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
             raise ValueError(f"{path}: no detector written by `visthrow detector train`: {error}") from error
         found.calibration = {kind: tuple(header["calibration"][kind]) for kind in KINDS}
         found.made_by = header["made_by"]

@@ -11,12 +11,14 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 from hil.errors import LinkError
 
 _NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):([0-9]{1,5})")
 _SERIAL = re.compile(r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})")
+PLUGGED = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "cu.*")  # names of serial ports in /dev
 LARGEST_DATAGRAM = 65536
 MOST_CHUNKS = 256  # datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
 MOST_SHUT_OUT = 4096  # datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of those that are ours
@@ -196,7 +198,10 @@ class SerialPort(_Stream):
             self._open = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
             number = getattr(error, "errno", None)  # pyserial's text names port and reason twice
-            raise LinkError(f"cannot open {device.host}: {os.strerror(number) if number else error}") from error
+            here = ", ".join(str(path) for name in PLUGGED for path in sorted(Path("/dev").glob(name)))
+            raise LinkError(
+                f"cannot open {device.host}: {os.strerror(number) if number else error}; plugged in here: {here or 'no serial port'}"
+            ) from error
         self._get, self._put = lambda: self._open.read(self._open.in_waiting or 1), self._open.write
 
 

@@ -189,7 +189,9 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
         if candidate.is_file():
             return candidate
     shipped = {path.relative_to(root).as_posix() for kind in kinds or ("**",) for path in root.glob(f"{kind}/*.toml")}
-    _schema.fail(source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {suggest(name, shipped)}")
+    short = [other for other in sorted(shipped) if Path(other).stem == name]  # a name as the command line takes it
+    meant = f"did you mean '{short[0]}'?" if short else suggest(name, shipped)
+    _schema.fail(source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {meant}")
 
 
 def _override(schema: type, tree: Table, override: str) -> None:

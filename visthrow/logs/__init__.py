@@ -76,8 +76,10 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
 
 
 def _missing(path: Path) -> LogError:
-    near = sorted(p.name for p in path.parent.iterdir()) if path.parent.is_dir() else []
-    return LogError(f"{path}: no such file; in that folder: {', '.join(near[:20]) or 'nothing'}")
+    folder = path if path.is_dir() else path.parent
+    near = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+    came = "a folder, expected a file" if path.is_dir() else "no such file"
+    return LogError(f"{path}: {came}; in that folder: {', '.join(near[:20]) or 'nothing'}")
 
 
 def _of_folder(path: Path) -> list[FlightLog]:

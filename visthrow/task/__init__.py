@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from camera.params import CameraParams
 from sim.fleet import FleetParams
 from sim.params import (
+    GRAVITY,
     AirParams,
     LawParams,
     PlantParams,
@@ -289,6 +290,24 @@ class Experiment:
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             given = f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m"
             raise ConfigError(f"{given}; expected the same ball")
+        if self.fleet is None:
+            self._check_that_it_hovers()
+
+    def _check_that_it_hovers(self) -> None:
+        """Raise ConfigError where thrust does not carry the weight, or the payload does not hang above the ground: another unit."""
+        mass, motors = plant_of(self).total_mass, 4.0 * self.vehicle.controller.max_thrust
+        asked = self.task.action.max_thrust
+        if not GRAVITY * mass < min(motors, asked):
+            raise ConfigError(
+                f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is {motors:g} N at most (four times "
+                f"vehicle.controller.max_thrust) and asked up to {asked:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
+            )
+        low = self.rope.length + self.rope.payload_offset - self.rope.mount[2]
+        if not self.task.start.spawn_height - low > self.release.landing_height:
+            raise ConfigError(
+                f"the payload hangs {low:g} m (rope.length, rope.payload_offset) below a vehicle that starts at "
+                f"{self.task.start.spawn_height:g} m (task.start.spawn_height): on the ground; expected m"
+            )
 
 
 def plant_of(experiment: Experiment) -> PlantParams:

@@ -6,6 +6,7 @@ that they read back to the same bits. Lines are written by a thread of their own
 
 import hashlib
 import json
+import shutil
 import tempfile
 import tomllib
 import zipfile
@@ -33,14 +34,35 @@ POLICY, CONFIG, POSES, TICKS, SUMMARY, PROVENANCE = (
 )  # fmt: skip
 
 
+def check_free(folder: Path) -> None:
+    """Raise `StorageError` for a folder that holds a run already."""
+    if (folder / CONFIG).exists():
+        raise StorageError(f"{folder} holds a run already; name another folder with --out")
+
+
+@contextmanager
+def begun(folder: Path) -> Iterator[None]:
+    """Keep a new folder only where the run that is to write it begins; raises `StorageError` for one that holds a run already.
+
+    The links write theirs before there is a recorder.
+    """
+    check_free(folder)
+    new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
 class Recorder:
     """Writes a run's folder."""
 
     def __init__(self, folder: str | Path, params: HilParams) -> None:
         """Make the folder with config, policy and provenance; raises `StorageError` where it holds a run already, or cannot be written."""
         self.folder = Path(folder)
-        if (self.folder / CONFIG).exists():
-            raise StorageError(f"{self.folder} holds a run already; name another folder with --out")
+        check_free(self.folder)
         source = find_policy(params.policy)
         data = source.read_bytes()
         provenance.write_run_folder(self.folder, config.dumps(params), policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest())

@@ -21,11 +21,13 @@ import numpy as np
 from hil.control.recording.flightlogs import Samples, events, meta_of, read
 from hil.control.recording.playback import Playback, Tick
 from hil.control.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of, require_run
+from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from visthrow import config
 from visthrow.onboard.policy import Policy
 
+ENDINGS = (".rrd", ".mcap")  # of recordings: for rerun, for Foxglove
 EVERY = 0.1  # between two looks at the folder [s]
 MOST_SHOWN = 100  # ticks sent at a time; of more, where the viewer fell behind, the last ones
 TRAIL = 300  # poses whose places stay drawn: three seconds at 100 Hz
@@ -181,6 +183,8 @@ def run(args: argparse.Namespace) -> int:
             while True:
                 time.sleep(1.0)
     path = Path(args.out) if args.out is not None else folder / "run.rrd"
+    if path.suffix not in ENDINGS:
+        raise RunError(f"--out {path}; expected a recording that ends in {' or '.join(ENDINGS)}")
     write(folder, path)
     opens = "with Foxglove" if path.suffix == ".mcap" else f"with: rerun {path}"
     print(f"{path}  the run in 3D, image plane and signals; open it {opens}")

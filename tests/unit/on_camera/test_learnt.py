@@ -108,6 +108,9 @@ def test_networks_are_written_and_read(tmp_path):
     torch.testing.assert_close(read.goal(patch), made.goal(patch), atol=2e-3, rtol=0)
     with pytest.raises(ValueError, match="no detector written by"):
         Networks.load(tmp_path / "none.npz")
+    (tmp_path / "empty.npz").touch()
+    with pytest.raises(ValueError, match="no detector written by"):
+        Networks.load(tmp_path / "empty.npz")
     (tmp_path / "b.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:2000])
     with pytest.raises(ValueError, match="no detector written by"):
         Networks.load(tmp_path / "b.npz")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from visthrow.diagnose.select import held_out, point, result, search
 from visthrow.diagnose.throw.landing import Landings
 from visthrow.logs.flightlog import FlightLog
 
+SWING = str(Path(__file__).resolve().parents[2] / "data" / "real" / "pendulum_single" / "single_pendulum_id.csv.gz")
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
 
@@ -468,7 +470,8 @@ def test_the_recording_is_written(tmp_path, found):
 @pytest.mark.parametrize(("arguments", "said"), [
     (["explain", "nothing.npz"], "nothing.npz"), (["blind", "nothing.npz"], "nothing.npz"),
     (["plan", "nothing.npz"], "nothing.npz"),
-    (["explain", "nothing.npz", "--config", "nobody"], "nobody"),
+    (["explain", "nothing.npz", "--config", "nobody"], "nobody"), (["map", "."], "a folder, expected a file"),
+    (["explain", SWING, "--config", "pendulum_encoder", "--only", ""], "no effect ''"),
 ])  # fmt: skip
 def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):
     from visthrow.cli import main

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from visthrow import cli, config
-from visthrow.common.errors import BusyError, ConfigError
+from visthrow.common.errors import BusyError, ConfigError, StorageError
 from visthrow.common.storage import write_json
 from visthrow.evidence.sweep import RunGroup, SweepList, pool, units
 from visthrow.evidence.sweep.record import collect, status
@@ -262,6 +262,12 @@ def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
         assert not held(path)
     finally:
         other.kill()
+
+
+def test_a_folder_in_which_nothing_is_done_makes_no_record(path, tmp_path):
+    with pytest.raises(StorageError, match=r"nothing of the list .* is done there; expected what 'visthrow sweep run"):
+        collect(load_list(path), tmp_path / "nothing", tmp_path / "records")
+    assert not (tmp_path / "records").exists()
 
 
 def test_records_join_what_two_machines_did(path, tmp_path):

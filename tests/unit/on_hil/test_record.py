@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -114,6 +115,27 @@ def test_a_folder_that_cannot_be_made(tmp_path, capsys):
     assert main(["hil", "run", "--out", str(tmp_path / "file" / "run"), "--set", device]) == 2
     assert "cannot write" in (said := capsys.readouterr().err)
     assert "--out" in said
+
+
+def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder, tmp_path, capsys):
+    """The links write before there is a recorder: a second run into a folder emptied the first one's link.tlog."""
+    device = f'link.device="udp:127.0.0.1:{free_port()}"'
+    first = tmp_path / "first"
+    shutil.copytree(run_folder, first)
+    (first / "link.tlog").write_bytes(b"of the first run")
+    assert main(["hil", "run", "--out", str(first), "--set", device]) == 2
+    assert "holds a run already" in capsys.readouterr().err
+    assert (first / "link.tlog").read_bytes() == b"of the first run"
+    late = ["--config", "fake_betaflight", "--set", "betaflight.device=tcp:127.0.0.1:9"]  # nobody listens there
+    assert main(["hil", "run", "--out", str(tmp_path / "new"), "--set", device, *late]) == 2
+    assert "cannot connect" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_view_is_a_recording(run_folder, tmp_path, capsys):
+    assert main(["hil", "view", str(run_folder), "--out", str(tmp_path / "a.txt")]) == 2
+    assert "ends in .rrd or .mcap" in capsys.readouterr().err
+    assert not (tmp_path / "a.txt").exists()
 
 
 def test_the_folder_holds_config_policy_and_hash(run_folder):

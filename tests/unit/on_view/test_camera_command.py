@@ -202,6 +202,12 @@ def test_a_rendered_scene_says_nothing_of_a_missing_gpu(tmp_path):
     assert shown.stderr == ""
 
 
+def test_a_payload_below_the_ground_is_not_drawn(tmp_path, capsys):
+    assert main(["camera", "show", "fisheye", "--hangs", "1.4", "--out", str(tmp_path / "a.png")]) == 2
+    assert "--hangs 1.4 below --height 1.333; expected a payload above the ground" in capsys.readouterr().err
+    assert not (tmp_path / "a.png").exists()
+
+
 def test_ocam_agrees_with_its_own_inverse_polynomial(tmp_path):
     """world2cam of the toolbox, which the reader does not use, is the oracle."""
     path = tmp_path / "calib_results.txt"

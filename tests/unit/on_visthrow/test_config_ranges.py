@@ -22,6 +22,11 @@ from visthrow.task import Experiment
         ("task", "state", "noise.command_step=-1", "command_step"),
         ("train", "state", "ppo.iterations=-3", "1 or more"),
         ("train", "state", "ppo.discount=1.5", "discount"),
+        ("train", "state", "vehicle.body.mass=210", "weigh 210.062 kg, 2.06e+03 N, but thrust is 14 N at most"),  # grams
+        ("train", "state", "rope.payload_mass=12", "it cannot hover"),
+        ("train", "state", "task.action.max_thrust=2", "asked up to 2 N (task.action.max_thrust): it cannot hover"),
+        ("train", "state", "rope.length=34", "the payload hangs 34.053 m"),  # centimetres
+        ("train", "state", "vehicle=x500", "did you mean 'vehicle/x500.toml'?"),
     ],
 )
 def test_the_command_refuses(kind, name, change, message, capsys):

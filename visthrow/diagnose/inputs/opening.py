@@ -48,7 +48,7 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
         raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
     else:
         model = setup.model_of(chosen, logs)
-        model = _only(model, args.only.split(",")) if args.only else model
+        model = _only(model, args.only.split(",")) if args.only is not None else model
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
     # day of each flight, from 0: what its log says, else those of one folder are of one
@@ -76,7 +76,7 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
 
     threads.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
-    only = args.only.split(",") if args.only else None
+    only = args.only.split(",") if args.only is not None else None
     known = {"sensing": experiment.sensing, "camera": experiment.camera, "device": resolve(args.device)}
     known |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from visthrow.common.errors import StorageError
 from visthrow.evidence.report.result_set import runs_of
 from visthrow.evidence.sweep.units import PROGRESS, SUMMARY, Source, Work, throws_folder, variant_of
 from visthrow.evidence.sweep.work import PIECES, held, lock_of
@@ -45,12 +46,15 @@ def _state(source: Source, out: Path) -> tuple[str, float]:
 def collect(work: Work, out: Path, records: Path) -> list[Path]:
     """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already; returns their paths.
 
-    Of two results for the same question, older and newer weights or config, the one that is here counts.
+    Of two results for the same question, older and newer weights or config, the one that is here counts. Raises StorageError: nothing is
+    done, and nothing stands there.
     """
     training, throws = records / "training" / f"{work.name}.json", records / "throws" / f"{work.name}.json"
     runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {
         source.name: _run(source, out) for source in work.sources if source.config and source.done(out)
     }
+    if not runs and not any(unit.done(out) for units in work.throws.values() for unit in units) and not throws.exists():
+        raise StorageError(f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep run {work.name}' made")
     order = {source.name: i for i, source in enumerate(work.sources)}
     listed = sorted((run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]])
     results.write_line(training, {"runs": listed})

@@ -144,6 +144,8 @@ def show(args: argparse.Namespace) -> int:
     if out.suffix.lower() not in PICTURES:
         raise ConfigError(f"--out {out}; expected a picture, one of {', '.join(PICTURES)}")
     params = config.load(CameraParams, config.find("camera", args.config))
+    if args.hangs + params.payload_radius > args.height:
+        raise ConfigError(f"--hangs {args.hangs:g} below --height {args.height:g}; expected a payload above the ground [m]")
     camera, lens = KeypointCamera(params), Fisheye(params.fisheye)
     pos_w, rot_wb = torch.tensor([0.0, 0.0, args.height]), torch.eye(3)
     ball_w, goal_w = pos_w - torch.tensor([0.0, 0.0, args.hangs]), torch.tensor([*args.target, 0.0])
