@@ -181,7 +181,8 @@ class FlightLog:
         except LogError as error:
             raise LogError(f"{path}: {error}") from error
         except (KeyError, TypeError, ValueError) as error:
-            raise LogError(f"{path}: incomplete: {error!r}; it holds {', '.join(sorted(arrays))}") from error
+            came = f"no entry {error}" if isinstance(error, KeyError) else str(error)
+            raise LogError(f"{path}: incomplete: {came}; expected a flight log, it holds {', '.join(sorted(arrays))}") from error
 
 
 class FlightRecorder:

@@ -471,6 +471,9 @@ def test_the_recording_is_written(tmp_path, found):
     (["explain", "nothing.npz"], "nothing.npz"), (["blind", "nothing.npz"], "nothing.npz"),
     (["plan", "nothing.npz"], "nothing.npz"),
     (["explain", "nothing.npz", "--config", "nobody"], "nobody"), (["map", "."], "a folder, expected a file"),
+    (["plan", "nothing.npz", "--hall", "nan,5,3"], "--hall nan,5,3: expected lengths above 0"),
+    (["plan", "nothing.npz", "--hall", "5,5,0.5"], "a height above 0.8 m"),
+    (["plan", "nothing.npz", "--manoeuvres", "hoover"], "did you mean 'hover'"),
     (["explain", SWING, "--config", "pendulum_encoder", "--only", ""], "no effect ''"),
 ])  # fmt: skip
 def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):

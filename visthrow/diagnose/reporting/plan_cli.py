@@ -1,6 +1,7 @@
 """``visthrow diagnose plan``: the flight that tells most of what could not be told, with its reference to fly."""
 
 import argparse
+import math
 from pathlib import Path
 
 from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
@@ -38,15 +39,15 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.reporting import pictures, report
     from visthrow.diagnose.reporting.explain_cli import explained
 
+    limits, chosen = _limits(args), _chosen(args.manoeuvres)
     model, logs = opening.open_model(args)
-    limits = _limits(args)
     diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     aim = plan.Aim(diagnosis, tuple(name for name in args.about.split(",") if name))
     simulate, flown = simulator_of(model, diagnosis, lambda logs: setup.model_of(setup.load(args.config), logs), seed=args.seed)
-    manoeuvres = [m for m in map(flown, _chosen(args.manoeuvres)) if m is not None]
+    manoeuvres = [m for m in map(flown, chosen) if m is not None]
     told = [(m, aim.information(s.model)) for m, s in zip(manoeuvres, simulate(manoeuvres)) if s.model is not None]
     found = None
     if told and args.steps > 0:
@@ -79,6 +80,9 @@ def _limits(args: argparse.Namespace):
         x, y, z = (float(part) for part in args.hall.split(","))
     except ValueError as error:
         raise DiagnoseError(f"--hall {args.hall}: expected three lengths in metres between commas, such as 5,5,2.6") from error
+    lowest = Limits.lowest
+    if not (0.0 < x < math.inf and 0.0 < y < math.inf and lowest < z < math.inf):
+        raise DiagnoseError(f"--hall {args.hall}: expected lengths above 0 and a height above {lowest:g} m, the lowest that is flown")
     return Limits(half=(0.5 * x, 0.5 * y), highest=z, speed=args.speed)
 
 
