@@ -92,15 +92,29 @@ class Selector(SearchState):
         short += [j for j in alike if np.isfinite(screened[j]) and j not in short]
         short = [j for j in short if frozenset([*self.active, j]) not in self.visited]
         listed = {(*self.active, j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:SHOWN].tolist()}
+        together = self._stepwise(free, usable)
+        if len(together) > len(self.active) + 1 and self._best(self._tried(free, [together]), listed, self._contradicted()):
+            return True
         tried = self._tried(free, [(*self.active, j) for j in short])
         if self._best(tried, listed, self._contradicted()):
             return True
         return bool(tried) and self._closer(max(tried, key=lambda move: move.nats), listed)
 
-    def _additions(self, point: Point, usable: np.ndarray) -> np.ndarray:
+    def _additions(self, point: Point, usable: np.ndarray, active: Sequence[int] | None = None) -> np.ndarray:
         gain = np.full(len(self.priors.floor), -np.inf)
-        gain[usable] = additions(point.information, point.score, self.priors, self.active)[usable]
+        gain[usable] = additions(point.information, point.score, self.priors, self.active if active is None else active)[usable]
         return gain - (self.prices - self.least)
+
+    def _stepwise(self, point: Point, usable: np.ndarray) -> list[int]:
+        """The set that stepwise selection comes to from that of the search, by the statistics of a point alone."""
+        active, plain = list(self.active), usable[~self.problem.switches[usable]]
+        while len(active) < MOST_NAMES:
+            gain = self._additions(point, plain, active)
+            best = int(np.argmax(gain))
+            if gain[best] <= self.least:
+                break
+            active.append(best)
+        return active
 
     def _alike(self, j: int) -> list[int]:
         """What the catalogue says looks like an effect: where a rope whips, derivatives may promise far too little."""
