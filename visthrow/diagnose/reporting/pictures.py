@@ -129,7 +129,8 @@ def ladder(diagnosis: Diagnosis) -> bytes:
                 won = name == step.named
                 axis.plot(max(step.refitted[name], 0.0), y, marker="o" if won else "^", ms=6, color=AFTER if won else style.QUIET)
         axis.axvline(step.least, color=BEFORE, lw=1)
-        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {'exchanged' if ', ' in step.named else step.named}")
+        several = f"{step.named.count(', ') + 1} causes"
+        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {several if ', ' in step.named else step.named}")
         axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
         _plain(axis.xaxis, MOST_TICKS // across)
         axis.tick_params(axis="y", labelsize=8)

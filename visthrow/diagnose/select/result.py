@@ -58,7 +58,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Step:
-    """One addition of the search, or an exchange of all names for a set that says more."""
+    """One addition of the search, of one cause or of several at once, or an exchange of all names for a set that says more."""
 
     named: str  # names of a set with commas between them
     nats: float  # against what was named before

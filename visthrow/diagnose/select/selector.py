@@ -93,8 +93,10 @@ class Selector(SearchState):
         short = [j for j in short if frozenset([*self.active, j]) not in self.visited]
         listed = {(*self.active, j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:SHOWN].tolist()}
         together = self._stepwise(free, usable)
-        if len(together) > len(self.active) + 1 and self._best(self._tried(free, [together]), listed, self._contradicted()):
-            return True
+        if len(together) > len(self.active) + 1 and frozenset(together) not in self.visited:
+            listed[together] = self.linear(together, free) - self.linear(self.active, free)
+            if self._best(self._tried(free, [together]), listed, self._contradicted()):
+                return True
         tried = self._tried(free, [(*self.active, j) for j in short])
         if self._best(tried, listed, self._contradicted()):
             return True
@@ -105,8 +107,8 @@ class Selector(SearchState):
         gain[usable] = additions(point.information, point.score, self.priors, self.active if active is None else active)[usable]
         return gain - (self.prices - self.least)
 
-    def _stepwise(self, point: Point, usable: np.ndarray) -> list[int]:
-        """The set that stepwise selection comes to from that of the search, by the statistics of a point alone."""
+    def _stepwise(self, point: Point, usable: np.ndarray) -> tuple[int, ...]:
+        """The set that forward selection comes to from that of the search, by the statistics of a point alone."""
         active, plain = list(self.active), usable[~self.problem.switches[usable]]
         while len(active) < MOST_NAMES:
             gain = self._additions(point, plain, active)
@@ -114,7 +116,7 @@ class Selector(SearchState):
             if gain[best] <= self.least:
                 break
             active.append(best)
-        return active
+        return tuple(active)
 
     def _alike(self, j: int) -> list[int]:
         """What the catalogue says looks like an effect: where a rope whips, derivatives may promise far too little."""
