@@ -235,16 +235,22 @@ def advantage(
     return ahead - behind
 
 
-def curvature(problem: Problem, origin: Point, there: Point) -> float:
-    """What the simulation's distance from its linearisation would be taken for: the largest size of any effect, in floors.
+def bend(problem: Problem, origin: Point, there: Point, active: Sequence[int]) -> np.ndarray:
+    """What the simulation's distance from its linearisation would be taken for: sizes of all effects, in floors, shape (K,).
 
-    ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same derivatives.
+    ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same derivatives; ``active``: effects that
+    are named.
     """
     change = problem.priors.floor * (there.theta - origin.theta)
     bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
     _, grams = _with_residuals(problem, there, bent)
     total = sum(share.score for share in there.integrals.shares(grams, there.noise))
-    return float(np.abs(covariance(there.information, problem.priors.deviation(())) @ total).max(initial=0.0))
+    return covariance(there.information, problem.priors.deviation(list(active))) @ total
+
+
+def curvature(problem: Problem, origin: Point, there: Point) -> float:
+    """The largest size that :func:`bend` says of any effect while none is named."""
+    return float(np.abs(bend(problem, origin, there, ())).max(initial=0.0))
 
 
 def with_fitted_noise(point: Point) -> Point:

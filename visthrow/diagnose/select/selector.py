@@ -13,12 +13,13 @@ from itertools import combinations
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import STRONG, additions, estimate, log_evidence, pair_additions
+from visthrow.diagnose.likelihood.evidence import INEXACT, STRONG, additions, estimate, log_evidence, pair_additions
 from visthrow.diagnose.select import dropped, terms
 from visthrow.diagnose.select.excess import compares_phases, levels
 from visthrow.diagnose.select.point import (
     Point,
     Problem,
+    bend,
     candidate,
     candidates,
     fitted,
@@ -92,11 +93,11 @@ class Selector(SearchState):
         short += [j for j in alike if np.isfinite(screened[j]) and j not in short]
         short = [j for j in short if frozenset([*self.active, j]) not in self.visited]
         listed = {(*self.active, j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:SHOWN].tolist()}
-        together = self._stepwise(free, usable)
-        if len(together) > len(self.active) + 1 and frozenset(together) not in self.visited:
-            listed[together] = self.linear(together, free) - self.linear(self.active, free)
-            if self._best(self._tried(free, [together]), listed, self._contradicted()):
-                return True
+        several = self._several(free, usable)
+        for move in several:
+            listed[move.active] = self.linear(move.active, free) - self.linear(self.active, free)
+        if self._best(several, listed, self._contradicted()):
+            return True
         tried = self._tried(free, [(*self.active, j) for j in short])
         if self._best(tried, listed, self._contradicted()):
             return True
@@ -107,16 +108,23 @@ class Selector(SearchState):
         gain[usable] = additions(point.information, point.score, self.priors, self.active if active is None else active)[usable]
         return gain - (self.prices - self.least)
 
-    def _stepwise(self, point: Point, usable: np.ndarray) -> tuple[int, ...]:
-        """The set that forward selection comes to from that of the search, by the statistics of a point alone."""
-        active, plain = list(self.active), usable[~self.problem.switches[usable]]
-        while len(active) < MOST_NAMES:
-            gain = self._additions(point, plain, active)
-            best = int(np.argmax(gain))
-            if gain[best] <= self.least:
-                break
-            active.append(best)
-        return tuple(active)
+    def _several(self, free: Point, usable: np.ndarray) -> list[Move]:
+        """The additions that forward selection comes to, where there are several, simulated at once.
+
+        Those are left out that the distance from the linearisation would be taken for. ``free``: the point by whose statistics alone
+        they are selected.
+        """
+        active, plain = tuple(self.active), usable[~self.problem.switches[usable]]
+        while len(active) < MOST_NAMES and (gain := self._additions(free, plain, active)).max() > self.least:
+            active = (*active, int(np.argmax(gain)))
+        while len(active) > len(self.active) + 1 and frozenset(active) not in self.visited:
+            move, = self._tried(free, [active])
+            sizes, faked = np.abs(move.point.theta), np.abs(bend(self.problem, self.origin, move.point, active))
+            held = tuple(j for j in active if j in self.active or faked[j] <= INEXACT * sizes[j])
+            if held == active:
+                return [move]
+            active = held
+        return []
 
     def _alike(self, j: int) -> list[int]:
         """What the catalogue says looks like an effect: where a rope whips, derivatives may promise far too little."""
