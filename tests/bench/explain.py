@@ -29,7 +29,7 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     begun = time.perf_counter()
     model, logs = opening.open_model(args)
     opened = time.perf_counter()
-    diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without))
+    diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without, logs))
     explained = time.perf_counter()
     found = {
         "open": opened - begun, "explain": explained - opened, "verdict": explained - begun, "logs": len(logs),

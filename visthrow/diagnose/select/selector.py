@@ -111,10 +111,12 @@ class Selector(SearchState):
     def _several(self, free: Point, usable: np.ndarray) -> list[Move]:
         """The additions that forward selection comes to, where there are several, simulated at once.
 
-        Those are left out that the distance from the linearisation would be taken for. ``free``: the point by whose statistics alone
-        they are selected.
+        Those are left out that the distance from the linearisation would be taken for. Where a law may be missing there are none: names
+        take a part of it each. ``free``: the point by whose statistics alone they are selected.
         """
         active, plain = tuple(self.active), usable[~self.problem.switches[usable]]
+        if self.problem.terms:
+            return []
         while len(active) < MOST_NAMES and (gain := self._additions(free, plain, active)).max() > self.least:
             active = (*active, int(np.argmax(gain)))
         while len(active) > len(self.active) + 1 and frozenset(active) not in self.visited:
