@@ -7,10 +7,11 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood import evidence
+from visthrow.diagnose.likelihood import evidence, grammar
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select import held_out, result, search, selector
+from visthrow.diagnose.select import held_out, result, search, selector, terms
+from visthrow.diagnose.select.point import Problem, linearise, with_all_effects_noise
 from visthrow.diagnose.select.scatter import Varies, disagreement
 
 EFFECTS = catalogue(12)
@@ -66,13 +67,31 @@ def test_one_effect_is_named_with_its_size_and_interval(sign):
     assert found.nats > diagnosis.threshold
 
 
-def test_three_effects_are_named_together():
-    truth = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
-    model = world(truth=truth, seed=1)
+TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
+
+
+@pytest.mark.parametrize(("curvature", "steps"), [(0.0, 1), (2.0, 3)])
+def test_three_effects_are_named_at_once_unless_bends_would_fake_one(curvature, steps):
+    """A bend of 2 at 30 floors is taken for more than a third of each size."""
+    model = world(truth=TRIPLE, seed=1, curvature=curvature)
     diagnosis = search.explain(model, laws=False)
-    assert set(diagnosis.named) == set(truth)
+    assert set(diagnosis.named) == set(TRIPLE)
+    assert len(diagnosis.steps) == steps
     for name, size in sizes(model, diagnosis).items():
-        assert abs(size - truth[name]) < 1.5
+        assert abs(size - TRIPLE[name]) < 1.5
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_names_come_one_by_one_where_a_law_is_a_candidate(law):
+    model = world(truth=TRIPLE, seed=1)
+    problem = Problem.of(model, model.windows({}), range(len(model.windows({}))))
+    nominal = linearise(problem, np.zeros(len(EFFECTS)))
+    if law:
+        term = terms.as_effect(grammar.Term("vehicle force", ("speed",), "vel"), 1.0, 0.0)
+        problem, (nominal,) = terms.extended(problem, [nominal], [term])
+    own = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
+    several = own._several(with_all_effects_noise(problem, nominal), own._usable())
+    assert [{own.name(j) for j in move.active} for move in several] == ([] if law else [set(TRIPLE)])
 
 
 def hiding(own: float, **options) -> SyntheticModel:

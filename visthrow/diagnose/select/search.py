@@ -50,16 +50,15 @@ def explain(
         problem, nominal = _left_out(problem, nominal, gone, say)
     least = _least(nominal, priors, seed, say)
     search = Selector(problem, nominal, least, say, laws)
-    search.run()
-    for _ in range(ROUNDS - 1):
-        gone = lost(search.point)  # where the causes are in the simulation, it may lose windows that it followed without
-        if not gone or search.events:
+    for further in range(ROUNDS - 1, -1, -1):
+        search.run(follow=not further)
+        gone = lost(search.point) if further and not search.events else []
+        if not gone:
             break
         problem, nominal = _left_out(problem, nominal, gone, say)
         least = _least(nominal, priors, seed, say)
         if not search.stands_without(gone, problem, nominal, least):
             search = Selector(problem, nominal, least, say, laws)
-        search.run()
     diagnosis = held_out.judged(conclude(search))
     return replace(diagnosis, seconds=time.monotonic() - begun, seed=seed)
 

@@ -24,6 +24,7 @@ from visthrow.diagnose.select.point import (
     candidates,
     fitted,
     linearise,
+    lost,
     only,
     with_all_effects_noise,
     with_floors_noise,
@@ -50,8 +51,12 @@ the catalogue does not hold the true term brought 1.9, 7 and 107 times as much a
 class Selector(SearchState):
     """The moves of a search."""
 
-    def run(self) -> None:
-        """Move until nothing is worth more."""
+    def run(self, follow: bool = True) -> None:
+        """Move until nothing is worth more.
+
+        ``follow``: go on also where the simulation loses windows with the names that were found; else it ends there, and they may be
+        left out.
+        """
         if self.point is None:
             self.point = self.origin = self.nominal
         while True:
@@ -63,14 +68,20 @@ class Selector(SearchState):
                     continue
                 return
             if len(self.active) < MOST_NAMES and (self._vary() or self._add()):
-                if len(self.active) > CHAIN and self._propose():
+                if len(self.active) > CHAIN and (follow or not self._loses()) and self._propose():
                     self._exchange()
                 continue
+            if not follow and self._loses():
+                return
             if len(self.active) < MOST_NAMES and self._vary(last=True):
                 continue
             if self._exchange() or self._propose() or self._lose_commands(0.0):
                 continue
             return
+
+    def _loses(self) -> bool:
+        """Whether the simulation follows some windows no more, and no flight was left out for it."""
+        return not self.events and bool(lost(self.point))
 
     def _usable(self) -> np.ndarray:
         usable = self.priors.visible.copy()
