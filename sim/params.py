@@ -367,6 +367,10 @@ class LawParams:
     coefficient: float  # in the unit that makes the product N or N m
 
 
+LOWEST = 0.05  # height below which a law's 1/z is held [m]
+SLOWEST = 0.1  # rate of the rope against the vehicle below which a law's dry friction falls to 0 [1/s]
+
+
 @dataclass(frozen=True)
 class PlantParams:
     """All that defines one simulated plant."""

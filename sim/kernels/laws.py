@@ -2,7 +2,7 @@
 
 A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of its factors into the kernel that
 is built for it; its coefficient is a number of the run, so that one kernel serves every size of a law. The names are those of
-``visthrow.diagnose.likelihood.grammar``. A law's force is taken at the start of an integration step and held over it.
+``visthrow.diagnose.models.laws``. A law's force is taken at the start of an integration step and held over it.
 
 A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that does the same to a straight rope
 of the length l in direction n, (-M x n) / l on the payload and its opposite at the mount. Momentum is conserved.
@@ -14,11 +14,9 @@ import warp as wp
 
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
 from sim.kernels.structs import Types, make_struct, types
-from sim.params import LawParams
+from sim.params import LOWEST, SLOWEST, LawParams
 
-LOWEST = 0.05  # height below which 1/z is held [m]
 MOST_LAWS = 4
-SLOWEST = 0.1  # rate of the rope against the vehicle below which dry friction falls to 0 [1/s]
 BLOCKS = ("vehicle force", "vehicle torque", "payload force", "rope joint")
 
 

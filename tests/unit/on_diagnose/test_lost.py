@@ -9,7 +9,7 @@ from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.likelihood.grammar import Term
+from visthrow.diagnose.models.laws import Term
 from visthrow.diagnose.select import result, search, selector, terms
 from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
 from visthrow.diagnose.throw.cutting import RINGING

@@ -9,6 +9,7 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.models import laws
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import Table, table_of, train, unexplained
 from visthrow.diagnose.select import result, search, selector, terms, verdicts
@@ -17,7 +18,7 @@ from visthrow.diagnose.select.point import Problem, candidate, linearise
 from visthrow.diagnose.select.scatter import Varies
 
 EFFECTS = catalogue(12)
-IN_THE_BODY = ("vehicle torque", grammar.JOINT)
+IN_THE_BODY = ("vehicle torque", laws.JOINT)
 LEFT = 0.7  # of a hidden force after a table learnt from a dozen throws, in a throw that it has not seen: a table is no formula
 KNOTS = (
     "time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust", "payload_pos_w", "payload_vel_w", "cable_dir_w", "tension", "mount_b",
@@ -25,7 +26,7 @@ KNOTS = (
 
 
 def table(terms_: list, knots: dict) -> np.ndarray:
-    return grammar.Layout.of(terms_).table(knots)
+    return laws.Layout.of(terms_).table(knots)
 
 
 def turned(knots: dict, angle: float) -> dict:
@@ -55,65 +56,65 @@ def random_knots(seed: int = 0) -> dict:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("block", grammar.BLOCKS)
+@pytest.mark.parametrize("block", laws.BLOCKS)
 def test_terms_turn_with_the_world(block):
     """Frame-covariant: forces turn with the world about the vertical, torques in the body do not notice."""
     knots, angle = random_knots(), 0.7
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) if block not in IN_THE_BODY else np.eye(3)
-    every = grammar.terms(block, KNOTS)
+    every = laws.terms_of(block, KNOTS)
     assert len(every) > 300
     values = table(every, knots)
     again = table(every, turned(knots, angle))
     np.testing.assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 
 
-@pytest.mark.parametrize("block", grammar.BLOCKS)
+@pytest.mark.parametrize("block", laws.BLOCKS)
 def test_the_table_of_terms_holds_each_term(block):
     """All at once, in their order, to the last bit what one product after the other gives."""
     knots = random_knots()
-    terms = grammar.terms(block, KNOTS)
+    terms = laws.terms_of(block, KNOTS)
     values = table(terms, knots)
     assert values.shape == (len(knots["time"]), 3, len(terms))
     for i, term in enumerate(terms):
-        own = grammar.VECTORS[block][term.vector].read(grammar.Known(knots))
+        own = laws.VECTORS[block][term.vector].read(laws.Known(knots))
         for factor in term.factors:
-            own = own * grammar.SCALARS[factor].read(grammar.Known(knots))[:, None]
+            own = own * laws.SCALARS[factor].read(laws.Known(knots))[:, None]
         np.testing.assert_array_equal(values[:, :, i], own)
         assert values[:, :, i].tobytes() == table([term], knots)[:, :, 0].tobytes()
 
 
 def test_what_follows_from_knots_is_computed_once(monkeypatch):
     calls = []
-    swing = grammar.DERIVED["swing"]
-    monkeypatch.setitem(grammar.DERIVED, "swing", lambda k: calls.append(1) or swing(k))
-    known = grammar.Known(random_knots())
-    for block in grammar.BLOCKS:
-        table(grammar.terms(block, KNOTS), known)
+    swing = laws.DERIVED["swing"]
+    monkeypatch.setitem(laws.DERIVED, "swing", lambda k: calls.append(1) or swing(k))
+    known = laws.Known(random_knots())
+    for block in laws.BLOCKS:
+        table(laws.terms_of(block, KNOTS), known)
     assert len(calls) == 1
 
 
 def test_a_torque_in_the_joint_acts_on_both_sides():
     """No force is left over, and no moment but the one about the rope, which a rope without stiffness does not take."""
     knots = random_knots()
-    terms = grammar.terms(grammar.JOINT, KNOTS)[:5]
+    terms = laws.terms_of(laws.JOINT, KNOTS)[:5]
     torque_b = table(terms, knots)
-    found = grammar.loads(grammar.JOINT, knots, torque_b)
+    found = laws.loads(laws.JOINT, knots, torque_b)
     assert tuple(sorted(found)) == tuple(sorted(LATENT_BLOCKS))
     np.testing.assert_allclose(found["vehicle force"], -found["payload force"])
     away = knots["payload_pos_w"] - knots["pos_w"]
-    along = away - grammar.rotate(knots, knots["mount_b"])
+    along = away - laws.rotate(knots, knots["mount_b"])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     for i in range(len(terms)):
-        on_vehicle = grammar.rotate(knots, found["vehicle torque"][:, :, i])
+        on_vehicle = laws.rotate(knots, found["vehicle torque"][:, :, i])
         about_it = on_vehicle + np.cross(away, found["payload force"][:, :, i])
-        twist = np.einsum("ki,ki->k", grammar.rotate(knots, torque_b[:, :, i]), along)[:, None] * along
+        twist = np.einsum("ki,ki->k", laws.rotate(knots, torque_b[:, :, i]), along)[:, None] * along
         np.testing.assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
 
 
 def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
     knots = random_knots() | {"tension": np.array([1.0, 0.5, 0.1, 0.0, 0.0, 0.0])}
-    values = table(grammar.terms(grammar.JOINT, KNOTS), knots)
+    values = table(laws.terms_of(laws.JOINT, KNOTS), knots)
     assert not values[3:].any()
     assert values[:3].any()
 
@@ -134,13 +135,13 @@ def test_hats_at_the_knots_follow_the_curve_between_them():
 
 
 @pytest.mark.parametrize(("term", "unit", "formula"), [
-    (grammar.Term("vehicle force", ("speed",), "vel"), "kg m^-1", "F = c |v| v"),
-    (grammar.Term("vehicle force", ("thrust", "speed_across_squared"), "body_z"), "m^-2 s^2", "F = c T v_xy² e_z"),
-    (grammar.Term("payload force", (), "vertical_cross_vel"), "kg s^-1", "F_p = c (z x v_p)"),
-    (grammar.Term("vehicle torque", ("thrust",), "axis_cross_vel"), "s", "M = c T (e_z x v)"),
-    (grammar.Term("vehicle force", ("thrust",), "body_z"), "1", "F = c T e_z"),
-    (grammar.Term(grammar.JOINT, ("joint_rate",), "joint_rate"), "kg m^2", "M_j = c |Ω| Ω"),
-    (grammar.Term(grammar.JOINT, ("tension",), "friction"), "m", "M_j = c S Ω/|Ω|"),
+    (laws.Term("vehicle force", ("speed",), "vel"), "kg m^-1", "F = c |v| v"),
+    (laws.Term("vehicle force", ("thrust", "speed_across_squared"), "body_z"), "m^-2 s^2", "F = c T v_xy² e_z"),
+    (laws.Term("payload force", (), "vertical_cross_vel"), "kg s^-1", "F_p = c (z x v_p)"),
+    (laws.Term("vehicle torque", ("thrust",), "axis_cross_vel"), "s", "M = c T (e_z x v)"),
+    (laws.Term("vehicle force", ("thrust",), "body_z"), "1", "F = c T e_z"),
+    (laws.Term(laws.JOINT, ("joint_rate",), "joint_rate"), "kg m^2", "M_j = c |Ω| Ω"),
+    (laws.Term(laws.JOINT, ("tension",), "friction"), "m", "M_j = c S Ω/|Ω|"),
 ])  # fmt: skip
 def test_units_and_formulas(term, unit, formula):
     assert term.unit == unit
@@ -148,7 +149,7 @@ def test_units_and_formulas(term, unit, formula):
 
 
 def test_terms_that_lack_their_knots_are_not_made():
-    for term in grammar.terms("vehicle force", ("time", "vel_w")):
+    for term in laws.terms_of("vehicle force", ("time", "vel_w")):
         assert term.vector in ("world_z", "vel")
         assert set(term.factors) <= {"speed"}
 
@@ -206,15 +207,15 @@ def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
     assert not diagnosis.named
 
 
-DRAG = grammar.Term("vehicle force", ("speed",), "vel")
+DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 
-def beside_a_law(model: SyntheticModel, active: list[int], *laws: grammar.Term) -> selector.Selector:
+def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> selector.Selector:
     """A search that has come to some names and laws."""
     problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
-    if laws:
-        problem, (point,) = terms.extended(problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in laws])
+    if told:
+        problem, (point,) = terms.extended(problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in told])
     named = [*active, *range(len(model.effects), len(problem.priors.floor))]
     return selector.Selector(problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named))
 

@@ -18,6 +18,7 @@ from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.inputs.setup import Setup
+from visthrow.diagnose.models.laws import term_of
 from visthrow.diagnose.select.scatter import variances
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, plant_of
@@ -96,11 +97,15 @@ def with_scatter(
 
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
     """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0. Raises DiagnoseError: it holds fewer."""
-    explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
-    if rank > len(explanations):
-        raise DiagnoseError(f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws asks for number {rank}")
-    laws = explanations[rank - 1] if rank else []
+    if rank > len(there := _explanations(report)):
+        raise DiagnoseError(f"{path}: {len(there)} explanations by laws outside the catalogue; --laws asks for number {rank}")
+    laws = there[rank - 1] if rank else []
     return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in laws]
+
+
+def _explanations(report: Mapping[str, Any]) -> list[list[dict[str, Any]]]:
+    """Sets of laws that belong together, best first."""
+    return report.get("explanations") or [[law] for law in report.get("laws") or []]
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
@@ -142,18 +147,34 @@ def with_firmware(path: str | Path, base: str, experiment: Experiment, hover: fl
     return "\n".join([*lines, dumps({"base": base, "vehicle": vehicle})])
 
 
-def of_setup(base: str, setup: Setup, report: Mapping[str, Any], path: str, provenance: Sequence[str]) -> str:
-    """The TOML file of a setup of another model than the throw, extended by the sizes that a diagnosis of it found.
+def of_setup(
+    base: str, setup: Setup, report: Mapping[str, Any], path: str, provenance: Sequence[str], rank: int = 0
+) -> str:
+    """The TOML file of a setup of another model than the throw, extended by the sizes and laws that a diagnosis of it found.
 
-    ``base``: path of the diagnosed setup, as ``base =`` is to name it. Raises DiagnoseError: no diagnosis, or one of another model.
+    Raises DiagnoseError: no diagnosis, one of another model, or one without such an explanation.
+
+    Args:
+        base: path of the diagnosed setup, as ``base =`` is to name it.
+        setup: that setup.
+        report: of the diagnosis. path: of its file.
+        provenance: lines on where it comes from.
+        rank: of the explanation whose laws are written, from 1; 0 for none.
     """
     theta, covariance = read(report, path)
     if [report.get("model", THROW)] != setup.named():
         own = ', '.join(setup.named()) or 'none'
         raise DiagnoseError(f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base} is {own}")
     units = {f["name"]: f["unit"] for f in report["findings"]}
-    lines = [f"# {line}" for line in provenance] + [f"# covariance of {', '.join(theta)}:"]
-    lines += [f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance] + [dumps({"base": base}).strip(), "", "[effects]"]
+    laws = laws_of(report, path, rank)
+    known = [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]] if rank else []
+    lines = [f"# {line}" for line in provenance]
+    for rows, names in ((covariance, list(theta)), (known, [term_of(law).formula for law in laws])):
+        lines += [f"# covariance of {', '.join(names)}:"] * bool(names) + [f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in rows]
+    lines += dumps({"base": base}).splitlines()
+    if laws:
+        lines.append(dumps({"laws": [dataclasses.asdict(law) for law in (*setup.laws, *laws)]}).strip())
+    lines += ["", "[effects]"] * bool(theta)
     for i, (name, size) in enumerate(theta.items()):
         before = setup.effects.get(name, 0.0)
         lines.append(f"{name} = {before + size:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g} {units.get(name, '')}".rstrip())

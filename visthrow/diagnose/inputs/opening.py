@@ -93,6 +93,10 @@ class _Part:
     def __getattr__(self, name: str):
         return getattr(self.whole, name)
 
+    def with_laws(self, laws):
+        """See :class:`visthrow.diagnose.models.numeric.NumericModel`."""
+        return _Part(self.whole.with_laws(laws), self._keep)
+
     def windows(self, theta):
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         from dataclasses import replace

@@ -4,12 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sim.params import LawParams
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel, FlyerParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.laws import term_of
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
@@ -26,7 +28,7 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Setup:
-    """File of ``configs/diagnose``; at most one of the models. Raises ConfigError: more than one model."""
+    """File of ``configs/diagnose``; at most one of the models. Raises ConfigError: more than one model, or a law of no grammar."""
 
     about: str  # whose logs these are
     table: TableMap | None = None  # of tables' columns; None: the logs say themselves what they hold
@@ -37,10 +39,13 @@ class Setup:
     flyer: FlyerParams | None = None
     trim: TrimParams | None = None
     effects: dict[str, float] = field(default_factory=dict)  # sizes that a diagnosis found, written by apply
+    laws: tuple[LawParams, ...] = ()  # likewise
 
     def __post_init__(self) -> None:
         if len(self.named()) > 1:
             raise ConfigError(f"{' and '.join(self.named())}: a setup has one model")
+        for law in self.laws:
+            term_of(law)
 
     def named(self) -> list[str]:
         """Names of the models that have a table."""
@@ -50,13 +55,13 @@ class Setup:
 def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
     """Make the model that a setup holds logs against.
 
-    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect is none of the model's.
+    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect or law is none of the model's.
     """
     if not setup.named():
         raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
     name = setup.named()[0]
     model = MODELS[name](logs, getattr(setup, name))
-    model.extend(setup.effects)
+    model.extend(setup.effects, setup.laws)
     return model
 
 

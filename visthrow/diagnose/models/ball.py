@@ -10,6 +10,7 @@ import numpy as np
 
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.models.laws import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -67,6 +68,8 @@ class BallModel(NumericModel):
             air = vel - wind
             speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
             acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[at]
+            if self.laws:
+                acc = acc + exerted(self.laws, _known(state[:, 0], state))["payload force"]
             return np.concatenate([vel, acc], 1)
 
         step = self._span[lanes.owner, None] / STEPS * (1.0 + clock[:, None])
@@ -75,8 +78,7 @@ class BallModel(NumericModel):
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; a law's coefficient is that of a ball of 1 kg."""
         time = np.unique(stretch.latent_time)
-        known = triangles(time, np.linspace(time[0], time[-1], STEPS + 1)) @ path
-        return {"time": time, "payload_pos_w": known[:, :3], "payload_vel_w": known[:, 3:]}
+        return _known(time, triangles(time, np.linspace(time[0], time[-1], STEPS + 1)) @ path)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
@@ -88,6 +90,11 @@ class BallModel(NumericModel):
         first = pos[:, :1]
         turned = pos + cross(np.stack([tilt_x, tilt_y, 0.0 * tilt_x], 1)[:, None], pos - first)
         return (first + (turned - first) * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
+
+
+def _known(time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+    """Quantities of a law at states, shape (k, 6)."""
+    return {"time": time, "payload_pos_w": state[:, :3], "payload_vel_w": state[:, 3:]}
 
 
 def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:

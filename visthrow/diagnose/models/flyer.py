@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
-from visthrow.diagnose.models.flyer_windows import FINE, spare, stretches_of
+from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, spare, stretches_of
+from visthrow.diagnose.models.laws import exerted
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force, triangles
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
@@ -88,6 +89,13 @@ class FlyerModel(NumericModel):
         path = integrate(dynamics, dynamics.start(lanes), self.steps, np.full((len(lanes.owner), 1), p.step))
         return np.concatenate([path, real[::2].swapaxes(0, 1)], 2)
 
+    def _rise(self, thrust: np.ndarray) -> np.ndarray:
+        """Slope of the whole thrust at the half steps as knots tell it [N/s], shape (half steps, B)."""
+        knots = np.linspace(0.0, self.params.window, KNOTS)
+        grid = np.linspace(0.0, self.params.window, len(thrust))
+        slope = np.gradient(triangles(knots, grid[::2]) @ thrust[::2].sum(2), knots, axis=0)
+        return triangles(grid, knots) @ slope
+
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; the cable's tension is what accelerates the payload against gravity."""
         p, time = self.params, np.unique(stretch.latent_time)
@@ -157,12 +165,14 @@ class _Dynamics:
         """Take the lanes' sizes; ``thrust`` [N], shape (half steps, B, motors); ``latent`` as :func:`latent_force` gives it."""
         p = model.params
         self.thrust, self.total, self.latent = thrust, thrust.sum(2, keepdims=True), latent
+        self.rise = model._rise(thrust) if model.laws else None
 
         def get(name: str) -> np.ndarray:
             return model.of(lanes, name)
 
         mass = (p.mass + get("mass_quad"))[:, None]
         self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
+        self.blocks = ("", *["payload force"] * (p.cable is not None), *["vehicle torque"] * (p.torque is not None))
         self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
         self.lean = get("estimator_lean")[:, None]
         self.turns, self.half = bool(np.any(self.turn) or np.any(self.lean)), -1
@@ -219,6 +229,10 @@ class _Dynamics:
         if self.turns:
             force_b = force_b + cross(self.off, force_b)
         force = np.einsum("bij,bj->bi", self.rot, force_b) + latent[0]
+        if self.model.laws:
+            own = self._exerted(half, state, force, latent)
+            force = force + own.get("vehicle force", 0.0)
+            latent = np.stack([push + own.get(block, 0.0) for push, block in zip(latent, self.blocks)])
         parts = [vel]
         if self.p.cable is None:
             parts.append(force / self.mass + self.gravity)
@@ -229,7 +243,13 @@ class _Dynamics:
         return np.concatenate(parts, 1)
 
     def _with_cable(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:
-        """Acceleration of the vehicle, rate of the cable's vector, its acceleration; a cable pulls and never pushes."""
+        """Acceleration of the vehicle, rate of the cable's vector, its acceleration."""
+        free_q, free_p, along, pull = self._pull(state, vel, force, latent)
+        acc_q, acc_p = free_q + pull * along / self.mass, free_p - pull * along / self.payload
+        return [acc_q, state[:, 9:12], acc_p - acc_q]
+
+    def _pull(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Accelerations without the cable, its direction, and what it pulls with [N]; it never pushes."""
         gap, gap_rate = state[:, 6:9], state[:, 9:12]
         vel_p = vel + gap_rate - self.wind
         drag = -self.payload_drag * np.linalg.norm(vel_p, axis=1, keepdims=True) * vel_p
@@ -237,9 +257,22 @@ class _Dynamics:
         length = np.linalg.norm(gap, axis=1, keepdims=True)
         along = gap / length
         relative = np.sum(along * (free_p - free_q), 1, keepdims=True) + np.sum(gap_rate**2, 1, keepdims=True) / length
-        pull = np.maximum(relative / (1.0 / self.payload + 1.0 / self.mass), 0.0)
-        acc_q, acc_p = free_q + pull * along / self.mass, free_p - pull * along / self.payload
-        return [acc_q, gap_rate, acc_p - acc_q]
+        return free_q, free_p, along, np.maximum(relative / (1.0 / self.payload + 1.0 / self.mass), 0.0)
+
+    def _exerted(self, half: int, state: np.ndarray, force: np.ndarray, latent: np.ndarray) -> dict[str, np.ndarray]:
+        """What the laws exert in each latent block, at the cable's tension without them."""
+        vel, none, at = state[:, 3:6], np.zeros((len(state), 3)), half + self.model._spare
+        turn = np.einsum("bji,bjk->bik", self.model._rot[self.owner, at - 1], self.model._rot[self.owner, at + 1])
+        skew = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+        known = {
+            "time": none[:, 0], "pos_w": state[:, :3], "vel_w": vel, "rate_b": skew / (2.0 * self.p.step),
+            "thrust": self.total[half, :, 0], "slope": self.rise[half], **{f"axis_{a}": self.rot[:, :, i] for i, a in enumerate("xyz")},
+        }  # fmt: skip
+        if self.p.cable is not None:
+            _, _, along, pull = self._pull(state, vel, force, latent[1])
+            known |= {"payload_pos_w": state[:, :3] + state[:, 6:9], "payload_vel_w": vel + state[:, 9:12], "cable_dir_w": along,
+                      "tension": pull[:, 0], "mount_b": none}  # fmt: skip
+        return exerted(self.model.laws, known)
 
     def _turning(self, rate: np.ndarray, thrust: np.ndarray, total: np.ndarray, latent: np.ndarray) -> np.ndarray:
         """Angular acceleration from the motors' thrusts and the offset of the centre of mass."""

@@ -6,13 +6,16 @@ known at the start is fitted before the linearisation, so that the linearisation
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from sim.params import LawParams
 from visthrow.common.errors import LogError, suggest
 from visthrow.diagnose.models.interface import Effect, Linearised, Window
+from visthrow.diagnose.models.laws import carries, term_of
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel
 
@@ -20,7 +23,7 @@ EFFECT_STEP = 0.05
 """Step of the differences by effects, in their prior deviations: errors of curvature cancel, those of rounding do not matter."""
 NUISANCE_STEP = 1e-3  # step of the differences by unknowns at the start, in their prior deviations
 SETTLE_STEPS = 5
-SETTLED = 1e-3  # a Gauss-Newton step on the unknowns at the start that gains less than this [nats] is the last
+SETTLED = 1e-3  # a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
 MOST_LANES = 6000  # simulated in one batch
 
 
@@ -61,6 +64,7 @@ class NumericModel(ABC):
 
     cheap = True  # derivatives are taken anew wherever the search goes
     latent_step = 1.0  # of the differences by latent forces [N or N m]
+    lawless = ""  # why no law outside the catalogue can act in it
 
     def __init__(
         self, effects: Sequence[Effect], channels: Sequence[str], stretches: Sequence[Stretch], inputs: Sequence[str] = ()
@@ -78,16 +82,35 @@ class NumericModel(ABC):
         self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] | None = None
         self._base = np.zeros(len(self.effects))  # sizes that the model has before anything is found
+        self.laws: tuple[LawParams, ...] = ()  # that act in it besides
+        self._flown: NumericModel | None = None  # the same with more laws
 
-    def extend(self, sizes: Mapping[str, float]) -> None:
-        """Give the model what a diagnosis found: sizes are counted, and bounded, from there. Raises LogError for one outside its bounds."""
+    def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
+        """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws act besides.
+
+        Raises LogError for a size outside its bounds, and a law that cannot act in this model.
+        """
         base = self.size(sizes)
         for effect, size in zip(self.effects, base):
             if not effect.bounds[0] <= size <= effect.bounds[1]:
                 low, high = effect.bounds
                 raise LogError(f"{effect.name} = {size:.4g} {effect.unit}; this model has it from {low:g} to {high:g}")
-        self._base = base
+        if laws:
+            first, one = self.stretches[0], self._lanes(base).part([0])
+            there = self.knots(first, self.simulate(one)[0]).keys()
+            for term in map(term_of, laws):
+                lacking = sorted(term.needs - there) or ([] if carries(first.latent_block, term.block) else [term.block])
+                if lacking:
+                    raise LogError(f"the law {term.formula} cannot act here: {self.lawless or 'this model has no ' + ', '.join(lacking)}")
+        self._base, self.laws = base, (*self.laws, *laws)
         self.effects = tuple(replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b)) for e, b in zip(self.effects, base.tolist()))
+
+    def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
+        """The same model in which laws act besides its own."""
+        if self._flown is None:  # its initial states follow from call to call
+            self._flown = copy(self)
+        self._flown.laws = (*self.laws, *laws)
+        return self._flown
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """Simulate lanes; the result has the lane as its first axis. Models without a state need not override it."""
@@ -163,6 +186,8 @@ class NumericModel(ABC):
         costs = self._costs(residuals, self._start)
         for _ in range(SETTLE_STEPS):
             steps = np.array([self._newton(i, residual) for i, residual in enumerate(residuals)])
+            if not np.any(steps):
+                break
             before = costs.copy()
             for shrink in (1.0, 0.3):
                 trial = self._start + shrink * steps
@@ -193,7 +218,8 @@ class NumericModel(ABC):
             return np.zeros(len(s.nuisance))  # no step mends that; the search says which window it is
         rows = np.concatenate([slope * weight[:, None], np.diag(prior)])
         aim = np.concatenate([residual * weight, (s.nuisance - self._start[i]) * prior])
-        return np.linalg.lstsq(rows, aim, rcond=None)[0]
+        step = np.linalg.lstsq(rows, aim, rcond=None)[0]
+        return step if 0.5 * aim @ rows @ step > SETTLED else np.zeros_like(step)
 
     def _by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
         """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central differences; (N, directions) a stretch."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.models.laws import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -16,15 +17,15 @@ from visthrow.diagnose.models.numeric import (
     latent_force,
     latent_layout,
     sigma_of,
+    triangles,
 )
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "angle"
-KNOTS = 11  # of the latent torque per inertia over a window; told as one axis of the payload's force
+KNOTS = 11  # of the latent force on the bob over a window
 FEWEST = 20  # samples of a window
 FARTHEST = 2.0 * np.pi  # median distance from where the pendulum hangs [rad]: no free swing goes round and round most of the time
 SMOOTH = 0.02  # dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator
-
 
 @dataclass(frozen=True)
 class PendulumParams:
@@ -47,7 +48,12 @@ class PendulumParams:
 
 
 class PendulumModel(NumericModel):
-    """Free swings, cut into windows."""
+    """Free swings, cut into windows.
+
+    Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg at the pendulum's length.
+    """
+
+    latent_step = 0.1
 
     def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
         """Cut the logs. Raises LogError where none holds an angle, or one holds angles that are no radians from where it hangs."""
@@ -62,15 +68,34 @@ class PendulumModel(NumericModel):
         length, viscous, coulomb, quadratic, _, _, clock, spring = lanes.theta.T
         stiffness = p.gravity / (p.length + length)
         viscous, coulomb, quadratic = p.viscous + viscous, p.coulomb + coulomb, p.quadratic + quadratic
-        push = latent_force(lanes.latent, self._steps, 1, 1)[:, 0, :, 0]
+        push = latent_force(lanes.latent, self._steps, 1, 2)[:, 0]
 
         def slope(at: int, state: np.ndarray) -> np.ndarray:
             angle, rate = state.T
-            friction = viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate
-            return np.stack([rate, -stiffness * np.sin(angle) - spring * angle - friction + push[at]], 1)
+            sine, friction = np.sin(angle), viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate
+            force = push[at]
+            if self.laws:
+                force = force + exerted(self.laws, self._known(angle, state))["payload force"][:, ::2]
+            along = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
+            return np.stack([rate, -stiffness * sine - spring * angle - friction + along], 1)
 
         step = p.window / self._steps * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance.copy(), self._steps, step)
+
+    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
+        """See the base class."""
+        time, grid = np.unique(stretch.latent_time), stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path))
+        return self._known(time, triangles(time, grid) @ path)
+
+    def _known(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+        """Quantities of a law at angles and rates, shape (k, 2); the pivot stands upright and still."""
+        length, (angle, rate) = self.params.length, state.T
+        along, vel, upright = np.zeros((len(state), 3)), np.zeros((len(state), 3)), np.zeros((len(state), 4))
+        along[:, 0], along[:, 2], upright[:, 3] = np.sin(angle), -np.cos(angle), 1.0
+        vel[:, 0], vel[:, 2] = -length * rate * along[:, 2], length * rate * along[:, 0]
+        tension = np.maximum(length * rate**2 - self.params.gravity * along[:, 2], 0.0)
+        return {"time": time, "payload_pos_w": length * along, "payload_vel_w": vel, "cable_dir_w": along, "quat_wb": upright,
+                "under": -along[:, 2], "tension": tension}  # fmt: skip
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
@@ -102,7 +127,7 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
         found.append(
             Stretch(
                 number, "swing", t, np.zeros(len(t), dtype=int), y, np.full(len(t), sigma), fit[:2], np.array([0.2, 1.0]),
-                {"start": start}, **latent_layout(start, start + params.window, KNOTS, (2,), (0,)),
+                {"start": start}, **latent_layout(start, start + params.window, KNOTS, (2,), (0, 2)),
             )
         )  # fmt: skip
     return found

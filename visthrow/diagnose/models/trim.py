@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.models.laws import exerted
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
@@ -61,12 +62,24 @@ class TrimModel(NumericModel):
         spin = np.array(p.spin)
         lift = stretch.data["lift"]
         push, roll, pitch, turn = lanes.latent.reshape(len(theta), 4, 2).mean(2).T  # the last three are torques
+        if self.laws:
+            own = exerted(self.laws, self.knots(stretch, path))
+            push = push + np.mean(own.get("vehicle force", np.zeros((1, 3)))[:, 2])
+            roll, pitch, turn = (x + y for x, y in zip((roll, pitch, turn), np.mean(own.get("vehicle torque", np.zeros((1, 3))), 0)))
         share = np.outer(off_x, x) / p.arm**2 + np.outer(off_y, y) / p.arm**2 - np.outer(yaw, spin)
         thrust = 0.25 * (1.0 + share) * (weight * lift)[:, None] - 0.25 * push[:, None]
         thrust = thrust - 0.25 * (np.outer(roll, y) - np.outer(pitch, x)) / p.arm**2 - 0.25 * np.outer(turn, spin) / p.torque_ratio
         volts = 1.0 + (p.voltage_coefficient + sag) * (stretch.data["volts"] - p.reference_voltage)
         per_map = thrust / (np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None])
         return command_of(p.thrust_map, per_map)
+
+
+    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
+        """See the base class; nothing tells the attitude, hence not the body's velocity either."""
+        data, (start, end) = stretch.data, np.unique(stretch.latent_time)
+        thrust = self.params.mass * self.params.gravity * data["lift"]
+        return {"time": np.array([start, end]), "pos_w": np.tile(data["pos"], (2, 1)), "vel_w": np.tile(data["vel"], (2, 1)),
+                "thrust": np.full(2, thrust)}  # fmt: skip
 
 
 def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
@@ -97,7 +110,8 @@ def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
         if np.min(pos[near][:, 2]) < params.lowest or np.mean(np.linalg.norm(own, axis=1)) > params.fastest:
             continue
         lift = 1.0 + (own[-5:, 2].mean() - own[:5, 2].mean()) / window / params.gravity
-        data = {"volts": float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage, "lift": lift}
+        data = {"volts": float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage, "lift": lift,
+                "pos": np.mean(pos[near], axis=0), "vel": np.mean(own, axis=0)}  # fmt: skip
         found.append(
             Stretch(
                 number, "hover", np.full(4, start), np.zeros(4, dtype=int), np.mean(sent[inside], axis=0), np.full(4, params.spread),

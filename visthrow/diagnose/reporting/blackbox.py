@@ -11,6 +11,7 @@ import numpy as np
 
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.stack import statistics
+from visthrow.diagnose.models import laws
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
 
@@ -25,7 +26,7 @@ def _inputs(window: Window) -> np.ndarray:
     knots = window.knots
     parts = [np.zeros((len(knots.get("time", ())), 0))]
     if "vel_w" in knots:
-        parts.append(grammar.rotate_back(knots, knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"])
+        parts.append(laws.rotate_back(knots, knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"])
     parts += [knots[name].reshape(len(knots[name]), -1) for name in ("rate_b", "thrust") if name in knots]
     return np.hstack(parts)
 
@@ -47,7 +48,7 @@ class Table:
 
     def columns(self, window: Window) -> np.ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
-        basis, parts, known = self.radial(_inputs(window)), [], grammar.Known(window.knots)
+        basis, parts, known = self.radial(_inputs(window)), [], laws.Known(window.knots)
         for block in self.blocks:
             turned = block != "vehicle torque" and "quat_wb" in known
             axes = np.stack([known[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1)) for i, row in zip("xyz", np.eye(3))], -1)

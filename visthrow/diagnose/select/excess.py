@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
-from visthrow.diagnose.likelihood.grammar import JOINT, JOINT_NEEDS, Known, through_latents
+from visthrow.diagnose.likelihood.grammar import through_latents
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.laws import JOINT, JOINT_NEEDS, Known
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import Level
 from visthrow.logs.flightlog import STANDARD_CHANNELS

@@ -72,6 +72,13 @@ class Problem:
         """The same of some of the windows that are looked at."""
         return replace(self, kept=tuple(self.kept[w] for w in windows))
 
+    def flown(self, theta: np.ndarray) -> Model | None:
+        """The model with the terms at their sizes as its laws; None where it cannot fly laws, or has none. ``theta`` is in floors."""
+        if not self.terms or not hasattr(self.model, "with_laws"):
+            return None
+        sizes = zip(self.terms, theta[-len(self.terms) :])
+        return self.model.with_laws([e.term.law(float(size * e.floor)) for e, size in sizes if size != 0.0])
+
     def sizes(self, theta: np.ndarray) -> dict[str, float]:
         """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in floors."""
         return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
@@ -139,11 +146,12 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     already.
     """
     sizes, channels = problem.sizes(theta), len(problem.model.channels)
-    windows = problem.model.windows(sizes) if windows is None else windows
+    flown = problem.flown(theta)
+    windows = (flown or problem.model).windows(sizes) if windows is None else windows
     own = with_correlations([windows[i] for i in problem.kept], problem.correlated)
     commands = problem.model.without_commands(sizes, problem.kept) if problem.lost else ()
     commands = [np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, own)]  # nothing behind replayed samples
-    found = own if not problem.terms else each(lambda w: with_terms(w, problem.terms, theta), own)
+    found = own if not problem.terms else each(lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta), own)
     found = found if not commands else [_losing(w, c, problem.lost) for w, c in zip(found, commands)]
     device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
     first = grams_of(found, floors, channels, device)
@@ -198,7 +206,10 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     about = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
     own = len(problem.model.effects)  # a term's column stays that of the place where derivatives were taken
     sizes, change = problem.priors.floor * theta, problem.priors.floor * (theta - point.theta)
-    if np.array_equal(theta[:own], point.theta[:own]):
+    if (flown := problem.flown(theta)) is not None:
+        found = flown.residuals(problem.sizes(theta), about)
+        residuals = [found[i] for i in problem.kept]
+    elif np.array_equal(theta[:own], point.theta[:own]):
         residuals = [w.residual - w.effects[:, own:] @ change[own:] for w in point.windows]
     else:
         found = problem.model.residuals(problem.sizes(theta), about)

@@ -85,13 +85,14 @@ class Law:
     """A term outside the catalogue: coefficient times scalar factors times a vector."""
 
     formula: str
-    block: str  # of visthrow.diagnose.likelihood.grammar.BLOCKS
-    factors: tuple[str, ...]  # keys of visthrow.diagnose.likelihood.grammar.SCALARS
-    vector: str  # key of visthrow.diagnose.likelihood.grammar.VECTORS
+    block: str  # of visthrow.diagnose.models.laws.BLOCKS
+    factors: tuple[str, ...]  # keys of visthrow.diagnose.models.laws.SCALARS
+    vector: str  # key of visthrow.diagnose.models.laws.VECTORS
     coefficient: float
     sd: float
     unit: str
     nats: float  # of evidence, less the log of the number of terms tried
+    covariance: tuple[float, ...] = ()  # of its coefficient with those of all laws of its explanation, in their order
 
 
 @dataclass(frozen=True)

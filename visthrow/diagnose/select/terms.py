@@ -14,15 +14,15 @@ import numpy as np
 import torch
 from scipy.linalg import lapack
 
-from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.designs import Same
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
-from visthrow.diagnose.likelihood.grammar import TermEffect, carries, forces
+from visthrow.diagnose.likelihood.grammar import TermEffect, forces, joined, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.laws import JOINT, Known, Layout, Term, carries, loads, terms_of
 from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
@@ -38,16 +38,16 @@ WEIGHED = 6  # terms that become effects to be weighed: as many as other sets th
 
 
 @lru_cache(maxsize=32)
-def _laid(block: str, known: tuple[str, ...]) -> tuple[tuple[grammar.Term, ...], grammar.Layout | None]:
-    terms = tuple(grammar.terms(block, known))
-    return terms, grammar.Layout.of(terms) if terms else None
+def _laid(block: str, known: tuple[str, ...]) -> tuple[tuple[Term, ...], Layout | None]:
+    terms = tuple(terms_of(block, known))
+    return terms, Layout.of(terms) if terms else None
 
 
 @dataclass
 class Screen:
     """Information of all terms about one point, summed over windows."""
 
-    terms: tuple[grammar.Term, ...]
+    terms: tuple[Term, ...]
     size: np.ndarray  # root mean square over the knots, shape (T,)
     own: np.ndarray  # shape (T,)
     score: np.ndarray
@@ -56,7 +56,7 @@ class Screen:
 
 def felt(block: str) -> str:
     """Latent block whose levels a term's size is measured in."""
-    return "vehicle torque" if block == grammar.JOINT else block
+    return "vehicle torque" if block == JOINT else block
 
 
 def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
@@ -77,7 +77,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
     return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts
 
 
-def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[grammar.Known]) -> Screen | None:
+def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[Known]) -> Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
     through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
     names = [set(point.windows[w].knots) for w in through]
@@ -88,7 +88,7 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
     own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
 
     ends = np.cumsum([len(known[w]["time"]) for w in through])[:-1]
-    factors = zip(*(np.split(values, ends) for values in layout.factors(grammar.joined([known[w] for w in through], shared))))
+    factors = zip(*(np.split(values, ends) for values in layout.factors(joined([known[w] for w in through], shared))))
     exerted = each(lambda w: _exerted(point, parts[w], w, block, known[w], own), through)
     told = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
     flights = np.searchsorted(point.plain.flights, [point.windows[w].flight for w in through])
@@ -113,15 +113,15 @@ def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarr
     return out
 
 
-def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: grammar.Known, own: int) -> tuple[np.ndarray, ...]:
+def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: Known, own: int) -> tuple[np.ndarray, ...]:
     """Of what is exerted at a window's knots: square and information, score and cross information."""
-    through = grammar.through_latents(point.windows[w], known, block)
+    through = through_latents(point.windows[w], known, block)
     here = through[point.grams[w].latent_block == own]
     score = part.latent_score + part.latent_effects @ point.theta
     return here.T @ here, through.T @ part.latent_information @ through, through.T @ score, through.T @ part.latent_effects
 
 
-def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: grammar.Layout, device: str) -> tuple[np.ndarray, ...]:
+def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: Layout, device: str) -> tuple[np.ndarray, ...]:
     """Square, information, score and cross information of all terms, of these windows together.
 
     ``windows``: of each, what is exerted at its knots, and the scalars and vectors there.
@@ -219,9 +219,9 @@ def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     return own, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
-def knots_of(point: Point) -> list[grammar.Known]:
+def knots_of(point: Point) -> list[Known]:
     """Quantities at the knots of each window."""
-    return [grammar.Known(window.knots) for window in point.windows]
+    return [Known(window.knots) for window in point.windows]
 
 
 def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float) -> list[TermEffect]:
@@ -235,7 +235,7 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
     depths = [term.depth for of in screens.values() for term in of.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
-    found: list[tuple[float, grammar.Term, float]] = []
+    found: list[tuple[float, Term, float]] = []
     for block, of in screens.items():
         gain, prior = gains(calm, problem.priors, active, of, UNKNOWN_RATIO * strongest[block])
         gain -= [price[term.depth] for term in of.terms]
@@ -245,7 +245,7 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
 
-def as_effect(term: grammar.Term, prior: float, price: float) -> TermEffect:
+def as_effect(term: Term, prior: float, price: float) -> TermEffect:
     """A term as an effect, with the prior deviation of its coefficient and what it costs beyond the threshold [nats]."""
     return TermEffect(term.formula, "a law that the catalogue does not hold", term.formula, term.unit, term.block, (-np.inf, np.inf),
                       prior, NARROW * prior, (), "grammar", term=term, price=price)  # fmt: skip
@@ -258,7 +258,7 @@ def strongest_forces(point: Point) -> dict[str, float]:
         name = LATENT_BLOCKS[block]
         strongest[name] = max(strongest.get(name, 0.0), level)
     if set(strongest) == set(LATENT_BLOCKS):
-        strongest[grammar.JOINT] = strongest[felt(grammar.JOINT)]
+        strongest[JOINT] = strongest[felt(JOINT)]
     return strongest if all(w.knots for w in point.windows) else {}
 
 
@@ -268,11 +268,11 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
     ``j``: number of the term among the effects.
     """
     term = problem.effects[j].term
-    layout = grammar.Layout.of([term])
+    layout = Layout.of([term])
     square: dict[tuple[int, str], list[float]] = {}
     for window, gram, own in zip(point.windows, point.grams, knots_of(point)):
         if carries(gram.latent_block, term.block):
-            for block, values in grammar.loads(term.block, own, layout.table(own)).items():
+            for block, values in loads(term.block, own, layout.table(own)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
     floors = floors_of(problem, point)
     return any(abs(size) * np.sqrt(np.mean(values)) > floors.get(key, 0.0) for key, values in square.items())
@@ -281,12 +281,15 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
 def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
     sigma = covariance(point.information, problem.priors.deviation(list(active)))
-    mean, sd, effects = sigma @ point.score, np.sqrt(np.diag(sigma)), problem.effects
-    told = [(effects[j].term, effects[j].floor, j) for j in active if isinstance(effects[j], TermEffect)]
+    mean, effects = sigma @ point.score, problem.effects
+    told = [j for j in active if isinstance(effects[j], TermEffect)]
+    floor = np.array([effects[j].floor for j in told])
+    spread = sigma[np.ix_(told, told)] * np.outer(floor, floor)
     return tuple(
-        Law(t.formula, t.block, t.factors, t.vector, float(mean[j] * floor), float(sd[j] * floor), t.unit, float(nats))
-        for t, floor, j in told
-    )
+        Law(t.formula, t.block, t.factors, t.vector, float(mean[j] * floor[i]), float(np.sqrt(spread[i, i])), t.unit, float(nats),
+            tuple(spread[i].tolist()))
+        for i, (j, t) in enumerate((j, effects[j].term) for j in told)
+    )  # fmt: skip
 
 
 def beyond(point: Point, priors: Priors, active: Sequence[int], term: int, name: int) -> float:

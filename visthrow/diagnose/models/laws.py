@@ -1,0 +1,326 @@
+"""Laws outside the catalogue: a force or torque as coefficient times up to two scalars times one vector.
+
+Every factor has a unit, so the coefficient's unit follows; vectors are made of body axes, world vertical, rope and velocities, so
+that a law means the same after the world is turned about the vertical. A term is plain data (:class:`Term`), from which the
+simulator can build a block.
+
+A torque in the rope's joint acts on both sides: M on the vehicle, -M on the rope. With n the rope's direction and l its length to
+the payload's centre, the couple -M on a rope that is straight does what a pair of forces does,
+
+    F_p = (-M x n) / l on the payload,   -F_p at the mount,
+
+so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is conserved.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sim.params import LOWEST, SLOWEST, LawParams
+from visthrow.common import rotations
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.rotations import cross
+from visthrow.diagnose.models.interface import LATENT_BLOCKS
+
+Unit = tuple[int, int, int]  # exponents of kg, m and s
+
+Knots = Mapping[str, np.ndarray]
+
+JOINT = "rope joint"  # block of the torque between vehicle and rope, which acts in all latent blocks at once
+BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
+
+
+class Known(dict):
+    """Quantities at the knots, and what follows from them, computed when it is first asked for."""
+
+    def __missing__(self, name: str) -> np.ndarray:
+        """Compute one of the quantities of ``DERIVED``."""
+        value = self[name] = DERIVED[name](self)
+        return value
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A scalar or a vector of the state."""
+
+    symbol: str
+    unit: Unit
+    needs: tuple[str, ...]  # keys of Window.knots
+    read: Callable[[Known], np.ndarray]  # (k,) for a scalar, (k, 3) for a vector, in the block's frame
+
+
+@dataclass(frozen=True)
+class Term:
+    """One law without its coefficient."""
+
+    block: str  # of BLOCKS
+    factors: tuple[str, ...]  # keys of SCALARS
+    vector: str  # key of VECTORS[block]
+
+    @property
+    def depth(self) -> int:
+        """Number of factors."""
+        return len(self.factors) + 1
+
+    def law(self, coefficient: float) -> LawParams:
+        """The law that it is with a coefficient."""
+        return LawParams(self.block, self.factors, self.vector, coefficient)
+
+    @property
+    def needs(self) -> set[str]:
+        """Keys of Window.knots that its factors are made of."""
+        return {key for factor in (*(SCALARS[f] for f in self.factors), VECTORS[self.block][self.vector]) for key in factor.needs}
+
+    @property
+    def unit(self) -> str:
+        """Of the coefficient, such that the term is a force [N] or, on the vehicle and in the joint, a torque [N m]."""
+        target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
+        parts = [SCALARS[f].unit for f in self.factors] + [VECTORS[self.block][self.vector].unit]
+        left = zip(("kg", "m", "s"), (t - sum(p[i] for p in parts) for i, t in enumerate(target)))
+        return " ".join(name if n == 1 else f"{name}^{n}" for name, n in left if n) or "1"
+
+    @property
+    def formula(self) -> str:
+        """The right-hand side with coefficient c."""
+        symbols = [SCALARS[f].symbol for f in self.factors] + [VECTORS[self.block][self.vector].symbol]
+        left = {"vehicle force": "F", "vehicle torque": "M", "payload force": "F_p", JOINT: "M_j"}[self.block]
+        return f"{left} = c {' '.join(symbols)}"
+
+
+def term_of(law: LawParams) -> Term:
+    """The term of a law that a file holds. Raises ConfigError: a factor or vector that the grammar does not have there."""
+    for name, there in ((law.vector, VECTORS[law.block]), *((factor, SCALARS) for factor in law.factors)):
+        if name not in there:
+            raise ConfigError(f"law on {law.block}: no '{name}'; {suggest(name, there)}")
+    if len(law.factors) > MOST_SCALARS:
+        raise ConfigError(f"law on {law.block}: {len(law.factors)} factors; expected at most {MOST_SCALARS}")
+    return Term(law.block, law.factors, law.vector)
+
+
+def exerted(laws: Sequence[LawParams], known: Knots) -> dict[str, np.ndarray]:
+    """What laws exert in each latent block at states with these quantities, shape (k, 3); without laws nothing."""
+    known, total = Known(known), {}
+    for law in laws:
+        value = law.coefficient * VECTORS[law.block][law.vector].read(known)
+        for factor in law.factors:
+            value *= SCALARS[factor].read(known)[:, None]
+        for block, own in loads(law.block, known, value[:, :, None]).items():
+            total[block] = total.get(block, 0.0) + own[:, :, 0]
+    return total
+
+
+def carries(latent_block: np.ndarray, block: str) -> bool:
+    """Whether a window has all latents that terms of a block act through."""
+    return set(map(LATENT_BLOCKS.index, LATENT_BLOCKS if block == JOINT else (block,))) <= set(np.unique(latent_block).tolist())
+
+
+def rotate(knots: Knots, vector_b: np.ndarray) -> np.ndarray:
+    """Body to world at the knots, shape (k, 3)."""
+    return rotations.rotate(np.asarray(knots["quat_wb"], dtype=float), vector_b)
+
+
+def rotate_back(knots: Knots, vector_w: np.ndarray) -> np.ndarray:
+    """World to body at the knots, shape (k, 3)."""
+    return rotations.rotate_back(np.asarray(knots["quat_wb"], dtype=float), vector_w)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("ki,ki->k", a, b)
+
+
+def _axis(i: int) -> Callable[[Known], np.ndarray]:
+    return lambda k: rotate(k, np.tile(np.eye(3)[i], (len(k["quat_wb"]), 1)))
+
+
+def _fixed(i: int) -> Callable[[Known], np.ndarray]:
+    return lambda k: np.tile(np.eye(3)[i], (len(k["time"]), 1))
+
+
+def _slope(k: Known) -> np.ndarray:
+    return np.gradient(k["thrust"], k["time"]) if len(k["time"]) > 1 else np.zeros(len(k["time"]))
+
+
+def _swing(k: Known) -> np.ndarray:
+    """Velocity of the payload against the vehicle, across the rope."""
+    relative, n = k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]
+    return relative - _dot(relative, n)[:, None] * n
+
+
+def _reach(k: Known) -> np.ndarray:
+    """From the mount to the payload's centre [m], world frame."""
+    return k["payload_pos_w"] - k["pos_w"] - rotate(k, k["mount_b"])
+
+
+def _joint_rate(k: Known) -> np.ndarray:
+    """Rate of the rope against the vehicle [1/s], body frame; 0 where nothing hangs on it."""
+    reach = k["reach_w"]
+    mount_vel = k["vel_w"] + rotate(k, cross(k["rate_b"], k["mount_b"]))
+    rope_rate = cross(reach, k["payload_vel_w"] - mount_vel) / _dot(reach, reach)[:, None]
+    return (k["tension"] > 0.0)[:, None] * (rotate_back(k, rope_rate) - k["rate_b"])
+
+
+def _friction(k: Known) -> np.ndarray:
+    """Direction of that rate, and less than a unit vector where it is slow."""
+    return k["joint_rate_b"] / np.hypot(_size(k["joint_rate_b"]), SLOWEST)[:, None]
+
+
+def _spring(k: Known) -> np.ndarray:
+    """What turns the vehicle's axis against the rope, body frame; 0 where nothing hangs on it."""
+    return (k["tension"] > 0.0)[:, None] * cross(_EZ, k["cable_dir_b"])
+
+
+def _size(vector: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(vector, axis=1)
+
+
+_EZ = np.array([0.0, 0.0, 1.0])
+
+DERIVED: dict[str, Callable[[Known], np.ndarray]] = {
+    "quat_wb": lambda k: Rotation.from_matrix(np.stack([k[f"axis_{i}"] for i in "xyz"], axis=-1)).as_quat(),
+    "axis_x": _axis(0), "axis_y": _axis(1), "axis_z": _axis(2), "slope": _slope, "swing": _swing,
+    "along": lambda k: _dot(k["vel_w"], k["axis_z"]), "across": lambda k: k["vel_w"] - k["along"][:, None] * k["axis_z"],
+    "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]), "vel_b": lambda k: rotate_back(k, k["vel_w"]),
+    "cable_dir_b": lambda k: rotate_back(k, k["cable_dir_w"]), "reach_w": _reach, "joint_rate_b": _joint_rate,
+}  # fmt: skip
+"""What :class:`Known` computes of the quantities at the knots."""
+
+_POSE, _MOVES = ("quat_wb",), ("vel_w", "quat_wb")
+_PAIR = ("payload_vel_w", "vel_w", "cable_dir_w")
+JOINT_NEEDS = ("payload_pos_w", "payload_vel_w", "pos_w", "vel_w", "quat_wb", "rate_b", "cable_dir_w", "mount_b", "tension")
+
+SCALARS: dict[str, Factor] = {
+    "thrust": Factor("T", (1, 1, -2), ("thrust",), lambda k: k["thrust"]),
+    "thrust_rate": Factor("dT/dt", (1, 1, -3), ("thrust", "time"), lambda k: k["slope"]),
+    "abs_thrust_rate": Factor("|dT/dt|", (1, 1, -3), ("thrust", "time"), lambda k: np.abs(k["slope"])),
+    "speed": Factor("|v|", (0, 1, -1), ("vel_w",), lambda k: _size(k["vel_w"])),
+    "speed_across": Factor("v_xy", (0, 1, -1), _MOVES, lambda k: _size(k["across"])),
+    "speed_across_squared": Factor("v_xy²", (0, 2, -2), _MOVES, lambda k: _size(k["across"]) ** 2),
+    "speed_along": Factor("v_z", (0, 1, -1), _MOVES, lambda k: k["along"]),
+    "rate": Factor("|ω|", (0, 0, -1), ("rate_b",), lambda k: _size(k["rate_b"])),
+    "rate_yaw": Factor("ω_z", (0, 0, -1), ("rate_b",), lambda k: k["rate_b"][:, 2]),
+    "inverse_height": Factor("1/z", (0, -1, 0), ("pos_w",), lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST)),
+    "tension": Factor("S", (1, 1, -2), ("tension",), lambda k: k["tension"]),
+    "payload_speed": Factor("|v_p|", (0, 1, -1), ("payload_vel_w",), lambda k: _size(k["payload_vel_w"])),
+    "swing_speed": Factor("|v_s|", (0, 1, -1), _PAIR, lambda k: _size(k["swing"])),
+    "cable_under_rotors": Factor("(-n·e_z)", (0, 0, 0), ("cable_dir_w", "quat_wb"), lambda k: k["under"]),
+    "joint_rate": Factor("|Ω|", (0, 0, -1), JOINT_NEEDS, lambda k: _size(k["joint_rate_b"])),
+}  # fmt: skip
+"""Scalars of a term."""
+
+ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
+
+VECTORS: dict[str, dict[str, Factor]] = {
+    "vehicle force": {
+        "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
+        "body_x": Factor("e_x", (0, 0, 0), _POSE, lambda k: k["axis_x"]),
+        "body_y": Factor("e_y", (0, 0, 0), _POSE, lambda k: k["axis_y"]), "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)),
+        "vel": Factor("v", (0, 1, -1), ("vel_w",), lambda k: k["vel_w"]),
+        "vel_across": Factor("v_⊥", (0, 1, -1), _MOVES, lambda k: k["across"]),
+        "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(k["axis_z"], k["vel_w"])),
+        "rate_cross_vel": Factor("(ω x v)", (0, 1, -2), (*_MOVES, "rate_b"),
+                                 lambda k: cross(rotate(k, k["rate_b"]), k["vel_w"])),
+        "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
+        "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
+    },
+    "vehicle torque": {
+        "body_x": Factor("e_x", (0, 0, 0), ("time",), _fixed(0)), "body_y": Factor("e_y", (0, 0, 0), ("time",), _fixed(1)),
+        "body_z": Factor("e_z", (0, 0, 0), ("time",), _fixed(2)),
+        "rate": Factor("ω", (0, 0, -1), ("rate_b",), lambda k: k["rate_b"]),
+        "axis_cross_rate": Factor("(e_z x ω)", (0, 0, -1), ("rate_b",), lambda k: cross(_EZ, k["rate_b"])),
+        "vel": Factor("v", (0, 1, -1), _MOVES, lambda k: k["vel_b"]),
+        "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES,
+                                 lambda k: cross(_EZ, k["vel_b"])),
+        "axis_cross_cable": Factor("(e_z x n)", (0, 0, 0), ("cable_dir_w", "quat_wb"),
+                                   lambda k: cross(_EZ, k["cable_dir_b"])),
+        "axis_cross_swing": Factor("(e_z x v_s)", (0, 1, -1), (*_PAIR, "quat_wb"),
+                                   lambda k: cross(_EZ, rotate_back(k, k["swing"]))),
+    },
+    "payload force": {
+        "payload_vel": Factor("v_p", (0, 1, -1), ("payload_vel_w",), lambda k: k["payload_vel_w"]),
+        "vertical_cross_vel": Factor("(z x v_p)", (0, 1, -1), ("payload_vel_w",),
+                                     lambda k: cross(_EZ, k["payload_vel_w"])),
+        "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)), "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
+        "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
+        "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
+        "cable_cross_swing": Factor("(n x v_s)", (0, 1, -1), _PAIR, lambda k: cross(k["cable_dir_w"], k["swing"])),
+        "vel": Factor("v", (0, 1, -1), ("vel_w",), lambda k: k["vel_w"]),
+        "sideways": Factor("(n - (n·e_z) e_z)", (0, 0, 0), ("cable_dir_w", "quat_wb"),
+                           lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"]),
+    },
+    JOINT: {
+        "joint_rate": Factor("Ω", (0, 0, -1), JOINT_NEEDS, lambda k: k["joint_rate_b"]),
+        "friction": Factor("Ω/|Ω|", (0, 0, 0), JOINT_NEEDS, _friction),
+        "axis_cross_cable": Factor("(e_z x n)", (0, 0, 0), JOINT_NEEDS, _spring),
+    },
+}  # fmt: skip
+"""Vectors of a term by block, in that block's frame: world for forces, body for torques."""
+
+MOST_SCALARS = 2
+
+
+def terms_of(block: str, known: Sequence[str]) -> list[Term]:
+    """All terms of a block whose factors can be made of these knots, simplest first."""
+    have = set(known)
+    out = () if block == JOINT else ONLY_JOINT
+    scalars = [name for name, factor in SCALARS.items() if set(factor.needs) <= have and name not in out]
+    vectors = [name for name, factor in VECTORS[block].items() if set(factor.needs) <= have]
+    return [
+        Term(block, factors, vector)
+        for count in range(MOST_SCALARS + 1)
+        for factors in combinations_with_replacement(scalars, count)
+        for vector in vectors
+    ]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which factors many terms of one block consist of; the scalar before the first is 1."""
+
+    block: str
+    scalars: tuple[str, ...]
+    vectors: tuple[str, ...]
+    scalar: np.ndarray  # of each term, shape (MOST_SCALARS, T); 0 for none
+    vector: np.ndarray  # shape (T,)
+
+    @staticmethod
+    def of(terms_: Sequence[Term]) -> "Layout":
+        """Sort out the factors of terms."""
+        scalars = tuple(dict.fromkeys(f for t in terms_ for f in t.factors))
+        vectors = tuple(dict.fromkeys(t.vector for t in terms_))
+        at, place = {f: i + 1 for i, f in enumerate(scalars)}, {v: i for i, v in enumerate(vectors)}
+        rows = [([at[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS] for t in terms_]
+        return Layout(terms_[0].block, scalars, vectors, np.array(rows).T, np.array([place[t.vector] for t in terms_]))
+
+    def factors(self, known: Known) -> tuple[np.ndarray, np.ndarray]:
+        """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors); each is computed once."""
+        scalars = np.stack((np.ones(len(known["time"])), *(SCALARS[f].read(known) for f in self.scalars)), axis=-1)
+        return scalars, np.stack([VECTORS[self.block][v].read(known) for v in self.vectors], axis=-1)
+
+    def table(self, knots: Knots) -> np.ndarray:
+        """Values of the terms, shape (k, 3, T)."""
+        scalars, vectors = self.factors(knots if isinstance(knots, Known) else Known(knots))
+        values = vectors[:, :, self.vector]
+        for which in self.scalar:
+            values *= scalars[:, None, which]
+        return values
+
+
+def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]:
+    """What terms exert in each latent block: a torque in the joint on the vehicle, on the rope and, by it, on the payload.
+
+    ``values``: of the terms, shape (k, 3, T), in the block's frame.
+    Returns the latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).
+    """
+    if block != JOINT:
+        return {block: values}
+    known = knots if isinstance(knots, Known) else Known(knots)
+    torque_b, reach = np.swapaxes(values, 1, 2), known["reach_w"][:, None, :]
+    turn = np.stack([known[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
+    torque_w = np.einsum("kij,ktj->kti", turn, torque_b)
+    pair = -cross(torque_w, reach) / (reach**2).sum(-1, keepdims=True)
+    at_mount = cross(known["mount_b"][:, None, :], -np.einsum("kij,kti->ktj", turn, pair))
+    out = {"vehicle force": -pair, "vehicle torque": torque_b + at_mount, "payload force": pair}
+    return {name: np.swapaxes(value, 1, 2) for name, value in out.items()}
