@@ -308,8 +308,8 @@ def _unseen(diagnosis, name: str, setup, logs: Logs, folder: Path) -> dict[str, 
     base = str(Path(name).resolve()) if Path(name).is_file() else f"diagnose/{name}.toml"
     (folder / "extended.toml").write_text(patch.of_setup(base, setup, whole, name, ()))
     extended = setups.model_of(setups.load(folder / "extended.toml"), logs)
-    before, after = (on_others(model, {}, diagnosis.work) for model in (setups.model_of(setup, logs), extended))
-    return {channel: [before[channel][0], after[channel][0], after[channel][2]] for channel in before}
+    found = on_others(setups.model_of(setup, logs), extended, {}, diagnosis)
+    return {channel: list(errors) for channel, errors in found.items()}
 
 
 def won_back(errors: Sequence[float]) -> float:

@@ -34,8 +34,8 @@ PULLS = {
     "load": ("F_p = c S v_p", lambda v, down, pull: -0.003 * pull * v),
     "cubic": ("F_p = c |v_p| |v_p| v_p", lambda v, down, pull: -0.012 * (v @ v) * v),
 }
-"""Forces on a bob of 1 kg by its velocity, the cosine of the rod's angle and the rod's pull: an eddy current brake below the pivot, a bearing
-that the load presses, a drag that grows faster than it should."""
+"""Forces on a bob of 1 kg by its velocity, the cosine of the rod's angle and the rod's pull: an eddy current brake below the pivot, a
+bearing that the load presses, a drag that grows faster than it should."""
 GROUND = "F = c 1/z 1/z z"
 
 
@@ -52,12 +52,13 @@ def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLo
         return np.concatenate([v, free + push - n * (n @ (free + push) + v @ v / ROD + 2.0 * n @ v + 40.0 * (r @ n - ROD))])
 
     begin, stamps = rng.uniform(1.2, 2.2) * rng.choice([-1.0, 1.0]), np.arange(0.0, seconds, 0.005)
-    path = solve_ivp(slope, (0.0, seconds), [ROD * np.sin(begin), -ROD * np.cos(begin), 0.0, 0.0], "DOP853", stamps, rtol=1e-10, atol=1e-12).y
+    start = [ROD * np.sin(begin), -ROD * np.cos(begin), 0.0, 0.0]
+    path = solve_ivp(slope, (0.0, seconds), start, "DOP853", stamps, rtol=1e-10, atol=1e-12).y
     angle = np.arctan2(path[0], -path[1]) + rng.laplace(0.0, 1e-4, len(stamps))
     return FlightLog({"angle": Channel(stamps, np.round(angle / LINES) * LINES, "rad")})
 
 
-def hovered(law: str, rng: np.random.Generator, seconds: float = 40.0) -> FlightLog:
+def hovered(law: str, rng: np.random.Generator, seconds: float = 25.0) -> FlightLog:
     """One slow flight up and down, as its motors and a capture log it."""
     stamps = np.arange(0.0, seconds, 0.02)
     low, high, turn = rng.uniform(0.2, 0.35), rng.uniform(1.0, 1.6), rng.uniform(0.0, 2.0 * np.pi, 2)
@@ -66,7 +67,7 @@ def hovered(law: str, rng: np.random.Generator, seconds: float = 40.0) -> Flight
     speed, carried = np.gradient(place, 0.02, axis=0), 0.25 * CRAFT["mass"] * (G + np.gradient(np.gradient(height, 0.02), 0.02))
     helped = 1.0 / (1.0 - (CRAFT["disc"] / (4.0 * height)) ** 2) if law else 1.0
     a, b = CRAFT["map"][2], CRAFT["map"][1]
-    wanted = np.tile((carried / helped)[:, None], (1, 4)) * (1.0 + rng.normal(0.0, 0.02, (len(stamps), 4)))
+    wanted = np.tile((carried / helped)[:, None], (1, 4)) * (1.0 + rng.normal(0.0, 0.1, (len(stamps), 4)))
     return FlightLog({
         "motor_command": Channel(stamps, (-b + np.sqrt(b * b + 4.0 * a * wanted)) / (2.0 * a), "1"),
         "pos_w": Channel(stamps, place + rng.laplace(0.0, 5e-4, place.shape), "m", "world"),

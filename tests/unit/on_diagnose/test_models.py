@@ -84,7 +84,8 @@ class TestBall:
         assert set(diagnosis.theta) == set(truth)
         assert all(abs(diagnosis[name].estimate - size) < 3.0 * diagnosis[name].sd for name, size in truth.items())
         unseen = paths + np.random.default_rng(2).normal(0.0, 5e-4, paths.shape)
-        errors = on_others(beside_aeroid.model_of(stamps, unseen), diagnosis.theta, diagnosis.work)
+        others = beside_aeroid.model_of(stamps, unseen)
+        errors = on_others(others, others, diagnosis.theta, diagnosis)
         before, after, noise = errors["payload_pos_w"]
         assert before > 20.0 * noise
         assert 0.7 * noise < after < 1.3 * noise

@@ -1,9 +1,10 @@
 """``visthrow diagnose apply``: write the extended configuration that a diagnosis asks for."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from sim.params import LawParams
 from visthrow import config
 from visthrow.common.arguments import NUMBER
 from visthrow.common.errors import DiagnoseError
@@ -71,17 +72,27 @@ def run(args: argparse.Namespace) -> int:
     theta, covariance = patch.with_scatter(*found, report)
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if not theta and not laws:
-        unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
-        print(f"nothing was named{unused}; the configuration stands as it is")
-        return 0
+        return _nothing(report, "configuration")
     _bear_out(report, args.anyway)
     base, experiment = _diagnosed(_made_with(report, args, "plant"), report.get("overrides", ()))
     content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
     atomic_write(args.out, content)
     config.load(Experiment, Path(args.out))  # what was written is what training will read
-    named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
-    print(f"{args.out}: {', '.join(named)} on top of {base}")
+    _say(args.out, theta, laws, base)
     return 0
+
+
+def _nothing(report: dict, what: str) -> int:
+    """Say that nothing is written."""
+    unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
+    print(f"nothing was named{unused}; the {what} stands as it is")
+    return 0
+
+
+def _say(out: str, theta: Iterable[str], laws: Sequence[LawParams], base: str) -> None:
+    """Say what was written."""
+    named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
+    print(f"{out}: {', '.join(named)} on top of {base}")
 
 
 def _extend_setup(args: argparse.Namespace, report: dict) -> int:
@@ -90,22 +101,25 @@ def _extend_setup(args: argparse.Namespace, report: dict) -> int:
     from visthrow.diagnose.extend import patch
     from visthrow.diagnose.inputs import setup
 
-    if not report.get("theta"):
-        print("nothing was named; the setup stands as it is")
-        return 0
+    why = setup.MODELS[report["model"]].lawless if report.get("model") in setup.MODELS else ""
+    if args.laws and why:
+        raise DiagnoseError(f"{args.diagnosis}: no law can act in the model '{report['model']}': {why}; expected no --laws")
+    laws = patch.laws_of(report, args.diagnosis, args.laws)
+    if not report.get("theta") and not laws:
+        return _nothing(report, "setup")
     _bear_out(report, args.anyway)
     name = _made_with(report, args, "config")
     base = _named("diagnose", name)
-    content = patch.of_setup(base, setup.load(name), report, args.diagnosis, origin(report, args.diagnosis))
+    content = patch.of_setup(base, setup.load(name), report, args.diagnosis, origin(report, args.diagnosis), args.laws)
     atomic_write(args.out, content)
     setup.load(args.out)
-    print(f"{args.out}: {', '.join(report['theta'])} on top of {base}")
+    _say(args.out, report["theta"], laws, base)
     return 0
 
 
 def _bear_out(report: dict, anyway: bool) -> None:
     """Refuse what held-out flights deny. Raises DiagnoseError: they do, and nobody wants it all the same."""
-    doubts = harm(report)
+    doubts = harm(report) if report.get("theta") else []  # of a law alone, held-out flights have not been asked
     if doubts and not anyway:
         raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
 
@@ -157,7 +171,7 @@ def origin(report: dict, path: str) -> list[str]:
     lines = [f"Extended by `visthrow diagnose apply` from {path}: {report.get('overall', 'a diagnosis')}."]
     lines += [f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows, {report.get('samples', 0)} samples."]
     lines += [f"{name}: {made[name]}" for name in ("commit", "time", "command") if made.get(name)]
-    for c in (report.get("gain") or {}).get("channels", []):
+    for c in (report.get("gain") or {}).get("channels", []) if report.get("theta") else []:
         lines.append(f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before, {c.get('after', 0.0):.3g} after.")
     landing = (report.get("gain") or {}).get("landing")
     if landing:

@@ -43,6 +43,8 @@ class GimbalParams:
 class GimbalModel(NumericModel):
     """Windows of the marker's positions in the camera's frame."""
 
+    lawless = "it is geometry, in which no force moves anything"
+
     def __init__(self, logs: Sequence[FlightLog], params: GimbalParams) -> None:
         """Cut the logs. Raises LogError where none has both bodies and the marker, or the marker is not seen at the payload."""
         self.params = params

@@ -105,6 +105,12 @@ class NumericModel(ABC):
         self._base, self.laws = base, (*self.laws, *laws)
         self.effects = tuple(replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b)) for e, b in zip(self.effects, base.tolist()))
 
+    def plain(self) -> "NumericModel":
+        """The same model without what it was extended by."""
+        other = copy(self)
+        other._base, other.laws, other._flown = np.zeros_like(self._base), (), None
+        return other
+
     def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
         """The same model in which laws act besides its own."""
         if self._flown is None:  # its initial states follow from call to call

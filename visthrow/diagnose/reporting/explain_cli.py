@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import add_out
-from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
+from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, OUT_OF_DOMAIN, UNKNOWN, Diagnosis
 
 MOST_SPOILED = 0.5
 """Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.made_with(args))
     print("\n" + report.summary(diagnosis, gain))
-    tested = _tested(args, diagnosis) if args.test and diagnosis.theta else {}
+    tested = _tested(args, diagnosis) if args.test and diagnosis.work is not None else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
@@ -74,19 +74,26 @@ def explained(
         say(f"  left out: {reason}")
     left_out = (*without, *spoiled, *doubled)
     found = search.explain(model, seed=seed, without=left_out, laws=laws, progress=lambda line: say(f"  {line}"))
-    noted = [f"{one.name}: {row.text}" for one in checked for row in one.rows if (row.topic, row.verdict) == ("thrust", "warn")]
-    told = (*found.reasons, *(f"left out: {reason}" for reason in reasons), *(f"check: {text}" for text in noted))
+    noted = [f"check: {one.name}: {row.text}" for one in checked for row in one.rows if (row.topic, row.verdict) == ("thrust", "warn")]
+    if (why := getattr(model, "lawless", "")) and found.overall in (UNKNOWN, IN_PART):
+        noted.append(f"no law outside the catalogue is looked for: {why}")
+    told = (*found.reasons, *(f"left out: {reason}" for reason in reasons), *noted)
     return replace(found, reasons=told, duplicates=doubled)
 
 
 def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float, float]]:
-    """Prediction errors of other flights before and after, and of noise alone; printed."""
+    """Prediction errors of other flights by the model as its setup has it without extensions, by that with all that was found, and of
+    noise alone; printed."""
     from visthrow.diagnose.inputs import opening
     from visthrow.diagnose.likelihood.forms import READABLE, unit_of
+    from visthrow.diagnose.models.laws import term_of
     from visthrow.diagnose.reporting.gain import on_others
 
-    model, _ = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))
-    errors = on_others(model, diagnosis.theta, diagnosis.work)
+    after, _ = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))
+    before = after.plain() if hasattr(after, "plain") else after
+    if diagnosis.explanations and hasattr(after, "with_laws"):
+        after = after.with_laws([term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]])
+    errors = on_others(before, after, diagnosis.theta, diagnosis)
     for channel, found in errors.items():
         factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
         before, after, floor = (factor * x for x in found)

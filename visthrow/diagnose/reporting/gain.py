@@ -5,7 +5,7 @@ Beside it stand the noise floor, which cannot be beaten, and a black box trained
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -103,29 +103,29 @@ def landing_gain(
     )
 
 
-def on_others(model: Model, theta: Mapping[str, float], work: Work) -> dict[str, tuple[float, float, float]]:
+def on_others(before: Model, after: Model, theta: Mapping[str, float], found: Diagnosis) -> dict[str, tuple[float, float, float]]:
     """Prediction errors of flights that nothing was estimated from.
 
     Returns channel -> root mean square error before and after, and of the sensors' noise and the initial state's uncertainty alone, in
     the channel's unit; every component counts alike.
 
     Args:
-        model: of these flights, as it stood before the diagnosis.
-        theta: sizes that were found on others.
-        work: of that search, whose noise is taken.
+        before: model of these flights that says what is worth it.
+        after: model of these flights that was diagnosed, with the laws that were found. theta: sizes that were found.
+        found: that diagnosis, whose noise is taken.
     """
-    noise, errors = work.after.noise, []
-    for sizes in ({}, theta):
+    noise, errors = replace(found.work.after.noise, scale=np.array([found.sensor_scale[name] for name in after.channels])), []
+    for model, sizes in ((before, {}), (after, theta)):
         sums = np.zeros((3, len(model.channels)))
         finite = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
-        for window in with_correlations(finite, work.problem.correlated):
+        for window in with_correlations(finite, found.work.problem.correlated):
             left, expected, horizon = predicted(window, noise, window.residual[:, None])
             squares = np.array([left[:, 0] ** 2, expected, window.sigma**-2.0]) * window.sigma**2
             for total, own in zip(sums, squares[:, horizon >= 0]):
                 total += np.bincount(window.channel[horizon >= 0], own, len(total))
         errors.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
-    (before, _), (after, floor) = errors
-    return {name: tuple(map(float, row)) for name, row in zip(model.channels, np.column_stack((before, after, floor)))}
+    (plain, _), (named, floor) = errors
+    return {name: tuple(map(float, row)) for name, row in zip(after.channels, np.column_stack((plain, named, floor)))}
 
 
 def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channels: int, rng: np.random.Generator):
