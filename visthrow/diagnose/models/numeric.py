@@ -65,6 +65,7 @@ class NumericModel(ABC):
     cheap = True  # derivatives are taken anew wherever the search goes
     latent_step = 1.0  # of the differences by latent forces [N or N m]
     lawless = ""  # why no law outside the catalogue can act in it
+    bends = False  # whether what a law does to a window is far from its share at the knots, so that the search must fly it
 
     def __init__(
         self, effects: Sequence[Effect], channels: Sequence[str], stretches: Sequence[Stretch], inputs: Sequence[str] = ()

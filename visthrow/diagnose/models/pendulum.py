@@ -53,7 +53,7 @@ class PendulumModel(NumericModel):
     Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg at the pendulum's length.
     """
 
-    latent_step = 0.1
+    latent_step, bends = 0.1, True
 
     def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
         """Cut the logs. Raises LogError where none holds an angle, or one holds angles that are no radians from where it hangs."""

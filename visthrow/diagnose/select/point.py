@@ -73,8 +73,8 @@ class Problem:
         return replace(self, kept=tuple(self.kept[w] for w in windows))
 
     def flown(self, theta: np.ndarray) -> Model | None:
-        """The model with the terms at their sizes as its laws; None where it cannot fly laws, or has none. ``theta`` is in floors."""
-        if not self.terms or not hasattr(self.model, "with_laws"):
+        """The model with the terms at their sizes as its laws; None where their columns do. ``theta`` is in floors."""
+        if not self.terms or not getattr(self.model, "bends", False):
             return None
         sizes = zip(self.terms, theta[-len(self.terms) :])
         return self.model.with_laws([e.term.law(float(size * e.floor)) for e, size in sizes if size != 0.0])
