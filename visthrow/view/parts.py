@@ -73,6 +73,10 @@ def png_of(figure, dpi: float = 150.0) -> bytes:
     import matplotlib.pyplot as plt
 
     buffer = io.BytesIO()
+    if layout := figure.get_layout_engine():  # done here: for its sake all would be drawn twice
+        figure.set_dpi(dpi)
+        layout.execute(figure)
+        figure.set_layout_engine("none")
     figure.savefig(buffer, format="png", dpi=dpi)
     plt.close(figure)
     return buffer.getvalue()
