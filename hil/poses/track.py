@@ -61,7 +61,7 @@ class Track:
         if stepped and before is not None:
             self._shift -= (pose.stamp - before.stamp) - (pose.arrival - before.arrival)
         self.accepted += 1
-        self._vel = self.filter.update(replace(pose, stamp=pose.stamp + self._shift))
+        self._vel = self.filter.update(replace(pose, stamp=pose.stamp + self._shift) if self._shift else pose)
         self._pose = pose
         self._slow.appendleft((pose.arrival, pose.pos))
         return None

@@ -182,7 +182,7 @@ def parse(block: Block) -> None:
 def _one(words: list[str], place: str) -> None:
     if words[0] == "visthrow":  # in this process: most of a command's time is what it imports
         status = cli.main(words[1:])
-    elif words[0].startswith("python ") and words[0].split()[1].endswith(".py"):  # as above
+    elif words[0].startswith("python "):  # as above
         status = _program(shlex.split(words[0])[1:])
     else:
         status = subprocess.run(["bash", "-ec", words[0]], env=_environment()).returncode
@@ -190,9 +190,11 @@ def _one(words: list[str], place: str) -> None:
 
 
 def _program(argv: list[str]) -> int:
-    before, sys.argv = sys.argv, argv
+    """Run what ``python`` would run: a file, or with ``-m`` a module."""
+    before, module = sys.argv, argv[0] == "-m"
+    sys.argv = argv[module:]
     try:
-        runpy.run_path(argv[0], run_name="__main__")
+        (runpy.run_module if module else runpy.run_path)(sys.argv[0], run_name="__main__")
     except SystemExit as end:
         return int(end.code or 0)
     finally:
