@@ -196,9 +196,22 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys)
     out = tmp_path / "x.toml"
     assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", "pendulum_encoder", "--out", str(out)]) == 2
     assert "a diagnosis of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum" in capsys.readouterr().err
-    for theta, message in (({"ball_drag": 9.0}, "ball_drag = 9 1/m; this model has it from"), ({"thrust": 1.0}, "no effect 'thrust'")):
-        report = diagnosis(**{**BALL, "theta": theta})
-        assert cli.main(["diagnose", "apply", report, "--config", "jugglebot", "--out", str(out)]) == 0
+    out.write_text('base = "diagnose/jugglebot.toml"\n[effects]\nball_drag = 0.4\n')
+    for theta, unit, name, message in (
+        ({"ball_drag": 9.0}, "1/m", "jugglebot", "ball_drag = 9 1/m; the ball has it from"),
+        ({"ball_drag": 0.2}, "1/m", str(out), "ball_drag = 0.6 1/m; the ball has it from"),
+        ({"ball_drag": 0.1}, "N", "jugglebot", "ball_drag in 'N'; the ball's ball_drag is in '1/m'"),
+        ({"thrust": 1.0}, "N", "jugglebot", "thrust are no effects of the ball"),
+    ):
+        report = diagnosis(**{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]})
+        assert cli.main(["diagnose", "apply", report, "--config", name, "--out", str(tmp_path / "none.toml")]) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "none.toml").exists()
+    at_bound = diagnosis(**{**BALL, "theta": {"ball_drag": 0.1 + 1e-12}})
+    assert cli.main(["diagnose", "apply", at_bound, "--config", str(out), "--out", str(tmp_path / "bound.toml")]) == 0
+    setups.model_of(setups.load(tmp_path / "bound.toml"), [ball_log(seed=1)])
+    for entry, message in (("ball_drag = 9.0", "ball_drag = 9 1/m; this model has it from"), ("thrust = 1.0", "no effect 'thrust'")):
+        out.write_text(f'base = "diagnose/jugglebot.toml"\n[effects]\n{entry}\n')
         with pytest.raises(LogError, match=message):
             setups.model_of(setups.load(out), [ball_log(seed=1)])
 

@@ -7,18 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from sim.effects.effect import apply
+from sim.effects.effect import Effect, apply
 from sim.effects.firmware import calibrated_voltage, controller_of, left_out
 from sim.effects.setting import Setting, generalised, specialised
 from sim.kernels.laws import check_laws
 from sim.params import GRAVITY, LawParams
 from visthrow import config
-from visthrow.common.errors import DiagnoseError
+from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.inputs.opening import THROW
 from visthrow.diagnose.inputs.setup import Setup
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.laws import term_of
+from visthrow.diagnose.models.numeric import ROUNDED
 from visthrow.diagnose.select.scatter import variances
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, plant_of
@@ -165,7 +167,9 @@ def of_setup(
     if [report.get("model", THROW)] != setup.named():
         own = ', '.join(setup.named()) or 'none'
         raise DiagnoseError(f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base} is {own}")
-    units = {f["name"]: f["unit"] for f in report["findings"]}
+    effects = {e.name: e for e in effects_of(setup.named()[0], getattr(setup, setup.named()[0]))}
+    after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
+    refuse_strange(report, path, after, effects, setup.named()[0])
     laws = laws_of(report, path, rank)
     known = [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]] if rank else []
     lines = [f"# {line}" for line in provenance]
@@ -176,27 +180,32 @@ def of_setup(
         lines.append(dumps({"laws": [dataclasses.asdict(law) for law in (*setup.laws, *laws)]}).strip())
     lines += ["", "[effects]"] * bool(theta)
     for i, (name, size) in enumerate(theta.items()):
-        before = setup.effects.get(name, 0.0)
-        lines.append(f"{name} = {before + size:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g} {units.get(name, '')}".rstrip())
+        lines.append(f"{name} = {after[name]:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g} {effects[name].unit}")
     return "\n".join(lines) + "\n"
 
 
-def refuse_strange(report: Mapping[str, Any], path: str, theta: Mapping[str, float]) -> None:
-    """Refuse effects that are none of the throw's, though they may bear the same name, and sizes that the throw's simulator cannot have.
+def refuse_strange(
+    report: Mapping[str, Any], path: str, theta: Mapping[str, float], known: Mapping[str, Effect] | None = None, of: str = "throw"
+) -> None:
+    """Refuse effects that are none of a model's, though they may bear the same name, and sizes that it cannot have.
 
-    Raises DiagnoseError: an effect or its unit is none of the catalogue's; a size lies outside its bounds.
+    Raises DiagnoseError: an effect or its unit is none of the model's; a size lies outside its bounds.
+
+    Args:
+        report: of the diagnosis. path: of its file.
+        theta: sizes that the model would have.
+        known: its effects; None: the throw's.
+        of: its name.
     """
-    known = catalogue()
+    known = catalogue() if known is None else known
     strange = [name for name in theta if name not in known]
     if strange:
-        raise DiagnoseError(
-            f"{path}: {', '.join(strange)} are no effects of the throw's simulator; apply writes configurations of that alone"
-        )
+        raise DiagnoseError(f"{path}: {', '.join(strange)} are no effects of the {of}; {suggest(strange[0], known)}")
     units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
     for name, size in theta.items():
         effect = known[name]
         if units.get(name, effect.unit) != effect.unit:
-            raise DiagnoseError(f"{path}: {name} in '{units[name]}'; the throw's {name} is in '{effect.unit}': of another model")
+            raise DiagnoseError(f"{path}: {name} in '{units[name]}'; the {of}'s {name} is in '{effect.unit}': of another model")
         low, high = effect.bounds
-        if not low <= size <= high:
-            raise DiagnoseError(f"{path}: {name} = {size:.4g} {effect.unit}; the throw's simulator has it from {low:g} to {high:g}")
+        if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
+            raise DiagnoseError(f"{path}: {name} = {size:.4g} {effect.unit}; the {of} has it from {low:g} to {high:g}")

@@ -25,6 +25,7 @@ NUISANCE_STEP = 1e-3  # step of the differences by unknowns at the start, in the
 SETTLE_STEPS = 5
 SETTLED = 1e-3  # a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
 MOST_LANES = 6000  # simulated in one batch
+ROUNDED = 1e-6  # of a prior deviation, by which a size at its bound may lie outside once it was written down
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ class NumericModel(ABC):
         """
         base = self.size(sizes)
         for effect, size in zip(self.effects, base):
-            if not effect.bounds[0] <= size <= effect.bounds[1]:
-                low, high = effect.bounds
+            low, high = effect.bounds
+            if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
                 raise LogError(f"{effect.name} = {size:.4g} {effect.unit}; this model has it from {low:g} to {high:g}")
         if laws:
             first, one = self.stretches[0], self._lanes(base).part([0])
