@@ -151,6 +151,16 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
         assert any(f"'{unit}' is a guess" in question for question in found.questions) == asked
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("gone", [np.nan, np.inf])
+def test_columns_without_a_number_are_no_channel(gone):
+    columns = flight(20.0)
+    lost = np.full(len(columns["time"]), gone)
+    table = {"time": columns["time"], **named("pos", columns["pos_w"]), **named("vel", columns["vel_w"]), **named("acc", columns["acc_b"])}
+    found = propose({**table, "acc_x": lost, **named("cam_pos", np.stack([lost] * 3, axis=1))}, "a.csv")
+    assert {c.name for c in found.mapping.channels} == {"pos_w", "vel_w"}
+
+
 def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     file = REAL / "payload_cf_single" / "log206.csv.gz"
     with pytest.raises(LogError, match=r"36\.9 is 36\.9 kg, but .* carries 0\.0408 kg in N: grams\? Expected kilograms: --mass 0\.0369"):

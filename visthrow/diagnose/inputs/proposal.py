@@ -67,7 +67,8 @@ def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
     Raises LogError: no column holds numbers that change.
     """
     numbers = {name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"}
-    if not any(np.nanstd(cells) > 0.0 for cells in numbers.values() if np.any(np.isfinite(cells))):
+    numbers = {name: np.where(np.isfinite(cells), cells, np.nan) for name, cells in numbers.items()}
+    if not any(_moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
     found, channels, clocks = Proposal(None), {}, {}
     for topic, part in _tables(numbers).items():
@@ -125,6 +126,12 @@ def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
     return TimeColumn(name, unit), numbers[name] * UNITS[unit][1]
 
 
+def _moves(values: np.ndarray) -> bool:
+    """Whether rows of numbers, shape (T, columns), differ."""
+    whole = values[np.all(np.isfinite(values), axis=1)]
+    return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
+
+
 def _rises(cells: np.ndarray) -> bool:
     steps = np.diff(cells[np.isfinite(cells)])
     return len(steps) > 10 and bool(np.all(steps >= 0.0)) and float(np.mean(steps > 0.0)) > 0.3
@@ -177,7 +184,7 @@ class _Chooser:
 
     def __init__(self, time: np.ndarray, groups: list[Group], found: Proposal) -> None:
         self.time, self.found = time, found
-        self.groups = [g for g in groups if np.any(np.nanstd(g.values, axis=0) > 0.0)]
+        self.groups = [g for g in groups if _moves(g.values)]
         self.taken: set[int] = set()
         self.attitudes: dict[str, Channel] = {}  # the vehicle's, by the units that its angles may be in
         self.made: dict[str, tuple[ChannelMap, Channel]] = {}
