@@ -186,6 +186,7 @@ def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
         (["--evaluate-every", "-1"], "--evaluate-every -1"),
         (["--minutes", "0"], "--minutes 0"),
         (["--until", "-0.1"], "--until -0.1"),
+        (["--until", "4"], "--until 4 m; throws are at 2 m"),  # centimetres
         (["--set", "vehicle.body.mass=-1"], "mass"),
         (["--set", "rope.length=-0.2"], "length"),
         (["--set", "ppo.epochs=0"], "epochs is 0; expected 1 or more"),

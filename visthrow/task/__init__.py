@@ -4,6 +4,8 @@ One experiment file of ``configs/train`` names the files of vehicle, rope, camer
 parameters; :func:`plant_of` gives what the simulator needs of it.
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -27,6 +29,8 @@ from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 Count = Annotated[int, Bound(1)]
 Counts = tuple[Count, ...]
 Share = Annotated[float, Bound(0.0, 1.0, "(]")]
+
+AIR_DENSITY, SOUND = 1.2, 343.0  # of air at 20 degrees [kg/m^3], [m/s]
 
 
 @dataclass(frozen=True)
@@ -290,24 +294,55 @@ class Experiment:
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             given = f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m"
             raise ConfigError(f"{given}; expected the same ball")
-        if self.fleet is None:
-            self._check_that_it_hovers()
+        for wrong in () if self.fleet is not None else (*_out_of_place(self), *_no_vehicle(self)):
+            raise ConfigError(wrong)
 
-    def _check_that_it_hovers(self) -> None:
-        """Raise ConfigError where thrust does not carry the weight, or the payload does not hang above the ground: another unit."""
-        mass, motors = plant_of(self).total_mass, 4.0 * self.vehicle.controller.max_thrust
-        asked = self.task.action.max_thrust
-        if not GRAVITY * mass < min(motors, asked):
-            raise ConfigError(
-                f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is {motors:g} N at most (four times "
-                f"vehicle.controller.max_thrust) and asked up to {asked:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
-            )
-        low = self.rope.length + self.rope.payload_offset - self.rope.mount[2]
-        if not self.task.start.spawn_height - low > self.release.landing_height:
-            raise ConfigError(
-                f"the payload hangs {low:g} m (rope.length, rope.payload_offset) below a vehicle that starts at "
-                f"{self.task.start.spawn_height:g} m (task.start.spawn_height): on the ground; expected m"
-            )
+
+def _out_of_place(e: Experiment) -> Iterator[str]:
+    """What of an experiment's lengths and times does not go together: a number in another unit is off by a hundred or more."""
+    start, bounds, release = e.task.start, e.task.bounds, e.release
+    low, high = bounds.altitude
+    hangs = e.rope.length + e.rope.payload_offset - e.rope.mount[2]
+    if not low <= start.spawn_height <= high:
+        yield f"task.start.spawn_height is {start.spawn_height:g} m; expected within task.bounds.altitude, {low:g} to {high:g} m"
+    if not start.spawn_height - hangs > release.landing_height:
+        yield (
+            f"the payload hangs {hangs:g} m (rope.length, rope.payload_offset) below a vehicle that starts at {start.spawn_height:g} m "
+            "(task.start.spawn_height): on the ground; expected m"
+        )
+    times = {"release.lag": release.lag, "vehicle.queue.delay": e.vehicle.queue.delay, "sim.control_period": e.sim.control_period,
+             "vehicle.motor.time_constant": e.vehicle.motor.time_constant}  # fmt: skip
+    for name, time in times.items():
+        if time >= bounds.time_limit:
+            yield f"{name} is {time:g} s, and a throw is over after {bounds.time_limit:g} s (task.bounds.time_limit); expected s"
+
+
+def _no_vehicle(e: Experiment) -> Iterator[str]:
+    """Why no vehicle is as an experiment's: thrust and weight, moments of inertia and size, thrust and speed of the rotors."""
+    vehicle, rotors, motor = e.vehicle, e.vehicle.rotors, e.vehicle.controller.max_thrust
+    mass, asked = plant_of(e).total_mass, e.task.action.max_thrust
+    if not GRAVITY * mass < min(4.0 * motor, asked):
+        yield (
+            f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is {4.0 * motor:g} N at most (four times "
+            f"vehicle.controller.max_thrust) and asked up to {asked:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
+        )
+    reach = max(map(math.hypot, rotors.x, rotors.y)) + rotors.radius
+    if reach > e.task.bounds.horizontal:
+        yield f"vehicle.rotors reach {reach:g} m from the middle, and it may fly {e.task.bounds.horizontal:g} m far; expected m"
+    gyration = math.sqrt(max(vehicle.body.inertia) / vehicle.body.mass)
+    if gyration > reach:
+        yield (
+            f"vehicle.body.inertia up to {max(vehicle.body.inertia):g} kg m^2 puts {vehicle.body.mass:g} kg {gyration:.3g} m from its "
+            f"middle, but the rotors reach {reach:.3g} m; expected kg m^2"
+        )
+    tip = math.sqrt(motor / vehicle.thrust.k_f) * rotors.radius
+    wake = math.sqrt(motor / (2.0 * AIR_DENSITY * math.pi * rotors.radius**2))
+    if not wake < tip < SOUND:
+        yield (
+            f"vehicle.thrust.k_f {vehicle.thrust.k_f:g} N s^2/rad^2 and vehicle.rotors.radius {rotors.radius:g} m make blade tips of "
+            f"{tip:.3g} m/s for {motor:g} N (vehicle.controller.max_thrust); expected more than the air through the rotor, {wake:.3g} m/s, "
+            f"and less than sound, {SOUND:g} m/s"
+        )
 
 
 def plant_of(experiment: Experiment) -> PlantParams:

@@ -96,6 +96,8 @@ def _check(args: Options) -> None:
         value = getattr(args, name)
         if value is not None and not value > 0:
             raise TrainError(f"--{name.replace('_', '-')} {value}; expected a number above 0")
+    if args.until is not None and args.until >= EVALUATION_TARGET:
+        raise TrainError(f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected an error below that, in m")
     if args.resume and args.start:
         raise TrainError("--resume goes on with its own policy; --from starts a new run")
     if args.resume and not args.out and not args.config:

@@ -120,7 +120,7 @@ class RecordedImages(Eyes):
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
         """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that cannot be opened."""
         super().__init__(params, training)
-        self._read, times = (_folder if params.kind == "folder" else _video)(Path(params.path))
+        self._read, times = (_folder if params.kind == "folder" else _video)(Path(params.path or ""))
         self._times = [time + params.delay for time in times]
         self._next = 0
 

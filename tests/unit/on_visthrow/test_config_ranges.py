@@ -27,6 +27,13 @@ from visthrow.task import Experiment
         ("train", "state", "task.action.max_thrust=2", "asked up to 2 N (task.action.max_thrust): it cannot hover"),
         ("train", "state", "rope.length=34", "the payload hangs 34.053 m"),  # centimetres
         ("train", "state", "vehicle=x500", "did you mean 'vehicle/x500.toml'?"),
+        ("train", "state", "task.start.spawn_height=133", "expected within task.bounds.altitude, 0.5 to 3 m"),
+        ("train", "state", "release.lag=110", "release.lag is 110 s, and a throw is over after 5 s"),  # milliseconds
+        ("train", "state", "vehicle.motor.time_constant=33", "vehicle.motor.time_constant is 33 s"),
+        ("train", "state", "vehicle.rotors.x=[68,68,-68,-68]", "vehicle.rotors reach 68.0381 m"),  # millimetres
+        ("train", "state", "vehicle.body.inertia=[2500,2500,4000]", "puts 0.21 kg 138 m from its middle"),  # g cm^2
+        ("train", "state", "vehicle.thrust.k_f=2.4e-9", "blade tips of 1.45e+03 m/s for 3.5 N"),  # N/rpm^2
+        ("train", "state", "vehicle.thrust.k_f=1", "expected more than the air through the rotor, 17.9 m/s"),
     ],
 )
 def test_the_command_refuses(kind, name, change, message, capsys):
