@@ -1,5 +1,6 @@
 """Traps made of real flights: what is wrong is named, with the right reason, and good flights stay free of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,15 @@ def test_early_thrust_is_named():
 def test_units_are_named_by_their_ratio(names, factor, words):
     found = bad(changed(FLIGHTS[204], names, lambda v: v * factor))
     assert all(part in found for part in words.split(".*")), found
+
+
+@pytest.mark.parametrize(
+    ("mass", "words"), [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")]
+)
+def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
+    found = bad(FLIGHTS[204], replace(CRAZYFLIE, mass=mass))
+    assert words in found
+    assert bool(found) == bool(words)
 
 
 def test_the_cable_is_held_against_the_models():

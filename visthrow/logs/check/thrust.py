@@ -138,9 +138,12 @@ def _weight(mass: float, known: Known, both: str) -> Row:
         return Row("thrust", both, "ok", f"thrust over force {mass:.4g} kg", {"mass_kg": mass})
     off, ratio = float(np.log(mass / known.mass)), mass / known.mass
     text = f"thrust over force {mass:.4g} kg, {ratio:.3g} times the model's {known.mass:.4g} kg"
-    unit = min(UNITS, key=lambda unit: abs(np.log(ratio * UNITS[unit])))
-    if abs(off) > MASS_BAD and abs(np.log(ratio * UNITS[unit])) < _UNIT:
-        return Row("units", both, "bad", f"{text}: in {unit}", {"mass_kg": mass, "model_kg": known.mass})
+    if abs(off) > MASS_BAD:
+        sizes = {f"in {unit}": size for unit, size in UNITS.items()} | {"the model's mass is in g": 1e3}
+        words = min(sizes, key=lambda words: abs(np.log(ratio * sizes[words])))
+        if abs(np.log(ratio * sizes[words])) > _UNIT:
+            words = "no battery's charge does that: mass or thrust map of another vehicle, or in another unit"
+        return Row("units", both, "bad", f"{text}: {words}", {"mass_kg": mass, "model_kg": known.mass})
     verdict = "warn" if abs(off) > _MASS_WARN else "ok"
     text += ": the thrust map is of another vehicle, battery or channel" if verdict == "warn" else ""
     return Row("thrust", both, verdict, text, {"mass_kg": mass, "model_kg": known.mass})
