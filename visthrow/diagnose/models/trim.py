@@ -61,11 +61,11 @@ class TrimModel(NumericModel):
         off_y = ((p.mass + mass) * com_y + added @ y) / total
         spin = np.array(p.spin)
         lift = stretch.data["lift"]
-        push, roll, pitch, turn = lanes.latent.reshape(len(theta), 4, 2).mean(2).T  # the last three are torques
+        draught = lanes.latent.reshape(len(theta), 4, 2).mean(2)  # a push along the vertical, then three torques
         if self.laws:
-            own = exerted(self.laws, self.knots(stretch, path))
-            push = push + np.mean(own.get("vehicle force", np.zeros((1, 3)))[:, 2])
-            roll, pitch, turn = (x + y for x, y in zip((roll, pitch, turn), np.mean(own.get("vehicle torque", np.zeros((1, 3))), 0)))
+            own = {block: np.mean(value, axis=0) for block, value in exerted(self.laws, self.knots(stretch, path)).items()}
+            draught = draught + np.append(own.get("vehicle force", np.zeros(3))[2], own.get("vehicle torque", np.zeros(3)))
+        push, roll, pitch, turn = draught.T
         share = np.outer(off_x, x) / p.arm**2 + np.outer(off_y, y) / p.arm**2 - np.outer(yaw, spin)
         thrust = 0.25 * (1.0 + share) * (weight * lift)[:, None] - 0.25 * push[:, None]
         thrust = thrust - 0.25 * (np.outer(roll, y) - np.outer(pitch, x)) / p.arm**2 - 0.25 * np.outer(turn, spin) / p.torque_ratio
