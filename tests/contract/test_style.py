@@ -7,6 +7,7 @@ rooms and their order are read from CONVENTIONS.md.
 import ast
 import re
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -125,9 +126,15 @@ def crowded(root: Path, packages: Iterable[str] = PACKAGES) -> list[tuple[str, i
 
 
 ORDER = rooms((ROOT / "CONVENTIONS.md").read_text(encoding="utf-8"))
-ARROWS = graph(ROOT)
 
 
+@cache
+def arrows() -> dict[str, set[str]]:
+    """Return the product's :func:`graph`; not when this file is imported, which every worker does."""
+    return graph(ROOT)
+
+
+@cache
 def offences() -> set[str]:
     """Return all that is wrong in the product."""
     long = {
@@ -136,8 +143,8 @@ def offences() -> set[str]:
         for function, _ in long_functions(path.read_text(encoding="utf-8"))
     }
     return {
-        *(f"circle: {', '.join(group)}" for group in circles(ARROWS)),
-        *(f"upward: {arrow}" for arrow in upward(ARROWS, ORDER)),
+        *(f"circle: {', '.join(group)}" for group in circles(arrows())),
+        *(f"upward: {arrow}" for arrow in upward(arrows(), ORDER)),
         *(f"crowded: {folder}" for folder, _ in crowded(ROOT)),
         *long,
     }
@@ -153,9 +160,9 @@ def test_the_list_of_what_is_to_be_mended_only_becomes_shorter():
 
 def test_every_part_of_the_product_is_in_a_room():
     """A new folder says where it stands; a room that is gone goes from the list."""
-    parts = {".".join(name.split(".")[:2]) for name in ARROWS if name.startswith("visthrow.")}
+    parts = {".".join(name.split(".")[:2]) for name in arrows() if name.startswith("visthrow.")}
     assert {part for part in parts if not any(room == part or room.startswith(part + ".") for room in ORDER)} == set()
-    assert {room for room in ORDER if room not in ARROWS} == set()
+    assert {room for room in ORDER if room not in arrows()} == set()
     assert set(PACKAGES) <= set(ORDER)
 
 

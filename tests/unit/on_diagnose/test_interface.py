@@ -39,7 +39,6 @@ def flown(seed: int, lag: float = 0.05) -> FlightLog:
     }, {})  # fmt: skip
 
 
-LOGS = [flown(seed) for seed in range(3)]
 FULL = 4.0 * PLANT.vehicle.controller.max_thrust
 WRONG = {
     "rate_axes": lambda u: u[:, [0, 2, 1, 3]],
@@ -50,33 +49,38 @@ WRONG = {
 }
 
 
+@pytest.fixture(scope="module")
+def logs():
+    return [flown(seed) for seed in range(3)]
+
+
 def changed(log, change):
     c = log["command"]
     return FlightLog({**log.channels, "command": Channel(c.time, change(c.values), c.unit, c.frame)}, log.meta)
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_each_mistake_is_suspected_and_put_right(name):
-    logs = [changed(log, WRONG[name]) for log in LOGS]
-    found = suspected(logs, PLANT)
+def test_each_mistake_is_suspected_and_put_right(logs, name):
+    wrong = [changed(log, WRONG[name]) for log in logs]
+    found = suspected(wrong, PLANT)
     assert [m.name for m in found] == [name.split(" ")[0]]
     assert found[0].logs == 3
-    for log, meant in zip(logs, LOGS):
+    for log, meant in zip(wrong, logs):
         np.testing.assert_allclose(found[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)
 
 
-def test_two_mistakes_at_once():
-    wrong = [changed(log, lambda u: u[:, [0, 1, 3, 2]] * [101.97, -57.29578, 57.29578, 57.29578]) for log in LOGS]
+def test_two_mistakes_at_once(logs):
+    wrong = [changed(log, lambda u: u[:, [0, 1, 3, 2]] * [101.97, -57.29578, 57.29578, 57.29578]) for log in logs]
     assert [m.name for m in suspected(wrong, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
 
 
-def test_good_logs_and_logs_that_disagree_are_not_suspected():
-    assert suspected(LOGS, PLANT) == []
-    mixed = [changed(LOGS[0], WRONG["rate_axes"]), *LOGS[1:]]
+def test_good_logs_and_logs_that_disagree_are_not_suspected(logs):
+    assert suspected(logs, PLANT) == []
+    mixed = [changed(logs[0], WRONG["rate_axes"]), *logs[1:]]
     assert suspected(mixed, PLANT) == []
-    strangers = [changed(log, lambda u, other=other: other["command"].values) for log, other in zip(LOGS, [*LOGS[1:], LOGS[0]])]
+    strangers = [changed(log, lambda u, other=other: other["command"].values) for log, other in zip(logs, [*logs[1:], logs[0]])]
     assert suspected(strangers, PLANT) == []
-    heavier = [changed(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in LOGS]
+    heavier = [changed(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in logs]
     assert suspected(heavier, PLANT) == []
 
 
