@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,6 +145,14 @@ def test_what_cannot_act_is_refused():
         setups.Setup("", ball=BALL, laws=(replace(pull, factors=("tensoin",)),))
     with pytest.raises(ConfigError, match="3 factors; expected at most 2"):
         setups.Setup("", ball=BALL, laws=(replace(pull, factors=("payload_speed",) * 3),))
+
+
+def test_an_unknown_of_a_model_without_laws_says_so(capsys):
+    tests = Path(__file__).resolve().parents[1] / "data" / "real" / "motor_prop_stand" / "all_tests.csv.gz"
+    assert cli.main(["diagnose", "explain", f"{tests}:a1_*", "--config", "motor_stand", "--no-report"]) == 0
+    said = capsys.readouterr().out
+    assert "UNKNOWN" in said
+    assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
 
 
 @pytest.mark.parametrize("kind", ["gimbal", "stand"])

@@ -35,7 +35,7 @@ class StandParams:
 class StandModel(NumericModel):
     """Static steps of tests on one stand; a test is a flight."""
 
-    lawless = "its steps are at rest, and what the grammar could make of thrust alone its catalogue holds"
+    lawless = "its steps are at rest, and what thrust alone could make its gains, exponents and offsets stand for"
 
     def __init__(self, logs: Sequence[FlightLog], params: StandParams) -> None:
         """Take the settled steps of the logs. Raises LogError where none has thrust, speed, voltage and current."""
