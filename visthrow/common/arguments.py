@@ -71,7 +71,11 @@ def add_commands(parser: argparse.ArgumentParser, commands: Commands, dest: str,
 
 
 def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
-    """Run the chosen command; returns its exit status."""
+    """Run the chosen command; returns its exit status. Raises StorageError where ``--json`` could not be written, before the work."""
+    if getattr(args, "json", None):
+        from visthrow.common.storage import check_place
+
+        check_place(args.json)
     return int(importlib.import_module(commands[name][1]).run(args) or 0)
 
 

@@ -51,6 +51,16 @@ def writable(folder: Path) -> None:
         raise StorageError(f"the folder {folder} cannot be written")
 
 
+def check_place(path: str | Path) -> None:
+    """Raise StorageError, before the work, for a file that could not be written after it; makes nothing."""
+    path = Path(path)
+    if path.is_dir():
+        raise StorageError(f"cannot write {path}: it is a folder; expected a file")
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise StorageError(f"cannot write {path}: {above} is {'a folder that cannot be written' if above.is_dir() else 'no folder'}")
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither."""
     atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")

@@ -475,13 +475,20 @@ def test_the_recording_is_written(tmp_path, found):
     (["plan", "nothing.npz", "--hall", "5,5,0.5"], "a height above 0.8 m"),
     (["plan", "nothing.npz", "--manoeuvres", "hoover"], "did you mean 'hover'"),
     (["explain", SWING, "--config", "pendulum_encoder", "--only", ""], "no effect ''"),
+    (["explain", SWING, "--config", "pendulum_encoder", "--test", "other.csv", "--no-report"], "other.csv: no such file"),
+    (["explain", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
+    (["blind", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
+    (["plan", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
+    (["check", "nothing.npz", "--json", "."], "it is a folder; expected a file"),
 ])  # fmt: skip
 def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):
     from visthrow.cli import main
 
     monkeypatch.chdir(tmp_path)
     assert main(["diagnose", *arguments]) == 2
-    assert said in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert printed.out == "", "before the search"
 
 
 def test_flights_are_numbers():

@@ -26,11 +26,12 @@ def run(args: argparse.Namespace) -> int:
     """Search once, hide, print, write."""
     import dataclasses
 
-    from visthrow.common.storage import atomic_write, write_json
+    from visthrow.common.storage import atomic_write, check_place, write_json
     from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.reporting import blind, pictures
     from visthrow.diagnose.reporting.explain_cli import explained
 
+    check_place(Path(args.out) / "blind.json")
     model, logs = opening.open_model(args)
     diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
     if diagnosis.work is None:

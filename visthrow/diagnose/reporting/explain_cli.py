@@ -34,18 +34,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
-    from visthrow.common.storage import write_json
+    from visthrow.common.storage import check_place, write_json
     from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.reporting import report
 
+    if not args.no_report:
+        check_place(Path(args.out) / "report.html")
     model, logs = opening.open_model(args)
     without = opening.numbers(args.without, logs)
+    others = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))[0] if args.test else None
     diagnosis = explained(model, logs, setup.known(args.config), args.seed, without, lambda x: print(x, flush=True))
     gain = None
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.made_with(args))
     print("\n" + report.summary(diagnosis, gain))
-    tested = _tested(args, diagnosis) if args.test and diagnosis.work is not None else {}
+    tested = _tested(others, diagnosis) if others is not None and diagnosis.work is not None else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
@@ -81,15 +84,13 @@ def explained(
     return replace(found, reasons=told, duplicates=doubled)
 
 
-def _tested(args: argparse.Namespace, diagnosis) -> dict[str, tuple[float, float, float]]:
+def _tested(after, diagnosis) -> dict[str, tuple[float, float, float]]:
     """Prediction errors of other flights by the model as its setup has it without extensions, by that with all that was found, and of
     noise alone; printed."""
-    from visthrow.diagnose.inputs import opening
     from visthrow.diagnose.likelihood.forms import READABLE, unit_of
     from visthrow.diagnose.models.laws import term_of
     from visthrow.diagnose.reporting.gain import on_others
 
-    after, _ = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))
     before = after.plain() if hasattr(after, "plain") else after
     if diagnosis.explanations and hasattr(after, "with_laws"):
         after = after.with_laws([term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]])

@@ -32,13 +32,14 @@ def run(args: argparse.Namespace) -> int:
     """Search, simulate the manoeuvres, optimise, rank, write."""
     import dataclasses
 
-    from visthrow.common.storage import atomic_write, write_json
+    from visthrow.common.storage import atomic_write, check_place, write_json
     from visthrow.diagnose.inputs import opening, setup
     from visthrow.diagnose.planning import design, excitation, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
     from visthrow.diagnose.reporting import pictures, report
     from visthrow.diagnose.reporting.explain_cli import explained
 
+    check_place(Path(args.out) / "plan.json")
     limits, chosen = _limits(args), _chosen(args.manoeuvres)
     model, logs = opening.open_model(args)
     diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
