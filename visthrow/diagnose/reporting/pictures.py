@@ -1,5 +1,6 @@
 """Pictures of a diagnosis, in the style of :mod:`visthrow.common.style`; each function returns a PNG."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -24,6 +25,7 @@ SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
 MOST_CURVES = 24  # curves of the completeness picture; of more effects it shows where their curves rise
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
 STEPS_ACROSS = 3
+NAMES_ACROSS = 26  # letters in a line of a set's names
 MOST_TICKS = 16  # over the whole width
 STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))  # within a decade of a logarithmic axis; the finest that leaves room is taken
 
@@ -122,7 +124,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
     for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
         names = list(step.screened)[::-1]
         screened = [max(step.screened[n], 0.0) for n in names]
-        labels = [name.replace(", ", ",\n") for name in names]
+        labels = [textwrap.fill(name, NAMES_ACROSS) for name in names]
         axis.barh(labels, screened, height=0.62, color=style.FAINT)
         for y, name in enumerate(names):
             if name in step.refitted:
