@@ -115,8 +115,10 @@ def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str 
     """Return where a run went wrong, by the first tick in abort (``time`` [s], ``state`` before it, ``since`` when [s], ``reason``,
     ``vehicle`` as it was seen), the last tick in the same form, and what is missing of the recording."""
     at = turn or (last if cut else None)
+    if last is None:
+        return "Whether it went wrong is not known: no tick is recorded."
     if at is None:
-        return "It did not go wrong." if last is None else f"It did not go wrong: it ended in {last['state']} ({last['reason']})."
+        return f"It did not go wrong: it ended in {last['state']} ({last['reason']})."
     why = turn["reason"] if turn else "the recording ends"
     vehicle: BodyState | None = at["vehicle"]
     where = "had not been seen"

@@ -34,6 +34,9 @@ POLICY, CONFIG, POSES, TICKS, SUMMARY, PROVENANCE = (
 )  # fmt: skip
 
 
+EXPECTED = f"expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it"
+
+
 def check_free(folder: Path) -> None:
     """Raise `StorageError` for a folder that holds a run already."""
     if (folder / CONFIG).exists():
@@ -135,8 +138,13 @@ def read_poses(folder: Path) -> dict[int, list[Pose]]:
 
 def require_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> None:
     """Raise `RunError` for what is no folder of a run, with what was expected in it."""
-    if not all((folder / name).is_file() for name in parts):
-        raise RunError(f"{folder}: no folder of a run; expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it")
+    if not is_run(folder, parts):
+        raise RunError(f"{folder}: no folder of a run; {EXPECTED}")
+
+
+def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
+    """Return whether a folder holds these files of a run."""
+    return all((folder / name).is_file() for name in parts)
 
 
 def _replayable(path: Path) -> str:
@@ -204,4 +212,7 @@ def opened(path: str | Path) -> Iterator[Path]:
                     bundle.extract(entry, folder)
         except (zipfile.BadZipFile, zlib.error, RuntimeError, OSError) as error:  # RuntimeError: locked by a password, an unknown method
             raise RunError(f"{path}: {error}; expected a folder of a run, or the bundle of one") from error
+        if not is_run(Path(folder)):
+            held = ", ".join(entry.filename for entry in entries) or "nothing"
+            raise RunError(f"{path}: no bundle of a run, it holds {held}; {EXPECTED}")
         yield Path(folder)

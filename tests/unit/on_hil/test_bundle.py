@@ -72,10 +72,21 @@ def test_a_good_run_did_not_go_wrong(tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[-1].startswith("It did not go wrong")
 
 
+def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
+    folder = shutil.copytree(aborted[0], tmp_path / "none")
+    (folder / "ticks.jsonl").write_text("")
+    assert main(["hil", "replay", str(folder)]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "Whether it went wrong is not known: no tick is recorded."
+
+
 def test_what_is_no_bundle(tmp_path, capsys):
     (tmp_path / "no.zip").write_bytes(b"PK no")
     assert main(["hil", "replay", str(tmp_path / "no.zip")]) == 2
     assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as bundle:
+        bundle.writestr("holiday.txt", "x")
+    assert main(["hil", "replay", str(tmp_path / "other.zip")]) == 2
+    assert "other.zip: no bundle of a run, it holds holiday.txt; expected config.toml" in capsys.readouterr().err
     with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
         bundle.writestr("../outside.txt", "x")
     assert main(["hil", "replay", str(tmp_path / "out.zip")]) == 2
