@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,12 @@ def command() -> str:
 
 def versions() -> dict[str, str]:
     """Return the installed version of each package that can change a figure."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """They are looked for once: a process that records many runs has the same packages in all of them."""
     found = {"visthrow": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         try:
