@@ -175,6 +175,25 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     assert diagnosis["effect_03"].manoeuvres
 
 
+def test_two_effects_that_do_as_two_others_are_classes_with_both():
+    """Two motors across, as weak as each other, do as less thrust and a trim of the yaw; no one of these does as one of those."""
+    truth, others = {"effect_03": 14.0, "effect_09": 14.0}, {"effect_01", "effect_07"}
+
+    def change(model, window):
+        columns = window.effects.copy()
+        columns[:, 7] = columns[:, 9] - columns[:, 1]
+        columns[:, 1] += columns[:, 3]
+        return replace(window, effects=columns, residual=window.residual + model._answer(columns, truth))
+
+    diagnosis = search.explain(altered(change, seed=3), laws=False)
+    assert {frozenset(names) for names, _ in diagnosis.sets} == {frozenset(truth), frozenset(others)}
+    for name in (*truth, *others):
+        beside = set(truth) if name in truth else others
+        assert diagnosis[name].verdict == result.CLASS
+        assert not beside & set(diagnosis[name].partners) or name not in diagnosis.theta
+        assert diagnosis[name].low < 14.0 * EFFECTS[3].floor < diagnosis[name].high
+
+
 def test_a_class_may_have_a_dozen_members():
     """What a hover shows of a weight, eight causes explain alike."""
     same = {f"effect_{j:02d}": ("effect_03", 1.0) for j in (0, 1, 4, 6, 7, 9, 10)}

@@ -195,9 +195,9 @@ def _finding(
     if not priors.visible[j]:
         missing = tuple(c for c in effect.channels if c not in search.problem.model.channels)
         return replace(blank, missing=missing, sentence=f"{effect.name}: not to be seen without {', '.join(missing)}.")
-    partners, home = _class_of(search, j, active)
+    partners, together = _class_of(search, j, active)
     if j in active or partners:
-        return _named(search, point, blank, j, home, partners, active, spread, unlike)
+        return _named(search, point, blank, j, together, partners, active, spread, unlike)
     wide = _wide(point, priors, j, active)
     mean, own = wide[0] * effect.floor, _deviation(*wide, unlike) * effect.floor
     low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) + 0.0 for side in (-1.0, 1.0))  # no -0
@@ -232,39 +232,40 @@ def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float
     return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
 
 
-def _class_of(search: Selector, j: int, active: Sequence[int]) -> tuple[tuple[int, ...], int]:
-    """Partners of an effect, and the named member in whose place it may stand."""
+def _class_of(search: Selector, j: int, active: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Partners of an effect, and the set that it belongs to: that of the search, or another that explains the flights as well.
+
+    Partners are a named effect and the new ones of sets of as many that do without it.
+    """
+    named, alike = set(active), [set(m.active) for m in search.sets if len(m.active) == len(active)]
     for home in active:
-        exchanged = {home}
-        for members in (move.active for move in search.sets):
-            new = set(members) - set(active)
-            if len(members) == len(active) and len(new) == 1 and set(active) - set(members) == {home}:
-                exchanged |= new
-        if j in exchanged and len(exchanged) > 1:
-            return tuple(sorted(exchanged - {j})), home
-    return (), j
+        own = [members for members in alike if home not in members]
+        partners = {home}.union(*own) - (named - {home})
+        if j in partners and len(partners) > 1:
+            return tuple(sorted(partners - {j})), tuple(active if j == home else next(m for m in own if j in m))
+    return (), tuple(active)
 
 
-def _named(search: Selector, point: Point, blank: Finding, j: int, home: int, partners: tuple[int, ...], active: list[int],
+def _named(search: Selector, point: Point, blank: Finding, j: int, together: Sequence[int], partners: tuple[int, ...], active: list[int],
            spread: np.ndarray, unlike: float) -> Finding:  # fmt: skip
     priors, floor = search.priors, blank.floor
     if j in active:
         size, sd = spread[j] @ point.score, np.sqrt(spread[j, j])
     else:
-        stead = [j if k == home else k for k in active]
-        size, sd = _wide(point, priors, j, stead[:-1] if stead[-1] == j else [k for k in stead if k != j])
+        size, sd = _wide(point, priors, j, [k for k in together if k != j])
     sd = _deviation(size, sd, unlike) * floor
     size = float(np.clip(size, priors.low[j], priors.high[j]) * floor) + 0.0  # no -0
     low = max(priors.low[j] * floor, size - NORMAL_95 * sd) + 0.0
     high = min(priors.high[j] * floor, size + NORMAL_95 * sd) + 0.0
-    rest = [k for k in active if k != home]
+    rest = [k for k in together if k != j]
     nats = _worth(point, priors, j, rest)
     text = f"{size:.3g} ± {sd:.2g} {blank.unit}"
     blank = replace(blank, estimate=size, sd=sd, low=low, high=high, nats=nats)
     if not partners:
         sentence = f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}), {nats:.0f} nats."
         return replace(blank, verdict=result.FOUND, sentence=sentence)
-    names, joint = tuple(map(search.name, partners)), _joint(search, point, sorted({j, *partners}), rest)
+    members = sorted({j, *partners})
+    names, joint = tuple(map(search.name, partners)), _joint(search, point, members, [k for k in active if k not in members])
     sentence = (f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it from {', '.join(names)}. "
                 f"Known is {joint}.")  # fmt: skip
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
