@@ -33,7 +33,7 @@ possible; any cause must be very strong, however few are in question."""
 
 INEXACT = 0.3
 """Part by which the form of anything may be off: of an effect from flight to flight, of another kind of block, of a force against the
-thrust, of the misfit of a window that begins in a motion that nobody knows."""
+thrust, of the misfit of a window that begins in a motion that nobody knows, of a size that derivatives of elsewhere give."""
 
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995

@@ -50,7 +50,7 @@ def explain(
         problem, nominal = _left_out(problem, nominal, gone, say)
     least = _least(nominal, priors, seed, say)
     search = Selector(problem, nominal, least, say, laws)
-    for further in range(ROUNDS - 1, -1, -1):
+    for further in range(ROUNDS - 1, -1, -1):  # where the causes are in the simulation, it may lose windows that it followed without
         search.run(follow=not further)
         gone = lost(search.point) if further and not search.events else []
         if not gone:

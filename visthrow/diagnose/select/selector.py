@@ -125,9 +125,9 @@ class Selector(SearchState):
         Those are left out that the distance from the linearisation would be taken for. Where a law may be missing there are none: names
         take a part of it each. ``free``: the point by whose statistics alone they are selected.
         """
-        active, plain = tuple(self.active), usable[~self.problem.switches[usable]]
         if self.problem.terms:
             return []
+        active, plain = tuple(self.active), usable[~self.problem.switches[usable]]
         while len(active) < MOST_NAMES and (gain := self._additions(free, plain, active)).max() > self.least:
             active = (*active, int(np.argmax(gain)))
         while len(active) > len(self.active) + 1 and frozenset(active) not in self.visited:
