@@ -75,11 +75,11 @@ def test_gain_comes_near_what_knowing_the_truth_would_bring(found, measured):
     model, diagnosis = found
     work = diagnosis.work
     floors = {e.name: e.floor for e in EFFECTS}
-    oracle = [w.residual[:, None] for w in model.windows({n: s * floors[n] for n, s in TRUTH.items()})]
-    best = forms.forms(work.after.windows, [w.flight for w in work.after.windows], work.after.noise, oracle, 2)
+    oracle = [w.residual for w in model.windows({n: s * floors[n] for n, s in TRUTH.items()})]
+    best = forms.errors(work.after.windows, [w.flight for w in work.after.windows], work.after.noise, oracle, 2)
     for c, channel in enumerate(measured.channels):
         sigma = np.median(work.after.windows[0].sigma[work.after.windows[0].channel == c])
-        own = np.sqrt(best.error(np.ones(1))[:, c].sum() / best.count[:, c].sum()) * sigma
+        own = np.sqrt(best.square[:, c].sum() / best.count[:, c].sum()) * sigma
         assert channel.before > channel.after > channel.floor * 0.9
         assert (channel.before - channel.after) > 0.9 * (channel.before - own)
         assert channel.low < channel.gain < channel.high
@@ -112,18 +112,20 @@ def test_errors_grow_with_the_horizon(measured):
         assert channel.horizons[-1][1] > channel.horizons[0][1]
 
 
-def test_forms_are_the_errors_written_out(found):
-    """The quadratic form at some sizes against the same prediction made sample by sample."""
+def test_errors_are_those_of_the_samples_ahead_added_up(found):
+    """By group, channel and horizon; a group's number says nothing of its row."""
     _, diagnosis = found
     point = diagnosis.work.after
-    window = point.windows[0]
-    columns = np.hstack((window.residual[:, None], window.effects))
-    own = forms.forms([window], [0], point.noise, [columns], 2)
-    v = np.concatenate(([1.0], np.linspace(-1e-3, 1e-3, len(EFFECTS))))
-    left, _, horizon = forms.predicted(window, point.noise, columns @ v[:, None])
-    for c in range(2):
-        rows = (window.channel == c) & (horizon >= 0)
-        assert own.error(v)[0, c].sum() == pytest.approx((left[rows] ** 2).sum(), rel=1e-9)
+    windows, groups = point.windows[:3], [7, 2, 7]
+    own = forms.errors(windows, groups, point.noise, [2.0 * w.residual for w in windows], 2)
+    for row, members in enumerate(([windows[1]], [windows[0], windows[2]])):
+        parts = [(w, *forms.predicted(w, point.noise, 2.0 * w.residual)) for w in members]
+        for c in range(2):
+            for h in range(len(forms.HORIZONS)):
+                rows = [(w.channel == c) & (horizon == h) for w, _, _, horizon in parts]
+                assert own.square[row, c, h] == pytest.approx(sum((left[at] ** 2).sum() for at, (_, left, _, _) in zip(rows, parts)))
+                assert own.floor[row, c, h] == pytest.approx(sum(floor[at].sum() for at, (_, _, floor, _) in zip(rows, parts)))
+                assert own.count[row, c, h] == sum(at.sum() for at in rows)
 
 
 def test_noise_that_lasts_leaves_more_than_white_noise_does(found):
@@ -147,10 +149,9 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     point = diagnosis.work.after
     window = point.windows[0]
     late = window.time > window.time.min() + 0.7
-    plain, spoilt = (forms.predicted(window, point.noise, column[:, None])[0]
-                     for column in (window.residual, window.residual + late))  # fmt: skip
+    plain, spoilt = (forms.predicted(window, point.noise, residual)[0] for residual in (window.residual, window.residual + late))
     np.testing.assert_allclose(spoilt[~late], plain[~late])
-    np.testing.assert_allclose((spoilt - plain)[late, 0], 1.0 / window.sigma[late])
+    np.testing.assert_allclose((spoilt - plain)[late], 1.0 / window.sigma[late])
 
 
 class Means(SyntheticModel):
@@ -172,8 +173,8 @@ def test_windows_without_states_are_predicted_whole(found):
     point = found[1].work.after
     window = point.windows[0]
     bare = replace(window, nuisance=np.zeros((len(window.time), 0)), nuisance_sd=np.zeros(0))
-    left, expected, horizon = forms.predicted(bare, point.noise, window.residual[:, None])
-    np.testing.assert_allclose(left[:, 0], window.residual / window.sigma)
+    left, expected, horizon = forms.predicted(bare, point.noise, window.residual)
+    np.testing.assert_allclose(left, window.residual / window.sigma)
     np.testing.assert_allclose(expected, point.noise.scale[window.channel] ** 2)
     assert horizon.min() == 0
     assert (horizon >= 0).all()

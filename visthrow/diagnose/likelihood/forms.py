@@ -1,8 +1,7 @@
-"""Prediction errors as quadratic forms of the effects' sizes, so that any sizes are scored without simulating again.
+"""Prediction errors: what is left ahead of the beginnings of windows.
 
 Within a window the initial state is fitted to the first HEAD seconds; what follows is predicted and compared at rising horizons.
 A window without an initial state (means, a motor's stand, a camera's view) has nothing to fit, and is predicted whole.
-Both steps are linear in the residuals, hence the squared error of any linear combination of residual columns is a quadratic form.
 """
 
 from collections.abc import Sequence
@@ -34,74 +33,61 @@ def unit_of(channel: str) -> str:
 
 
 @dataclass(frozen=True)
-class Forms:
-    """Sums of squares in sigmas, for groups of windows (flights), channels and horizons; Q columns, the residual first."""
+class Errors:
+    """Sums over the samples ahead, for groups of windows (flights), channels and horizons, shape (F, C, H) each."""
 
-    groups: np.ndarray  # shape (F,)
-    square: np.ndarray  # shape (F, C, H, Q, Q)
-    count: np.ndarray  # samples, shape (F, C, H)
-    floor: np.ndarray  # squares expected of sensor noise and of the initial state's uncertainty alone, shape (F, C, H)
-
-    def error(self, combination: np.ndarray) -> np.ndarray:
-        """Sum of squares of ``columns @ combination``, shape (F, C, H); ``combination`` (Q,) or (F, Q)."""
-        v = np.broadcast_to(combination, (len(self.groups), self.square.shape[-1]))
-        return np.einsum("fchij,fi,fj->fch", self.square, v, v, optimize=True)
+    square: np.ndarray  # of what is left, in sigmas
+    count: np.ndarray  # of samples
+    floor: np.ndarray  # squares expected of sensor noise and of the initial state's uncertainty alone
 
 
-def forms(windows: Sequence[Window], groups: Sequence[int], noise: Noise, columns: Sequence[np.ndarray], channels: int) -> Forms:
-    """Build the quadratic forms.
+def errors(windows: Sequence[Window], groups: Sequence[int], noise: Noise, residuals: Sequence[np.ndarray], channels: int) -> Errors:
+    """Predict each window's end from its head and add up what is left.
 
     Args:
-        groups: to which group (flight) each belongs.
+        groups: to which group (flight) each belongs; F of them.
         noise: for the sensor scales.
-        columns: of each window, shape (N, Q), in the channels' units; the residual stands first.
+        residuals: of each window, in the channels' units, shape (N,).
         channels: number C of channels.
     """
-    names = np.array(sorted(set(groups)))
-    size = columns[0].shape[1]
-    square = np.zeros((len(names), channels, len(HORIZONS), size, size))
-    count, floor = np.zeros(square.shape[:3]), np.zeros(square.shape[:3])
-    for window, group, column in zip(windows, groups, columns):
-        f = int(np.searchsorted(names, group))
-        left, expected, horizon = predicted(window, noise, column)
-        for c in np.unique(window.channel):
-            for h in range(len(HORIZONS)):
-                rows = (window.channel == c) & (horizon == h)
-                if rows.any():
-                    square[f, c, h] += left[rows].T @ left[rows]
-                    count[f, c, h] += rows.sum()
-                    floor[f, c, h] += expected[rows].sum()
-    return Forms(names, square, count, floor)
+    names, row = np.unique(groups, return_inverse=True)
+    sums = np.zeros((3, len(names), channels, len(HORIZONS)))
+    for window, f, residual in zip(windows, row, residuals):
+        left, expected, horizon = predicted(window, noise, residual)
+        ahead = horizon >= 0
+        for total, own in zip(sums, (left**2, np.ones_like(left), expected)):
+            np.add.at(total[f], (window.channel[ahead], horizon[ahead]), own[ahead])
+    return Errors(*sums)
 
 
 def left_ahead(window: Window, noise: Noise) -> np.ndarray:
     """Residuals of a window in sigmas once its initial state is fitted to its head, shape (N,); 0 in the head."""
-    left, _, horizon = predicted(window, noise, window.residual[:, None])
-    return np.where(horizon < 0, 0.0, left[:, 0])
+    left, _, horizon = predicted(window, noise, window.residual)
+    return np.where(horizon < 0, 0.0, left)
 
 
-def predicted(window: Window, noise: Noise, column: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def predicted(window: Window, noise: Noise, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predict the end of a window from its head.
 
-    Returns columns left after the fit of the initial state in sigmas, shape (N, Q), the square that noise is expected to leave there,
-    shape (N,), and the horizon's index (-1 in the head).
+    Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the square that noise is expected to leave there,
+    shape (N,), and the horizon's index (-1 in the head), shape (N,).
 
     Args:
         window: of N samples.
         noise: for the sensor scales.
-        column: in the channels' units, shape (N, Q).
+        residual: in the channels' units, shape (N,), or (N, Q) for several.
     """
     sigma = window.sigma
     scale = noise.scale[window.channel]
     states = window.nuisance * window.nuisance_sd / sigma[:, None]
-    column = column / sigma[:, None]
+    off = (residual.T / sigma).T
     begin, length = window.time.min(), np.ptp(window.time)
     fits = states.shape[1] > 0
     ahead = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
     head = (ahead <= 0.0) & fits
     weighted = (states[head] / scale[head, None] ** 2).T
     spread = np.linalg.inv(weighted @ states[head] + np.eye(states.shape[1]))
-    left = column - states @ (spread @ (weighted @ column[head]))
+    left = off - states @ (spread @ (weighted @ off[head]))
     if window.correlated:
         root = _root(window, scale)
         expected = ((root - states @ (spread @ (weighted @ root[head]))) ** 2).sum(1) + ((states @ spread) ** 2).sum(1)

@@ -11,7 +11,7 @@ import numpy as np
 
 from visthrow.common.statistics import mean
 from visthrow.diagnose.likelihood.correlation import with_correlations
-from visthrow.diagnose.likelihood.forms import forms, predicted
+from visthrow.diagnose.likelihood.forms import errors, predicted
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
@@ -114,17 +114,17 @@ def on_others(before: Model, after: Model, theta: Mapping[str, float], found: Di
         after: model of these flights that was diagnosed, with the laws that were found. theta: sizes that were found.
         found: that diagnosis, whose noise is taken.
     """
-    noise, errors = replace(found.work.after.noise, scale=np.array([found.sensor_scale[name] for name in after.channels])), []
+    noise, rms = replace(found.work.after.noise, scale=np.array([found.sensor_scale[name] for name in after.channels])), []
     for model, sizes in ((before, {}), (after, theta)):
         sums = np.zeros((3, len(model.channels)))
         finite = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
         for window in with_correlations(finite, found.work.problem.correlated):
-            left, expected, horizon = predicted(window, noise, window.residual[:, None])
-            squares = np.array([left[:, 0] ** 2, expected, window.sigma**-2.0]) * window.sigma**2
+            left, expected, horizon = predicted(window, noise, window.residual)
+            squares = np.array([left**2, expected, window.sigma**-2.0]) * window.sigma**2
             for total, own in zip(sums, squares[:, horizon >= 0]):
                 total += np.bincount(window.channel[horizon >= 0], own, len(total))
-        errors.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
-    (plain, _), (named, floor) = errors
+        rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
+    (plain, _), (named, floor) = rms
     return {name: tuple(map(float, row)) for name, row in zip(after.channels, np.column_stack((plain, named, floor)))}
 
 
@@ -134,13 +134,13 @@ def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channel
     if table is None:
         return None
     trained = train(before, table, groups)
-    columns = [np.hstack((w.residual[:, None], w.latent @ table.columns(w))) for w in before.windows]
-    own = forms(before.windows, groups, after.noise, columns, channels)
-    combination = np.ones((len(own.groups), columns[0].shape[1]))
+    weights = np.zeros((len(trained.groups), len(trained.reach)))
     for fold in folds:
-        rest = np.setdiff1d(np.arange(len(own.groups)), fold)
-        combination[fold, 1:] = -trained.weights(rest) if len(rest) else 0.0
-    return own.error(combination)
+        rest = np.setdiff1d(np.arange(len(weights)), fold)
+        weights[fold] = trained.weights(rest) if len(rest) else 0.0
+    own = weights[np.searchsorted(trained.groups, groups)]
+    left = [w.residual - w.latent @ (table.columns(w) @ size) for w, size in zip(before.windows, own)]
+    return errors(before.windows, groups, after.noise, left, channels).square
 
 
 def _nats(before: Point, after: Point, cross: Crossed) -> float:

@@ -22,7 +22,7 @@ from visthrow.diagnose.likelihood.evidence import (
     estimate,
     log_evidence,
 )
-from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Forms, forms, left_ahead, unit_of
+from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Errors, errors, left_ahead, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
@@ -153,20 +153,19 @@ def channel_gains(work: Work, cross: Crossed, box: np.ndarray | None = None) -> 
     ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C, H).
     """
     before, after, names = work.before, work.after, work.problem.model.channels
-    by_effect = [np.hstack((w.residual[:, None], w.effects * work.problem.priors.floor)) for w in after.windows]
-    own = forms(after.windows, cross.groups, after.noise, by_effect, len(names))
-    plain = forms(before.windows, cross.groups, after.noise, [w.residual[:, None] for w in before.windows], len(names))
-    combination = np.hstack((np.ones((len(cross.trained), 1)), after.theta - cross.trained))
-    errors = plain.error(np.ones(1)), own.error(combination)
+    change = (after.theta - cross.trained)[np.unique(cross.groups, return_inverse=True)[1]] * work.problem.priors.floor
+    named = [w.residual + w.effects @ own for w, own in zip(after.windows, change)]
+    own = errors(after.windows, cross.groups, after.noise, named, len(names))
+    plain = errors(before.windows, cross.groups, after.noise, [w.residual for w in before.windows], len(names))
     return tuple(
-        _channel(name, c, after, own, errors[0][:, c], errors[1][:, c], None if box is None else box[:, c])
+        _channel(name, c, after, own, plain.square[:, c], None if box is None else box[:, c])
         for c, name in enumerate(names)
         if own.count[:, c].sum() > 0
     )
 
 
-def _channel(name, c, after: Point, own: Forms, before, error, box) -> ChannelGain:
-    count = own.count[:, c].sum()
+def _channel(name: str, c: int, after: Point, own: Errors, before: np.ndarray, box: np.ndarray | None) -> ChannelGain:
+    error, count = own.square[:, c], own.count[:, c].sum()
     rows = [w.sigma[w.channel == c] for w in after.windows if np.any(w.channel == c)]
     sigma = float(np.median(np.concatenate(rows)))
 
@@ -250,12 +249,12 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
         return diagnosis
     groups, left_out = groups_of(point, work.problem.kept)
     names = work.problem.model.channels
-    own = forms(point.windows, groups, point.noise, [w.residual[:, None] for w in point.windows], len(names))
-    error, most = own.error(np.ones(1)).sum(2), UNKNOWN_RATIO**2 * own.floor.sum(2)
+    own = errors(point.windows, groups, point.noise, [w.residual for w in point.windows], len(names))
+    error, most = own.square.sum(2), UNKNOWN_RATIO**2 * own.floor.sum(2)
     firm = [name for c, name in enumerate(names) if jackknifed(most[:, c], error[:, c])[2] < 0.0]
     if not firm:
         return diagnosis
-    gains = channel_gains(work, Crossed(groups, left_out, point.statistics, [], np.zeros((len(own.groups), len(point.theta))), {}))
+    gains = channel_gains(work, Crossed(groups, left_out, point.statistics, [], np.zeros((len(error), len(point.theta))), {}))
     floors = floors_of(work.problem, point)
     level = max(diagnosis.levels, key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf), default=None)
     reasons = tuple(_left(c, work) for c in gains if c.channel in firm)
