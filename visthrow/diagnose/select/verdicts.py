@@ -17,7 +17,7 @@ from visthrow.diagnose.likelihood.evidence import (
     estimate,
 )
 from visthrow.diagnose.likelihood.marginal import TAIL
-from visthrow.diagnose.models.interface import Model, Window
+from visthrow.diagnose.models.interface import Effect, Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
 from visthrow.diagnose.select.held_out import joint
@@ -65,7 +65,7 @@ def conclude(search: Selector) -> Diagnosis:
     point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
     spread, floor = covariance(point.information, search.priors.deviation(active)), search.priors.floor
     unlike = differences(point.plain, search.priors, active, point.theta)
-    findings = tuple(_finding(search, point, j, active, spread, unlike[j], withdrawn) for j in range(len(model.effects)))
+    findings = tuple(_finding(search, point, j, active, unlike[j], withdrawn) for j in range(len(model.effects)))
     return Diagnosis(
         overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
         joint(spread, unlike, point.theta, active, floor), search.least, tuple(search.steps),
@@ -122,7 +122,7 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
     """The verdict where the simulation fails in most windows."""
     reason = f"the simulation stays finite in {usable} of {len(windows)} windows; check units, axes and the vehicle's configuration"
     findings = tuple(
-        Finding(e.name, result.NOT_IDENTIFIABLE, e.block, e.cause, e.equation, e.unit, 0.0, e.prior_sd, *e.bounds, e.floor, 0.0,
+        replace(_blank(e), verdict=result.NOT_IDENTIFIABLE, manoeuvres=(),
                 sentence=f"{e.name}: nothing can be said, the simulation does not follow these flights.")
         for e in model.effects
     )  # fmt: skip
@@ -186,50 +186,39 @@ def _on_bound(search: Selector, j: int) -> bool:
     return bool(at and push * point.theta[j] > 0.0 and 0.5 * push**2 / point.information[j, j] > search.least)
 
 
-def _finding(
-    search: Selector, point: Point, j: int, active: list[int], spread: np.ndarray, unlike: float, withdrawn: set[int]
-) -> Finding:
+def _finding(search: Selector, point: Point, j: int, active: list[int], unlike: float, withdrawn: set[int]) -> Finding:
     effect, priors = search.problem.effects[j], search.priors
-    blank = Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0,
-                    effect.prior_sd, *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
+    blank = _blank(effect)
     if not priors.visible[j]:
         missing = tuple(c for c in effect.channels if c not in search.problem.model.channels)
         return replace(blank, missing=missing, sentence=f"{effect.name}: not to be seen without {', '.join(missing)}.")
     partners, together = _class_of(search, j, active)
+    rest = [k for k in together if k != j]
+    sigma = covariance(point.information, priors.deviation([*rest, j]))  # as if it were named beside the others
+    mean, sd = float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
+    own = float(np.sqrt(sd**2 + OWN_FLOOR**2 + unlike * allowed(mean) ** 2)) * effect.floor
+    blank = replace(blank, sd=own, nats=point.evidence(priors, [*rest, j]) - point.evidence(priors, rest))
     if j in active or partners:
-        return _named(search, point, blank, j, together, partners, active, spread, unlike)
-    wide = _wide(point, priors, j, active)
-    mean, own = wide[0] * effect.floor, _deviation(*wide, unlike) * effect.floor
-    low, high = (float(np.clip(mean + side * NORMAL_95 * own, *effect.bounds)) + 0.0 for side in (-1.0, 1.0))  # no -0
-    gain = _worth(point, priors, j, active)
-    blank = replace(blank, sd=own, low=low, high=high, nats=gain)
+        return _named(search, point, blank, mean, sorted({j, *partners}), active)
+    low, high = (float(np.clip(mean * effect.floor + side * NORMAL_95 * own, *effect.bounds)) + 0.0 for side in (-1.0, 1.0))  # no -0
+    blank = replace(blank, low=low, high=high)
     if j in withdrawn:
         text = f"{effect.name}: explains a part of what is missing, but not its form; the name is withdrawn."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    if wide[1] > BIT * priors.slab[j]:
+    if sd > BIT * priors.slab[j]:
         text = f"{effect.name}: these flights say hardly more than was known ({own:.2g} of {effect.prior_sd:.2g} {effect.unit})."
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
     text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
     if low == high:
-        beyond = "less" if mean < low else "more"
+        beyond = "less" if mean * effect.floor < low else "more"
         text = f"{effect.name}: on its bound of {low:.3g} {effect.unit}; these flights ask for {beyond} than is possible."
     return replace(blank, verdict=result.BOUNDED, sentence=text)
 
 
-def _wide(point: Point, priors: Priors, j: int, active: Sequence[int]) -> tuple[float, float]:
-    """Posterior mean and deviation of one effect as if it were named beside the others, in floors."""
-    sigma = covariance(point.information, priors.deviation([*active, j]))
-    return float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
-
-
-def _deviation(size: float, sd: float, unlike: float) -> float:
-    """Deviation of an estimate with what numerics and differences among flights add, in floors."""
-    return float(np.sqrt(sd**2 + OWN_FLOOR**2 + unlike * allowed(size) ** 2))
-
-
-def _worth(point: Point, priors: Priors, j: int, active: Sequence[int]) -> float:
-    rest = [k for k in active if k != j]
-    return point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
+def _blank(effect: Effect) -> Finding:
+    """What is said of an effect before anything was seen of it."""
+    return Finding(effect.name, result.UNOBSERVABLE, effect.block, effect.cause, effect.equation, effect.unit, 0.0, effect.prior_sd,
+                   *effect.bounds, effect.floor, 0.0, manoeuvres=tuple(effect.manoeuvres))  # fmt: skip
 
 
 def _class_of(search: Selector, j: int, active: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -246,26 +235,18 @@ def _class_of(search: Selector, j: int, active: Sequence[int]) -> tuple[tuple[in
     return (), tuple(active)
 
 
-def _named(search: Selector, point: Point, blank: Finding, j: int, together: Sequence[int], partners: tuple[int, ...], active: list[int],
-           spread: np.ndarray, unlike: float) -> Finding:  # fmt: skip
-    priors, floor = search.priors, blank.floor
-    if j in active:
-        size, sd = spread[j] @ point.score, np.sqrt(spread[j, j])
-    else:
-        size, sd = _wide(point, priors, j, [k for k in together if k != j])
-    sd = _deviation(size, sd, unlike) * floor
-    size = float(np.clip(size, priors.low[j], priors.high[j]) * floor) + 0.0  # no -0
-    low = max(priors.low[j] * floor, size - NORMAL_95 * sd) + 0.0
-    high = min(priors.high[j] * floor, size + NORMAL_95 * sd) + 0.0
-    rest = [k for k in together if k != j]
-    nats = _worth(point, priors, j, rest)
-    text = f"{size:.3g} ± {sd:.2g} {blank.unit}"
-    blank = replace(blank, estimate=size, sd=sd, low=low, high=high, nats=nats)
-    if not partners:
-        sentence = f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}), {nats:.0f} nats."
+def _named(search: Selector, point: Point, blank: Finding, mean: float, members: list[int], active: list[int]) -> Finding:
+    """The verdict on a cause that the flights ask for; ``mean`` is in floors, ``members`` are those of its class."""
+    low, high = blank.low, blank.high
+    size = float(np.clip(mean * blank.floor, low, high)) + 0.0  # no -0
+    low, high = max(low, size - NORMAL_95 * blank.sd) + 0.0, min(high, size + NORMAL_95 * blank.sd) + 0.0
+    text = f"{size:.3g} ± {blank.sd:.2g} {blank.unit}"
+    blank = replace(blank, estimate=size, low=low, high=high)
+    if len(members) < 2:
+        sentence = f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}), {blank.nats:.0f} nats."
         return replace(blank, verdict=result.FOUND, sentence=sentence)
-    members = sorted({j, *partners})
-    names, joint = tuple(map(search.name, partners)), _joint(search, point, members, [k for k in active if k not in members])
+    names = tuple(name for name in map(search.name, members) if name != blank.name)
+    joint = _joint(search, point, members, [k for k in active if k not in members])
     sentence = (f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it from {', '.join(names)}. "
                 f"Known is {joint}.")  # fmt: skip
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
