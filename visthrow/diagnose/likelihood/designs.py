@@ -21,6 +21,7 @@ from visthrow.diagnose.likelihood.marginal import (
     gram_with,
     knot_factor,
     left_of,
+    with_products,
     with_residual,
 )
 from visthrow.diagnose.likelihood.threads import each
@@ -184,10 +185,9 @@ def with_residuals(
 ) -> list[Gram]:
     """Grams with the same derivatives and other residuals: of all windows at once on a GPU, where the derivatives stay.
 
-    ``grams``: of the windows, whose latents are at the knots; ``floors``: of the effects, shape (K,); ``residuals``: of each window, shape
-    (N,).
+    ``grams``: of the windows; ``floors``: of the effects, shape (K,); ``residuals``: of each window, shape (N,).
     """
     if device == "cpu" or _correlated(windows):
         return each(lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams)))
     design = _designed(windows, floors, len(grams[0].count), device)
-    return [replace(gram, cross=cross, square=square) for gram, (cross, square) in zip(grams, design.products(residuals))]
+    return [with_products(gram, *products) for gram, products in zip(grams, design.products(residuals))]

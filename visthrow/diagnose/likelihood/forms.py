@@ -69,8 +69,8 @@ def left_ahead(window: Window, noise: Noise) -> np.ndarray:
 def predicted(window: Window, noise: Noise, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predict the end of a window from its head.
 
-    Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the square that noise is expected to leave there,
-    shape (N,), and the horizon's index (-1 in the head), shape (N,).
+    Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the square that noise is expected to leave
+    there, shape (N,), and the horizon's index (-1 in the head), shape (N,).
 
     Args:
         window: of N samples.

@@ -274,11 +274,11 @@ def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
     return left - window.latent @ fit[states:] if len(fit) > states else left
 
 
-def recorrelated(gram: Gram, raw: Gram) -> Gram:
-    """The residuals of a gram whose latents are at the knots, in one with the same derivatives whose latents are correlated."""
-    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), raw.cross.copy()
+def with_products(gram: Gram, cross: np.ndarray, square: np.ndarray) -> Gram:
+    """The same derivatives with other residuals, whose inner products with columns at the knots, and with themselves, are known."""
+    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), cross.copy()
     cross[:, part] = cross[:, part] @ gram.factor
-    return replace(gram, cross=cross, square=raw.square)
+    return replace(gram, cross=cross, square=square)
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,7 @@ from visthrow.diagnose.likelihood.correlation import Correlation, correlations, 
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
 from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, Priors, covariance, estimate, log_evidence
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
-from visthrow.diagnose.likelihood.marginal import (
-    Gram,
-    Noise,
-    Statistics,
-    gather,
-    recorrelated,
-    rescored,
-)
+from visthrow.diagnose.likelihood.marginal import Gram, Noise, Statistics, gather, rescored
 from visthrow.diagnose.likelihood.threads import beside, each
 from visthrow.diagnose.models.interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
@@ -90,7 +83,6 @@ class Point:
 
     theta: np.ndarray
     windows: Sequence[Window]
-    raw: Sequence[Gram]  # latents at the knots
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
     plain: Statistics  # of flights without anything of their own
@@ -163,7 +155,7 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
     about = Linearised(sizes, {i: w if found is own else replace(o, sigma=w.sigma) for i, w, o in zip(problem.kept, kept, own)})
     said = _statistics(grams, integrals, noise, at)
-    return Point(at, kept, raw, grams, noise, said, problem.varies, integrals, about, commands, device)
+    return Point(at, kept, grams, noise, said, problem.varies, integrals, about, commands, device)
 
 
 def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -> Window:
@@ -182,7 +174,7 @@ def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
 
 def only(point: Point, windows: Sequence[int]) -> Point:
     """The same of some of its windows, with noise levels estimated from these."""
-    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "raw", "grams", "commands") if getattr(point, name)}
+    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "grams", "commands") if getattr(point, name)}
     noise = levels.maximised(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)[0]
     return regathered(point, noise=noise, **own)
 
@@ -218,15 +210,8 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
-    raw, grams = _with_residuals(problem, point, residuals)
-    at = np.array(theta, dtype=float)
-    return regathered(point, point.integrals, theta=at, windows=windows, raw=raw, grams=grams, about=about)
-
-
-def _with_residuals(problem: Problem, point: Point, residuals: Sequence[np.ndarray]) -> tuple[list[Gram], list[Gram]]:
-    """The point's grams with other residuals, with latents at the knots and correlated."""
-    raw = with_residuals(point.raw, point.windows, problem.priors.floor, residuals, point.device)
-    return raw, [recorrelated(gram, own) for gram, own in zip(point.grams, raw)]
+    grams = with_residuals(point.grams, point.windows, problem.priors.floor, residuals, point.device)
+    return regathered(point, point.integrals, theta=np.array(theta, dtype=float), windows=windows, grams=grams, about=about)
 
 
 def advantage(
@@ -254,7 +239,7 @@ def bend(problem: Problem, origin: Point, there: Point, active: Sequence[int]) -
     """
     change = problem.priors.floor * (there.theta - origin.theta)
     bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
-    _, grams = _with_residuals(problem, there, bent)
+    grams = with_residuals(there.grams, there.windows, problem.priors.floor, bent, there.device)
     total = sum(share.score for share in there.integrals.shares(grams, there.noise))
     return covariance(there.information, problem.priors.deviation(list(active))) @ total
 
