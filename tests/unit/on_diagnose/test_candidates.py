@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import point as points
 from visthrow.diagnose.select import result, search, selector, state
 from visthrow.diagnose.select.point import Problem, fitted, linearise
@@ -95,7 +94,7 @@ def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(beg
         monkeypatch.setattr(module, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
     monkeypatch.setattr(selector.Selector, "sure", lambda *_: sure)
     monkeypatch.setattr(selector.Selector, "_best", lambda *_: False)
-    problem = Problem(model, Priors.of(EFFECTS, model.channels), tuple(range(len(model.windows({})))))
+    problem = Problem(model, tuple(range(len(model.windows({})))))
     nominal = plain(problem, np.zeros(len(EFFECTS)))
     looked_at = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
     looked_at._closer(state.Move((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})

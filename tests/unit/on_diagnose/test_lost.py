@@ -8,7 +8,6 @@ import pytest
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models.laws import Term
 from visthrow.diagnose.select import result, search, selector, terms
 from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
@@ -44,7 +43,7 @@ class Spoiled(SyntheticModel):
 
 def lost_of(model) -> list[int]:
     windows = model.windows({})
-    problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(windows))))
+    problem = Problem(model, tuple(range(len(windows))))
     return lost(linearise(problem, np.zeros(len(model.effects)), windows=windows))
 
 
@@ -73,7 +72,7 @@ def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goe
 def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(active, stands):
     """Otherwise it begins anew: the window may have brought the name. Terms that were looked at on the way are left behind."""
     model = SyntheticModel(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
-    problem = Problem(model, Priors.of(tuple(model.effects), tuple(model.channels)), tuple(range(len(model.windows({})))))
+    problem = Problem(model, tuple(range(len(model.windows({})))))
     nominal = linearise(problem, np.zeros(len(EFFECTS)))
     at = selector.Selector(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
     at.point = candidate(at.problem, nominal, active)

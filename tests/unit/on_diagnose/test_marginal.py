@@ -184,7 +184,7 @@ def test_derivatives_are_laid_side_by_side_once(fitted):
 def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):
     """As linearised without the others, but for the correlation time, which all windows told."""
     model, windows = fitted[:2]
-    problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(windows))))
+    problem = Problem(model, tuple(range(len(windows))))
     left = [w for w in range(len(windows)) if windows[w].phase != windows[0].phase]
     whole = linearise(problem, np.zeros(len(EFFECTS)), windows=windows)
     part, begin = only(whole, left), noise.only(whole.noise, [whole.grams[w] for w in left], left)

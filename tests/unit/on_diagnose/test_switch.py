@@ -6,7 +6,6 @@ import numpy as np
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.config.effects import catalogue as shipped
-from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import search
 from visthrow.diagnose.select.point import Problem, fitted, linearise
 
@@ -15,7 +14,7 @@ EFFECTS = tuple(replace(e, switch=i == 3) for i, e in enumerate(catalogue(6)))
 
 def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
     model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 10.0, "effect_01": 8.0}, seed=4)
-    problem = Problem(model, Priors.of(EFFECTS, tuple(model.channels)), tuple(range(len(model.windows({})))))
+    problem = Problem(model, tuple(range(len(model.windows({})))))
     for at in (0.0, 7.0):
         point = linearise(problem, np.where(np.arange(6) == 3, at, 0.0))
         found = fitted(problem, point, [1, 3])

@@ -16,7 +16,6 @@ from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import initial_fit
 from visthrow.diagnose.throw.initial_fit import InitialFit
@@ -179,7 +178,7 @@ def test_initial_states_follow_the_effects(planted):
     """A centre of mass elsewhere needs other rotors, integrators and attitudes to begin with, or a transient hides what it does."""
     model = ThrowModel(planted[0], paper_plant(), only=["com_y"])
     windows = model.windows({})
-    problem = Problem(model, Priors.of(model.effects, tuple(model.channels)), tuple(range(len(windows))))
+    problem = Problem(model, tuple(range(len(windows))))
     nominal, there = linearise(problem, np.zeros(1), windows=windows), np.array([15.0])
     follow, behind = (moved(problem, point, there) for point in (nominal, dataclasses.replace(nominal, about=None)))
     assert curvature(problem, nominal, follow) < 0.2 * curvature(problem, nominal, behind)

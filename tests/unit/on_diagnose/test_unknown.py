@@ -212,7 +212,7 @@ DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> selector.Selector:
     """A search that has come to some names and laws."""
-    problem = Problem(model, Priors.of(model.effects, model.channels), tuple(range(len(model._windows))))
+    problem = Problem(model, tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
     if told:
         problem, (point,) = terms.extended(problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in told])

@@ -37,7 +37,6 @@ class Problem:
     """What stays the same during a search."""
 
     model: Model
-    priors: Priors
     kept: tuple[int, ...]  # windows that are looked at
     correlated: Mapping[int, Correlation] = field(default_factory=dict)  # channels whose noise is not white
     varies: Varies = field(default_factory=Varies)  # effects that differ from flight to flight, or from day to day
@@ -47,9 +46,14 @@ class Problem:
     @staticmethod
     def of(model: Model, windows: Sequence[Window], kept: Sequence[int]) -> "Problem":
         """The problem of some of a model's windows, with the correlation of their channels' noise."""
-        priors = Priors.of(tuple(model.effects), tuple(model.channels))
-        known = correlations([windows[i] for i in kept], priors.slab * priors.floor, len(model.channels))
-        return Problem(model, priors, tuple(kept), known, Varies(getattr(model, "days", ())))
+        plain = Problem(model, tuple(kept), varies=Varies(getattr(model, "days", ())))
+        slabs = plain.priors.slab * plain.priors.floor
+        return replace(plain, correlated=correlations([windows[i] for i in kept], slabs, len(model.channels)))
+
+    @cached_property
+    def priors(self) -> Priors:
+        """Of the effects."""
+        return Priors.of(self.effects, tuple(self.model.channels))
 
     @property
     def effects(self) -> tuple[Effect, ...]:

@@ -172,7 +172,6 @@ def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
 def extended(problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]) -> tuple[Problem, list[Point]]:
     """The problem and points of it with more terms as effects, at 0; nothing is simulated again, and the same derivatives are laid once."""
     wide = replace(problem, terms=(*problem.terms, *terms))
-    wide = replace(wide, priors=Priors.of(wide.effects, tuple(problem.model.channels)))
 
     def laid(window: Window, gram: Gram) -> tuple[np.ndarray, ...]:
         through = forces(window, terms)
@@ -211,8 +210,7 @@ def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """The problem and a point of it without its terms, whose shares are left out of the residuals where they are not 0."""
     if not problem.terms:
         return problem, point
-    own = replace(problem, terms=())
-    own, count = replace(own, priors=Priors.of(own.effects, tuple(problem.model.channels))), len(own.effects)
+    own, count = replace(problem, terms=()), len(problem.model.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
     more = len(problem.terms)
     grams = [replace(g, inner=g.inner[:, :-more, :-more], cross=g.cross[:, :-more]) for g in point.grams]
