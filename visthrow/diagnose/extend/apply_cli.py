@@ -1,10 +1,8 @@
 """``visthrow diagnose apply``: write the extended configuration that a diagnosis asks for."""
 
 import argparse
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from sim.params import LawParams
 from visthrow import config
 from visthrow.common.arguments import NUMBER
 from visthrow.common.errors import DiagnoseError
@@ -49,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.inputs.opening import DEFAULT_PLANT, THROW
     from visthrow.logs import BLACKBOX
     from visthrow.task import Experiment
@@ -56,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     if Path(args.diagnosis).suffix.lower() in BLACKBOX:
         if args.hover is None:
             raise DiagnoseError("a blackbox without --hover; expected the share of throttle in hover, such as --hover 0.36")
-        base, experiment = _diagnosed(args.plant or DEFAULT_PLANT)
+        plant = args.plant or DEFAULT_PLANT
+        base, experiment = _named("train", plant), config.load(Experiment, config.find("train", plant))
         atomic_write(args.out, patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay))
         config.load(Experiment, Path(args.out))
         print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
@@ -65,55 +65,30 @@ def run(args: argparse.Namespace) -> int:
         report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
-    if args.config or report.get("model", THROW) != THROW:
-        return _extend_setup(args, report)
-    found = patch.read(report, args.diagnosis)
-    patch.refuse_strange(report, args.diagnosis, found[0])
-    theta, covariance = patch.with_scatter(*found, report)
+    theta, covariance = patch.read(report, args.diagnosis)
+    model = report.get("model", THROW)
+    of_throw = model == THROW and not args.config
+    if args.laws and (why := setup.MODELS[model].lawless if model in setup.MODELS else ""):
+        raise DiagnoseError(f"{args.diagnosis}: no law can act in the model '{model}': {why}; expected no --laws")
     laws = patch.laws_of(report, args.diagnosis, args.laws)
+    if of_throw:
+        patch.refuse_strange(report, args.diagnosis, theta)
+        theta, covariance = patch.with_scatter(theta, covariance, report)
     if not theta and not laws:
-        return _nothing(report, "configuration")
+        unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
+        print(f"nothing was named{unused}; the {'configuration' if of_throw else 'setup'} stands as it is")
+        return 0
     _bear_out(report, args.anyway)
-    base, experiment = _diagnosed(_made_with(report, args, "plant"), report.get("overrides", ()))
-    content = patch.text(base, experiment, theta, covariance, args.plants, origin(report, args.diagnosis), laws)
+    folder, option, schema = ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
+    name, said = _made_with(report, args, option, folder), origin(report, args.diagnosis)
+    base = _named(folder, name)
+    diagnosed = config.load(schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ())
+    content = (patch.text(base, diagnosed, theta, covariance, args.plants, said, laws) if of_throw
+               else patch.of_setup(base, diagnosed, report, args.diagnosis, said, args.laws))  # fmt: skip
     atomic_write(args.out, content)
-    config.load(Experiment, Path(args.out))  # what was written is what training will read
-    _say(args.out, theta, laws, base)
-    return 0
-
-
-def _nothing(report: dict, what: str) -> int:
-    """Say that nothing is written."""
-    unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
-    print(f"nothing was named{unused}; the {what} stands as it is")
-    return 0
-
-
-def _say(out: str, theta: Iterable[str], laws: Sequence[LawParams], base: str) -> None:
-    """Say what was written."""
+    config.load(schema, Path(args.out))  # what was written is what training, or the next diagnosis, will read
     named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
-    print(f"{out}: {', '.join(named)} on top of {base}")
-
-
-def _extend_setup(args: argparse.Namespace, report: dict) -> int:
-    """Write the extended setup of another model than the throw."""
-    from visthrow.common.storage import atomic_write
-    from visthrow.diagnose.extend import patch
-    from visthrow.diagnose.inputs import setup
-
-    why = setup.MODELS[report["model"]].lawless if report.get("model") in setup.MODELS else ""
-    if args.laws and why:
-        raise DiagnoseError(f"{args.diagnosis}: no law can act in the model '{report['model']}': {why}; expected no --laws")
-    laws = patch.laws_of(report, args.diagnosis, args.laws)
-    if not report.get("theta") and not laws:
-        return _nothing(report, "setup")
-    _bear_out(report, args.anyway)
-    name = _made_with(report, args, "config")
-    base = _named("diagnose", name)
-    content = patch.of_setup(base, setup.load(name), report, args.diagnosis, origin(report, args.diagnosis), args.laws)
-    atomic_write(args.out, content)
-    setup.load(args.out)
-    _say(args.out, report["theta"], laws, base)
+    print(f"{args.out}: {', '.join(named)} on top of {base}")
     return 0
 
 
@@ -124,7 +99,7 @@ def _bear_out(report: dict, anyway: bool) -> None:
         raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
 
 
-def _made_with(report: dict, args: argparse.Namespace, option: str) -> str:
+def _made_with(report: dict, args: argparse.Namespace, option: str, folder: str) -> str:
     """Name of the plant or config that was diagnosed: sizes are counted from there.
 
     Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
@@ -133,17 +108,9 @@ def _made_with(report: dict, args: argparse.Namespace, option: str) -> str:
     if not (told or asked):
         model = report.get("model", "throw")
         raise DiagnoseError(f"{args.diagnosis}: a diagnosis of the model '{model}' names no {option}; expected --{option} NAME")
-    folder = {"plant": "train", "config": "diagnose"}[option]
     if told and asked and _named(folder, told) != _named(folder, asked):
         raise DiagnoseError(f"{args.diagnosis}: made with --{option} {told}; its sizes do not count from {asked}")
     return told or asked
-
-
-def _diagnosed(plant: str, overrides: Sequence[str] = ()):
-    """Name that another configuration finds the diagnosed one under, and what it says with overrides."""
-    from visthrow.task import Experiment
-
-    return _named("train", plant), config.load(Experiment, config.find("train", plant), overrides)
 
 
 def _named(folder: str, name: str) -> str:
