@@ -19,6 +19,7 @@ from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
 from visthrow.diagnose.select import held_out, point, result, search
 from visthrow.diagnose.throw.landing import Landings
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view import page
 
 SWING = str(Path(__file__).resolve().parents[2] / "data" / "real" / "pendulum_single" / "single_pendulum_id.csv.gz")
 EFFECTS = catalogue(12)
@@ -375,12 +376,12 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
 def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measured, hidden, degenerate):
     _, diagnosis = found
     made = report.sections(diagnosis, measured, hidden, step_check={"pos_w": 0.03}, about={"logs": 7})
-    paths = report.write(tmp_path, made, diagnosis, "A report")
-    page = paths[0].read_text(encoding="utf-8")
+    paths = page.write(tmp_path, "A report", report.sentence_of(diagnosis), made)
+    written = paths[0].read_text(encoding="utf-8")
     for text in ("KNOWN", "effect_03", "cause 4", "Held-out prediction error", "noise alone", "circle", "finer steps"):
-        assert text in page
-    assert page.count("data:image/png;base64") >= 6
-    assert "http" not in page.replace("http-equiv", "")  # self-contained
+        assert text in written
+    assert written.count("data:image/png;base64") >= 6
+    assert "http" not in written.replace("http-equiv", "")  # self-contained
     write_json(tmp_path / "d.json", report.to_json(diagnosis, measured, hidden))
     data = json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))
     assert {f["verdict"] for f in data["findings"]} <= set(result.VERDICTS)
@@ -412,8 +413,8 @@ def test_an_event_is_left_out_or_weighs_little(found):
     assert little.endswith("weighs little")
     assert f"flight {max(flights) + 1} " in out
     assert out.endswith("left out")
-    page = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
-    assert sum(text.startswith("**EVENT.**") for text in page) == 2
+    parts = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
+    assert sum(text.startswith("**EVENT.**") for text in parts) == 2
 
 
 def test_errors_are_told_in_millimetres(found, measured):
@@ -457,7 +458,7 @@ def test_residuals_have_units(channel, unit):
 
 def test_the_report_of_nothing_is_whole_too(tmp_path):
     diagnosis = search.explain(SyntheticModel(effects=EFFECTS, throws=3))
-    paths = report.write(tmp_path, report.sections(diagnosis), diagnosis, "Nothing")
+    paths = page.write(tmp_path, "Nothing", report.sentence_of(diagnosis), report.sections(diagnosis))
     assert "NO EFFECT" in paths[0].read_text(encoding="utf-8")
 
 

@@ -69,6 +69,11 @@ class Manoeuvre:
     release: float = np.inf  # [s] after SETTLE
     payload: bool = True
 
+    @property
+    def file(self) -> str:
+        """Name of the file that holds its reference."""
+        return "".join(c if c.isalnum() else "_" for c in self.name) + ".csv"
+
     def reference(self) -> Reference:
         """Rows from the start of the hover before it to the end of that after it."""
         time = np.arange(0.0, self.seconds - 0.5 * PERIOD, PERIOD)

@@ -6,7 +6,6 @@ the promise is the expected gap of their evidence with either as the truth, the 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -111,7 +110,7 @@ class Aim:
         separated, repeats = self.settled(new)
         separates = tuple(tuple(self.names[j] for j in group) for group in separated)
         return Proposal(manoeuvre.name, manoeuvre.purpose, manoeuvre.seconds, self.nats(new), separates, repeats,
-                        manoeuvre.reference().limits())  # fmt: skip
+                        manoeuvre.reference().limits(), manoeuvre.file)  # fmt: skip
 
 
 def propose(aim: Aim, told: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Proposal]:
@@ -197,18 +196,3 @@ def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
         if len(best[0]) == all_of_them:
             break
     return best
-
-
-def write_references(folder: str | Path, manoeuvres: Sequence[Manoeuvre], proposals: Sequence[Proposal]) -> list[Proposal]:
-    """Write each proposal's reference as CSV; returns the proposals with their files' names."""
-    from visthrow.common.storage import atomic_write
-
-    by_name, written = {m.name: m for m in manoeuvres}, []
-    for p in proposals:
-        if p.name not in by_name:  # measured on the ground
-            written.append(p)
-            continue
-        name = "".join(c if c.isalnum() else "_" for c in p.name) + ".csv"
-        atomic_write(Path(folder) / name, by_name[p.name].reference().csv())
-        written.append(replace(p, reference=name))
-    return written

@@ -112,6 +112,7 @@ def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool =
     from visthrow.common.storage import write_json
     from visthrow.diagnose.reporting import blackbox, blind, gain, recording, report
     from visthrow.diagnose.select import result
+    from visthrow.view import page
 
     measured = gain.measure(diagnosis, seed=seed)
     measured = measured if measured.channels else None  # windows of one sample have nothing ahead that could be predicted
@@ -120,7 +121,7 @@ def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool =
     origin = provenance.collect()
     about = {"logs": len(logs), "command": origin["command"], "commit": origin["commit"], "time": origin["time"]}
     made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
-    report.write(folder, made, diagnosis, "What the simulation gets wrong about these flights")
+    page.write(folder, "What the simulation gets wrong about these flights", report.sentence_of(diagnosis), made)
     table = blackbox.unexplained(diagnosis.work.after, seed) if diagnosis.overall == result.UNKNOWN else None
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)

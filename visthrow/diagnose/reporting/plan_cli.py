@@ -58,7 +58,9 @@ def run(args: argparse.Namespace) -> int:
         told.append((found.manoeuvre, found.information))
         rates = {m.name: aim.nats(information) / m.seconds for m, information in told}
         atomic_write(Path(args.out) / "plan.png", pictures.planned(found.base, found.manoeuvre, rates))
-    ranked = plan.write_references(args.out, [m for m, _ in told], plan.propose(aim, told))
+    ranked = plan.propose(aim, told)
+    for manoeuvre, _ in told:
+        atomic_write(Path(args.out) / manoeuvre.file, manoeuvre.reference().csv())
     _print(ranked)
     session = plan.session(ranked)
     if session:

@@ -1,8 +1,7 @@
 """The report of a diagnosis: one page with a sentence a finding, what it rests on and what to fly next; and the same as JSON."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -153,13 +152,6 @@ def sections(
     made += _next_flights(diagnosis)
     made.append(_ground(diagnosis, step_check, about))
     return made
-
-
-def write(folder: str | Path, made: Sequence[Section], diagnosis: Diagnosis, title: str) -> list[Path]:
-    """Write ``report.html``, ``report.md`` and the pictures. Raises ModuleNotFoundError: jinja2 is not installed."""
-    from visthrow.view import page
-
-    return page.write(Path(folder), title, sentence_of(diagnosis), made)
 
 
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:

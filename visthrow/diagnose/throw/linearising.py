@@ -113,25 +113,20 @@ def lanes_of(
     nuisances = tuple(d for d, x in enumerate(directions) if concerns(x, c))
     latents = tuple((axis, knot) for axis in range(6 if c.payload == NO_PAYLOAD else 9) for knot in range(knots))
     fine = alike | needs | whips
-    effects = np.argsort(2 * ~fine + ~alike, kind="stable")
-    derivatives = [Lane(w, 1 + int(k), w, rough=not fine[k]) for k in effects]
-    moved = [Lane(w, 0, (1 + d) * count + w, rough=not whips) for d in nuisances]
-    lanes = [Lane(w, 0, w, keep=kept, shared=int(alike.sum())), *[x for x in (*derivatives, *moved) if not x.rough]]
-    split = len(lanes)
-    lanes.append(Lane(w, 0, w, keep=kept + knots, rough=True))
-    lanes += [x for x in (*derivatives, *moved) if x.rough]
-    begin, parent = kept + knots, first + split
-    pushed = len(lanes)
-    lanes += [
-        Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=begin + max(knot - 1, 0), parent=parent, rough=True)
-        for axis, knot in latents
-    ]
-    row = np.cumsum(fine[effects]) * fine[effects] + (split + np.cumsum(~fine[effects])) * ~fine[effects]
-    at = np.empty(len(effects), dtype=int)
-    at[effects] = row
-    states = (split if whips else pushed) - len(nuisances) + np.arange(len(nuisances))
-    order = np.concatenate((at, states, pushed + np.arange(len(latents))))
-    return Plan(w, first, kept, split, order, nuisances, latents), lanes
+    effects, states = len(fine), len(nuisances)
+    split = 1 + np.count_nonzero(fine) + states * whips  # where the rough nominal lane stands, which latent lanes leave
+    columns = [(int(k), Lane(w, 1 + int(k), w, rough=not fine[k])) for k in np.argsort(~alike, kind="stable")]
+    columns += [(effects + i, Lane(w, 0, (1 + d) * count + w, rough=not whips)) for i, d in enumerate(nuisances)]
+    columns += [
+        (effects + states + i, Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=kept + knots + max(knot - 1, 0), parent=first + split,
+                                    rough=True))
+        for i, (axis, knot) in enumerate(latents)
+    ]  # fmt: skip
+    nominal = [Lane(w, 0, w, keep=kept, shared=int(alike.sum())), Lane(w, 0, w, keep=kept + knots, rough=True)]
+    parts = [[(-1, lane), *(x for x in columns if x[1].rough == lane.rough)] for lane in nominal]
+    numbers, lanes = zip(*parts[0], *parts[1])
+    order = np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
+    return Plan(w, first, kept, len(parts[0]), order, nuisances, latents), list(lanes)
 
 
 def at_knots(flights: Flights, setting: Setting, w: int, knots: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
