@@ -3,7 +3,7 @@
 Every message says what came, what was expected and what exists. The command line prints the message alone.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 
 
@@ -70,3 +70,10 @@ def suggest(name: str, known: Iterable[str]) -> str:
         near = get_close_matches(name, names, n=5, cutoff=0.0)
         listed, known = f"{', '.join(near)}; {len(names) - len(near)} more exist", "near it"
     return f"did you mean '{close[0]}'? {known.capitalize()}: {listed}" if close else f"{known}: {listed}"
+
+
+def expect_known(names: Iterable[str], known: Collection[str], said: str, error: type[VisthrowError]) -> None:
+    """Raise ``error`` for the first name that is not known; its message is ``said`` with the name in braces, and what exists."""
+    for name in names:
+        if name not in known:
+            raise error(f"{said.format(name)}; {suggest(name, known)}")

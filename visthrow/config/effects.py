@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from visthrow import config
-from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.errors import ConfigError, expect_known
 from visthrow.config import kinds
 
 FILES = ("thrust", "body", "air", "rope", "sensing", "camera", "numerics", "structure", "random")
@@ -38,7 +38,5 @@ def random_effects() -> tuple[Any, ...]:
 def chosen(names: Iterable[str]) -> dict[str, Any]:
     """Return the effects of these names; ConfigError for one that the catalogue does not hold."""
     known = catalogue()
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"no effect '{name}'; {suggest(name, known)}")
+    expect_known(names, known, "no effect '{}'", ConfigError)
     return {name: known[name] for name in names}

@@ -292,7 +292,7 @@ def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
 
 def test_mistakes_are_told(planted):
     logs, _ = planted
-    with pytest.raises(DiagnoseError, match="no effects"):
+    with pytest.raises(DiagnoseError, match="no effect '"):
         ThrowModel(logs, paper_plant(), only=["no_such"])
     with pytest.raises(DiagnoseError, match="command"):
         ThrowModel([type(logs[0])({k: v for k, v in logs[0].channels.items() if k != "command"}, {})], paper_plant())

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import laws
@@ -103,12 +104,12 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
     assert tuple(sorted(found)) == tuple(sorted(LATENT_BLOCKS))
     np.testing.assert_allclose(found["vehicle force"], -found["payload force"])
     away = knots["payload_pos_w"] - knots["pos_w"]
-    along = away - laws.rotate(knots, knots["mount_b"])
+    along = away - rotate(knots["quat_wb"], knots["mount_b"])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     for i in range(len(terms)):
-        on_vehicle = laws.rotate(knots, found["vehicle torque"][:, :, i])
+        on_vehicle = rotate(knots["quat_wb"], found["vehicle torque"][:, :, i])
         about_it = on_vehicle + np.cross(away, found["payload force"][:, :, i])
-        twist = np.einsum("ki,ki->k", laws.rotate(knots, torque_b[:, :, i]), along)[:, None] * along
+        twist = np.einsum("ki,ki->k", rotate(knots["quat_wb"], torque_b[:, :, i]), along)[:, None] * along
         np.testing.assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
 
 
@@ -224,7 +225,7 @@ def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> 
 def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     """Information and score of a column that the windows' inner products were given, and of no further simulation."""
     at = beside_a_law(SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1])
-    known = terms.knots_of(at.point)
+    known = [laws.Known(w.knots) for w in at.point.windows]
     of = terms.screen(at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
         problem, (point,) = terms.extended(at.problem, [at.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
@@ -317,7 +318,7 @@ def test_terms_are_screened_beside_what_varies(days):
     problem = Problem.of(model, model.windows({}), range(14))
     varies = Varies(days, {0: 5.0}, {4: 2.0} if days else {})
     calm, parts = terms.calmed(replace(linearise(problem, np.zeros(12)), varies=varies))
-    screen = terms.screen(calm, parts, "payload force", terms.knots_of(calm))
+    screen = terms.screen(calm, parts, "payload force", [laws.Known(w.knots) for w in calm.windows])
     for i in (0, 1, 40):
         own = terms.as_effect(screen.terms[i], 0.1, 0.0)
         _, (wide,) = terms.extended(problem, [calm], [own])

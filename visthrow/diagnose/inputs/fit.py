@@ -16,7 +16,7 @@ import numpy as np
 
 from sim.params import VehicleParams
 from visthrow import config
-from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.models.interface import Model
 from visthrow.logs.flightlog import FlightLog
@@ -59,9 +59,7 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     from visthrow.diagnose.select.point import Problem, fitted, linearise
 
     known = [effect.name for effect in model.effects]
-    for name in free:
-        if name not in known:
-            raise DiagnoseError(f"no effect '{name}' to fit; {suggest(name, known)}")
+    expect_known(free, known, "no effect '{}' to fit", DiagnoseError)
     if not free:
         raise DiagnoseError(f"nothing to fit; name effects with --free: {', '.join(known)}")
     at = [known.index(name) for name in free]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.models.interface import Effect
 
 WITHIN = 3.0  # deviations of a measurement beyond which the configured value cannot be off
@@ -38,10 +38,8 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
     ``measured``: effect -> deviation of the measurement that the configuration's value comes from, in its unit.
     Raises DiagnoseError: no effect of that name, or a deviation that is not above 0.
     """
-    known = [e.name for e in effects]
+    expect_known(measured, [e.name for e in effects], "no effect '{}' that could have been measured", DiagnoseError)
     for name, sd in measured.items():
-        if name not in known:
-            raise DiagnoseError(f"no effect '{name}' that could have been measured; {suggest(name, known)}")
         if not sd > 0.0:
             raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected one above 0")
     own = [(e, measured.get(e.name, np.inf)) for e in effects]

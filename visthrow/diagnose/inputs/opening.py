@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import WHOLE, add_common
-from visthrow.common.errors import ConfigError, DiagnoseError, suggest
+from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
 from visthrow.diagnose.models.interface import Model
 from visthrow.logs.check.run import label
 from visthrow.logs.flightlog import FlightLog
@@ -106,9 +106,7 @@ class _Part:
 
 def _only(model: Model, names: Sequence[str]) -> Model:
     known = [e.name for e in model.effects]
-    for name in names:
-        if name not in known:
-            raise DiagnoseError(f"no effect '{name}' for these logs; {suggest(name, known)}")
+    expect_known(names, known, "no effect '{}' for these logs", DiagnoseError)
     return _Part(model, [known.index(name) for name in names])
 
 

@@ -238,17 +238,13 @@ class _Dynamics:
         if self.p.cable is None:
             parts.append(force / self.mass + self.gravity)
         else:
-            parts += self._with_cable(state, vel, force, latent[1])
+            free_q, free_p, along, pull = self._pull(state, vel, force, latent[1])
+            pull_w = pull * along
+            acc_q, acc_p = free_q + pull_w / self.mass, free_p - pull_w / self.payload
+            parts += [acc_q, state[:, 9:12], acc_p - acc_q]
         if self.p.torque is not None:
             parts.append(self._turning(state[:, self.model._rate_at : self.model._rate_at + 3], self.thrust[half], total, latent[-1]))
         return np.concatenate(parts, 1)
-
-    def _with_cable(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> list[np.ndarray]:
-        """Acceleration of the vehicle, rate of the cable's vector, its acceleration."""
-        free_q, free_p, along, pull = self._pull(state, vel, force, latent)
-        pull_w = pull * along
-        acc_q, acc_p = free_q + pull_w / self.mass, free_p - pull_w / self.payload
-        return [acc_q, state[:, 9:12], acc_p - acc_q]
 
     def _pull(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> tuple[np.ndarray, ...]:
         """Accelerations without the cable, its direction, and what it pulls with [N]; it never pushes."""

@@ -20,9 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim.params import LOWEST, SLOWEST, LawParams
-from visthrow.common import rotations
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.common.rotations import cross
+from visthrow.common.rotations import cross, rotate, rotate_back
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 
 Unit = tuple[int, int, int]  # exponents of kg, m and s
@@ -117,22 +116,12 @@ def carries(latent_block: np.ndarray, block: str) -> bool:
     return set(map(LATENT_BLOCKS.index, LATENT_BLOCKS if block == JOINT else (block,))) <= set(np.unique(latent_block).tolist())
 
 
-def rotate(knots: Knots, vector_b: np.ndarray) -> np.ndarray:
-    """Body to world at the knots, shape (k, 3)."""
-    return rotations.rotate(np.asarray(knots["quat_wb"], dtype=float), vector_b)
-
-
-def rotate_back(knots: Knots, vector_w: np.ndarray) -> np.ndarray:
-    """World to body at the knots, shape (k, 3)."""
-    return rotations.rotate_back(np.asarray(knots["quat_wb"], dtype=float), vector_w)
-
-
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("ki,ki->k", a, b)
 
 
 def _axis(i: int) -> Callable[[Known], np.ndarray]:
-    return lambda k: rotate(k, np.tile(np.eye(3)[i], (len(k["quat_wb"]), 1)))
+    return lambda k: rotate(k["quat_wb"], np.tile(np.eye(3)[i], (len(k["quat_wb"]), 1)))
 
 
 def _fixed(i: int) -> Callable[[Known], np.ndarray]:
@@ -151,15 +140,15 @@ def _swing(k: Known) -> np.ndarray:
 
 def _reach(k: Known) -> np.ndarray:
     """From the mount to the payload's centre [m], world frame."""
-    return k["payload_pos_w"] - k["pos_w"] - rotate(k, k["mount_b"])
+    return k["payload_pos_w"] - k["pos_w"] - rotate(k["quat_wb"], k["mount_b"])
 
 
 def _joint_rate(k: Known) -> np.ndarray:
     """Rate of the rope against the vehicle [1/s], body frame; 0 where nothing hangs on it."""
     reach = k["reach_w"]
-    mount_vel = k["vel_w"] + rotate(k, cross(k["rate_b"], k["mount_b"]))
+    mount_vel = k["vel_w"] + rotate(k["quat_wb"], cross(k["rate_b"], k["mount_b"]))
     rope_rate = cross(reach, k["payload_vel_w"] - mount_vel) / _dot(reach, reach)[:, None]
-    return (k["tension"] > 0.0)[:, None] * (rotate_back(k, rope_rate) - k["rate_b"])
+    return (k["tension"] > 0.0)[:, None] * (rotate_back(k["quat_wb"], rope_rate) - k["rate_b"])
 
 
 def _friction(k: Known) -> np.ndarray:
@@ -182,8 +171,8 @@ DERIVED: dict[str, Callable[[Known], np.ndarray]] = {
     "quat_wb": lambda k: Rotation.from_matrix(np.stack([k[f"axis_{i}"] for i in "xyz"], axis=-1)).as_quat(),
     "axis_x": _axis(0), "axis_y": _axis(1), "axis_z": _axis(2), "slope": _slope, "swing": _swing,
     "along": lambda k: _dot(k["vel_w"], k["axis_z"]), "across": lambda k: k["vel_w"] - k["along"][:, None] * k["axis_z"],
-    "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]), "vel_b": lambda k: rotate_back(k, k["vel_w"]),
-    "cable_dir_b": lambda k: rotate_back(k, k["cable_dir_w"]), "reach_w": _reach, "joint_rate_b": _joint_rate,
+    "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]), "vel_b": lambda k: rotate_back(k["quat_wb"], k["vel_w"]),
+    "cable_dir_b": lambda k: rotate_back(k["quat_wb"], k["cable_dir_w"]), "reach_w": _reach, "joint_rate_b": _joint_rate,
 }  # fmt: skip
 """What :class:`Known` computes of the quantities at the knots."""
 
@@ -221,7 +210,7 @@ VECTORS: dict[str, dict[str, Factor]] = {
         "vel_across": Factor("v_⊥", (0, 1, -1), _MOVES, lambda k: k["across"]),
         "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(k["axis_z"], k["vel_w"])),
         "rate_cross_vel": Factor("(ω x v)", (0, 1, -2), (*_MOVES, "rate_b"),
-                                 lambda k: cross(rotate(k, k["rate_b"]), k["vel_w"])),
+                                 lambda k: cross(rotate(k["quat_wb"], k["rate_b"]), k["vel_w"])),
         "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
         "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
     },
@@ -236,7 +225,7 @@ VECTORS: dict[str, dict[str, Factor]] = {
         "axis_cross_cable": Factor("(e_z x n)", (0, 0, 0), ("cable_dir_w", "quat_wb"),
                                    lambda k: cross(_EZ, k["cable_dir_b"])),
         "axis_cross_swing": Factor("(e_z x v_s)", (0, 1, -1), (*_PAIR, "quat_wb"),
-                                   lambda k: cross(_EZ, rotate_back(k, k["swing"]))),
+                                   lambda k: cross(_EZ, rotate_back(k["quat_wb"], k["swing"]))),
     },
     "payload force": {
         "payload_vel": Factor("v_p", (0, 1, -1), ("payload_vel_w",), lambda k: k["payload_vel_w"]),

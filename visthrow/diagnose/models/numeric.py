@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sim.params import LawParams
-from visthrow.common.errors import LogError, suggest
+from visthrow.common.errors import LogError, expect_known
 from visthrow.diagnose.models.interface import Effect, Linearised, Window
 from visthrow.diagnose.models.laws import carries, term_of
 from visthrow.logs.check.signals import noise
@@ -134,9 +134,7 @@ class NumericModel(ABC):
 
     def size(self, theta: Mapping[str, float]) -> np.ndarray:
         """Sizes of all effects in order, with those it had before, shape (K,). Raises LogError for an effect that it does not know."""
-        for name in theta:
-            if name not in self.numbers:
-                raise LogError(f"no effect '{name}'; {suggest(name, self.numbers)}")
+        expect_known(theta, self.numbers, "no effect '{}'", LogError)
         return self._base + np.array([float(theta.get(name, 0.0)) for name in self.numbers])
 
     def of(self, lanes: Lanes, name: str) -> np.ndarray:

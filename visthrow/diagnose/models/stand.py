@@ -13,7 +13,7 @@ from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, laten
 from visthrow.logs.flightlog import FlightLog
 
 CHANNELS = ("thrust", "current")
-NEEDED = ("thrust", "rotor_speed", "supply_voltage", "current")
+NEEDED = ("rotor_speed", "thrust", "supply_voltage", "current")
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class StandModel(NumericModel):
 
 def settled(log: FlightLog, params: StandParams) -> np.ndarray:
     """Speed [rad/s], thrust [N], voltage [V] and current [A] of the steps that can be used, shape (N, 4)."""
-    rows = np.column_stack([log[name].values.astype(float) for name in ("rotor_speed", "thrust", "supply_voltage", "current")])
-    good = np.all([log[name].valid for name in ("rotor_speed", "thrust", "supply_voltage", "current")], axis=0)
+    rows = np.column_stack([log[name].values.astype(float) for name in NEEDED])
+    good = np.all([log[name].valid for name in NEEDED], axis=0)
     good &= (rows[:, 0] > params.lowest_speed) & (rows[:, 2] > 1.0) & (rows[:, 1] > 0.0) & (rows[:, 3] > 0.0)
     return rows[good]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance, log_evidence
 from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of
@@ -53,9 +53,7 @@ class Aim:
         work = diagnosis.work
         self.diagnosis, self.base, self.priors = diagnosis, work.after, work.problem.priors
         self.names = [e.name for e in work.problem.model.effects]
-        for name in about:
-            if name not in self.names:
-                raise DiagnoseError(f"no effect '{name}' in this diagnosis; {suggest(name, self.names)}")
+        expect_known(about, self.names, "no effect '{}' in this diagnosis", DiagnoseError)
         number = self.names.index
         classes = [f for f in diagnosis.findings if f.verdict == result.CLASS and f.name in diagnosis.theta]
         self.pairs = [(number(f.name), number(other)) for f in classes for other in f.partners if not about or {f.name, other} & set(about)]

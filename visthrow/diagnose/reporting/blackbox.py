@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visthrow.common.rotations import rotate_back
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.stack import statistics
 from visthrow.diagnose.models import laws
@@ -26,7 +27,7 @@ def _inputs(window: Window) -> np.ndarray:
     knots = window.knots
     parts = [np.zeros((len(knots.get("time", ())), 0))]
     if "vel_w" in knots:
-        parts.append(laws.rotate_back(knots, knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"])
+        parts.append(rotate_back(knots["quat_wb"], knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"])
     parts += [knots[name].reshape(len(knots[name]), -1) for name in ("rate_b", "thrust") if name in knots]
     return np.hstack(parts)
 

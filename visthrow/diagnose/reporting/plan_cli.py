@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 
 from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
-from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.common.errors import DiagnoseError, expect_known
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,9 +94,7 @@ def _chosen(names: str | None):
 
     known = {m.name: m for m in manoeuvres.catalogue()}
     chosen = names.split(",") if names else list(known)
-    for name in chosen:
-        if name not in known:
-            raise DiagnoseError(f"no manoeuvre '{name}'; {suggest(name, known)}")
+    expect_known(chosen, known, "no manoeuvre '{}'", DiagnoseError)
     return [known[name] for name in chosen]
 
 

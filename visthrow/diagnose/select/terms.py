@@ -217,11 +217,6 @@ def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     return own, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
-def knots_of(point: Point) -> list[Known]:
-    """Quantities at the knots of each window."""
-    return [Known(window.knots) for window in point.windows]
-
-
 def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float) -> list[TermEffect]:
     """The terms that say most beside a set of names, by the linear statistics.
 
@@ -229,7 +224,7 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     price.
     """
     calm, parts = calmed(point)
-    known = knots_of(point)
+    known = [Known(window.knots) for window in point.windows]
     screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
     depths = [term.depth for of in screens.values() for term in of.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
@@ -268,8 +263,9 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
     term = problem.effects[j].term
     layout = Layout.of([term])
     square: dict[tuple[int, str], list[float]] = {}
-    for window, gram, own in zip(point.windows, point.grams, knots_of(point)):
+    for window, gram in zip(point.windows, point.grams):
         if carries(gram.latent_block, term.block):
+            own = Known(window.knots)
             for block, values in loads(term.block, own, layout.table(own)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
     floors = floors_of(problem, point)

@@ -90,8 +90,7 @@ class InitialFit:
         left, promised = self.retained, np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
-        states, residuals = self._best(starts)
-        cost = self._costs(residuals)
+        states, residuals, cost = self._best(starts)
         stale, doubtful = ~aged, np.zeros(count, dtype=bool)
         for _ in range(ROUNDS):
             self.slopes |= self._slopes(states, left[stale[left]])
@@ -127,16 +126,17 @@ class InitialFit:
                 break
         return states
 
-    def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray]]:
-        """The best of each window's states, and what they leave; all are flown at once."""
+    def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray], np.ndarray]:
+        """The best of each window's states, what they leave, and its cost, shape (W,); all are flown at once."""
         retained, count = self.retained, len(self.retained)
         seen = self._residuals(stacked([rows_of(states, retained) for states in starts]), np.tile(retained, len(starts)))
-        cost = np.array([self._cost(w, residual) for w, residual in zip(np.tile(retained, len(starts)), seen)])
-        which = cost.reshape(len(starts), count).argmin(axis=0)
+        tried = np.reshape([self._cost(w, residual) for w, residual in zip(np.tile(retained, len(starts)), seen)], (len(starts), count))
+        which, cost = tried.argmin(axis=0), np.full(len(self.flights.cuts), np.inf)
+        cost[retained] = tried.min(axis=0)
         best = {name: value.copy() for name, value in starts[-1].items()}
         for name, value in best.items():
             value[retained] = np.stack([states[name][retained] for states in starts])[which, np.arange(count)]
-        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))}
+        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))}, cost
 
     def _tried(
         self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
@@ -161,13 +161,6 @@ class InitialFit:
         f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
         seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._shortened).seen
         return [self._sensitive[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
-
-    def _costs(self, residuals: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Costs of windows, infinite where there is no residual, shape (W,)."""
-        costs = np.full(len(self.flights.cuts), np.inf)
-        for w, residual in residuals.items():
-            costs[w] = self._cost(w, residual)
-        return costs
 
     def _cost(self, w: int, residual: np.ndarray) -> float:
         """Huber's cost of a window's residual; infinite where one is not finite."""

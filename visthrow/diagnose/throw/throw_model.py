@@ -16,7 +16,7 @@ from sim.effects.setting import Setting, generalised
 from sim.kernels.replay.kernel import ATTACHED
 from sim.kernels.replay.lanes import Replay
 from sim.params import PlantParams, SensingParams
-from visthrow.common.errors import DiagnoseError
+from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
@@ -86,7 +86,10 @@ class ThrowModel:
         self.channels = [*_measured(flights, carries), *channels_of(logs, flights, camera)]
         thrown = any(f.latch != NEVER for f in flights)
         concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
-        self._choose(concerned if only is None else _only(concerned, only))
+        if only is not None:
+            expect_known(only, concerned, "no effect '{}' for these flights", DiagnoseError)
+            concerned = {name: concerned[name] for name in only}
+        self._choose(concerned)
         self._directions = directions(self.setting.plant)
         self.flights = self._cut(flights, cuts)
         states, ends = self._through(self.setting)
@@ -221,13 +224,11 @@ class ThrowModel:
         count, f = len(self._retained), self.flights
         lanes = [Lane(w, s, w) for s in range(2) for w in self._retained]
         seen = f.fly(self._replay(settings), settings, self._fitted()[0], lanes, self.substep).seen
-        worst = dict.fromkeys(self.channels, 0.0)
+        worst = np.zeros(len(self.channels))
         for lane, w in enumerate(self._retained):
             off = np.abs(f.residual(seen, w, lane) - f.residual(seen, w, count + lane)) / f.sigma(w)
-            for i, name in enumerate(self.channels):
-                here = off[self._channel(w) == i]
-                worst[name] = max(worst[name], float(here.max())) if len(here) else worst[name]
-        return worst
+            np.fmax.at(worst, self._channel(w), off)
+        return dict(zip(self.channels, worst.tolist()))
 
     def landings(self, theta: Mapping[str, float], flights: Sequence[int] | None = None) -> Landings:
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
@@ -372,14 +373,6 @@ class ThrowModel:
 def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
     """The sizes that are not 0."""
     return frozenset((name, float(value)) for name, value in theta.items() if value)
-
-
-def _only(effects: Mapping[str, SettingEffect], names: Sequence[str]) -> dict[str, SettingEffect]:
-    """Return the effects of these names, in their order."""
-    unknown = [name for name in names if name not in effects]
-    if unknown:
-        raise DiagnoseError(f"no effects {unknown} for these flights; there are {', '.join(effects)}")
-    return {name: effects[name] for name in names}
 
 
 def _measured(flights: Sequence[Recorded], carries: bool) -> list[str]:
