@@ -304,7 +304,7 @@ def run(task: tuple[Case, Path]) -> dict:
 
 def _unseen(diagnosis, name: str, setup, logs: Logs, folder: Path) -> dict[str, list[float]]:
     """Errors of the plain setup and of the one that apply writes on other flights, and of noise alone."""
-    whole = report.to_json(diagnosis, extra={"model": setup.named()[0]})
+    whole = report.to_json(diagnosis, extra={"model": setup.model})
     base = str(Path(name).resolve()) if Path(name).is_file() else f"diagnose/{name}.toml"
     (folder / "extended.toml").write_text(patch.of_setup(base, setup, whole, name, ()))
     extended = setups.model_of(setups.load(folder / "extended.toml"), logs)

@@ -427,4 +427,3 @@ def test_shipped_mappings_name_channels_with_a_meaning_where_there_is_one(path):
     setup = setups.load(path.stem)
     names = [channel.name for channel in setup.table.channels]
     assert len(set(names)) == len(names)
-    assert len(setup.named()) <= 1

@@ -164,12 +164,12 @@ def of_setup(
         rank: of the explanation whose laws are written, from 1; 0 for none.
     """
     theta, covariance = read(report, path)
-    if [report.get("model", THROW)] != setup.named():
-        own = ', '.join(setup.named()) or 'none'
+    if report.get("model", THROW) != setup.model:
+        own = setup.model or "none"
         raise DiagnoseError(f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base} is {own}")
-    effects = {e.name: e for e in effects_of(setup.named()[0], getattr(setup, setup.named()[0]))}
+    effects = {e.name: e for e in effects_of(setup.model, getattr(setup, setup.model))}
     after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
-    refuse_strange(report, path, after, effects, setup.named()[0])
+    refuse_strange(report, path, after, effects, setup.model)
     laws = laws_of(report, path, rank)
     known = [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]] if rank else []
     lines = [f"# {line}" for line in provenance]

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             if row.verdict == "bad":
                 print(f"{checked.name}: {row.topic} {row.channel}: {row.text}")
     model = setups.model_of(setup, logs)
-    free = args.free or [n for n in fitting.DEFAULT_FREE.get(setup.named()[0], ()) if n in {e.name for e in model.effects}]
+    free = args.free or [n for n in fitting.DEFAULT_FREE.get(setup.model, ()) if n in {e.name for e in model.effects}]
     found = fitting.fit(model, free)
     for i, name in enumerate(found.names):
         low, high = found.interval(i)

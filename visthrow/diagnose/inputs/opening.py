@@ -42,10 +42,10 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
 
     logs = setup.read_logs(args.logs, args.config)
     chosen = setup.load(args.config) if args.config else None
-    if chosen is None or not chosen.named():
+    if chosen is None or not chosen.model:
         model, logs = throw_model(args, logs)
     elif args.overrides:
-        raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.named()[0]}")
+        raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.model}")
     else:
         model = setup.model_of(chosen, logs)
         model = _only(model, args.only.split(",")) if args.only is not None else model
@@ -61,8 +61,8 @@ def made_with(args: argparse.Namespace) -> dict[str, Any]:
     """Entries of a diagnosis' JSON that say what was diagnosed: ``apply`` builds on nothing else."""
     from visthrow.diagnose.inputs import setup
 
-    own = setup.load(args.config).named() if args.config else []
-    return {"model": own[0] if own else THROW, "plant": args.plant, "config": args.config, "overrides": args.overrides}
+    own = setup.load(args.config).model if args.config else ""
+    return {"model": own or THROW, "plant": args.plant, "config": args.config, "overrides": args.overrides}
 
 
 def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Model, list[FlightLog]]:

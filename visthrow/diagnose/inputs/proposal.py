@@ -381,22 +381,18 @@ class _Chooser:
 
     def _rates(self) -> None:
         attitude = self.made.get("quat_wb", (None, None))[1]
-        best = None
-        for group in self._open(3):
-            if not self._hinted(group, "rate_b"):
-                continue
+        ranked = []
+        for group in (g for g in self._open(3) if self._hinted(g, "rate_b")):
             found, times = None, 1.0
             if attitude is not None and len(attitude.time) > 100:
                 at, derived = relations.rates_of(*attitude.samples())
                 good = np.all(np.isfinite(group.values), axis=1)
                 found = relations.relate(at, derived, self.time[good], group.values[good], reach=0.2)
                 times = float(np.sqrt(np.mean(np.var(group.values[good], axis=0)) / max(np.mean(np.var(derived, axis=0)), 1e-12)))
-            score = found.axes_correlation if found is not None else 0.0
-            if best is None or score > best[0]:
-                best = (score, group, times)
-        if best is None:
+            ranked.append((found.axes_correlation if found is not None else 0.0, group, times))
+        if not ranked:
             return
-        score, group, times = best
+        score, group, times = max(ranked, key=lambda of: of[0])
         largest = float(np.nanpercentile(np.abs(group.values), 99))
         unit = group.unit if group.unit.endswith("/s") else "deg/s" if largest > 30.0 else "rad/s"
         why = f"99 % within {largest:.3g}"

@@ -42,14 +42,16 @@ class Setup:
     laws: tuple[LawParams, ...] = ()  # likewise
 
     def __post_init__(self) -> None:
-        if len(self.named()) > 1:
-            raise ConfigError(f"{' and '.join(self.named())}: a setup has one model")
+        named = [name for name in MODELS if getattr(self, name) is not None]
+        if len(named) > 1:
+            raise ConfigError(f"{' and '.join(named)}: a setup has one model")
         for law in self.laws:
             term_of(law)
 
-    def named(self) -> list[str]:
-        """Names of the models that have a table."""
-        return [name for name in MODELS if getattr(self, name) is not None]
+    @property
+    def model(self) -> str:
+        """Name of the model that has a table; empty where none has."""
+        return next((name for name in MODELS if getattr(self, name) is not None), "")
 
 
 def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
@@ -57,10 +59,9 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
 
     Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect or law is none of the model's.
     """
-    if not setup.named():
+    if not setup.model:
         raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
-    name = setup.named()[0]
-    model = MODELS[name](logs, getattr(setup, name))
+    model = MODELS[setup.model](logs, getattr(setup, setup.model))
     model.extend(setup.effects, setup.laws)
     return model
 

@@ -14,7 +14,7 @@ from sim.kernels.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.likelihood.transfer import to_host
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
-from visthrow.diagnose.throw.states import States, rows_of, stacked
+from visthrow.diagnose.throw.states import States, hover_state, measured_state, rows_of, stacked
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
@@ -200,15 +200,14 @@ def rough_step(setting: Setting, substep: float) -> float:
     return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
 
 
-def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: float) -> tuple[States, States]:
-    """Initial states of all windows: measured poses, and inner states carried through the windows before.
+def carried(flights: Flights, replay: Replay, setting: Setting, substep: float) -> tuple[States, States]:
+    """Initial states of all windows: smoothed measurements and, for what nobody measures, what flying through the windows before gives.
 
     Returns the states, and those at the windows' ends that they lead to.
 
     Args:
         flights: the windows, those of one flight in order of time.
         replay: whose row 0 is the setting.
-        begin: function ``(flight, cut, inner or None)`` -> one state, with ``inner`` the end of the window before.
         substep: largest integration step [s].
     """
     by_flight: dict[int, list[int]] = {}
@@ -220,9 +219,12 @@ def carried(flights: Flights, replay: Replay, setting: Setting, begin, substep: 
         now = [ws[k] for ws in by_flight.values() if k < len(ws)]
         for w in now:
             c = flights.cuts[w]
-            before = by_flight[c.flight][k - 1] if k else None
+            flight, before = flights.flights[c.flight], by_flight[c.flight][k - 1] if k else None
             gap = before is None or c.start > flights.cuts[before].end + 1e-6  # in which the inner states have gone
-            states[w] = begin(flights.flights[c.flight], c, None if gap else ends[before])
+            inner = hover_state(flight, setting.plant, c.payload) if gap else ends[before]
+            states[w] = measured_state(flight, c.start, setting, c.payload, inner)
+            if gap:
+                states[w]["gyro"] = states[w]["rate_b"].copy()
         lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
         flown = flights.fly(replay, [setting], stacked([states[w] for w in now]), lanes, substep)
         for row, w in enumerate(now):

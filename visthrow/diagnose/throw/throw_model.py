@@ -29,17 +29,7 @@ from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
 from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
-from visthrow.diagnose.throw.states import (
-    Direction,
-    States,
-    concerns,
-    directions,
-    hover_state,
-    measured_state,
-    moved_along,
-    resampled,
-    rows_of,
-)
+from visthrow.diagnose.throw.states import Direction, States, concerns, directions, moved_along, resampled, rows_of
 from visthrow.logs.flightlog import FlightLog
 
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
@@ -251,19 +241,8 @@ class ThrowModel:
         return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=download)
 
     def _through(self, setting: Setting) -> tuple[States, States]:
-        """Initial states from smoothed measurements and, for what nobody measures, from flying through the windows before.
-
-        Returns the states, and those at the windows' ends.
-        """
-
-        def begin(flight, c, inner):
-            start = hover_state(flight, setting.plant, c.payload) if inner is None else inner
-            state = measured_state(flight, c.start, setting, c.payload, start)
-            if inner is None:
-                state["gyro"] = state["rate_b"].copy()
-            return state
-
-        return carried(self.flights, self._replay([setting]), setting, begin, self.substep)
+        """See :func:`visthrow.diagnose.throw.replay.carried`."""
+        return carried(self.flights, self._replay([setting]), setting, self.substep)
 
     def _initial_fit(self, setting: Setting) -> InitialFit:
         """What fits initial states in a setting."""
