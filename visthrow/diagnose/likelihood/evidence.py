@@ -121,17 +121,7 @@ def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active
     ``information``: shape (K, K); ``score``: shape (K,) or (n, K).
     Returns nats, of the score's shape.
     """
-    sigma = covariance(information, priors.deviation(active))
-    mean, variance = score @ sigma, np.diag(sigma)
-    out = ~priors.visible
-    out[list(active)] = True
-    change = priors.slab**-2.0 - SPIKE**-2.0
-    left = np.where(out, 1.0, 1.0 + change * variance)
-    gain = -np.log(priors.slab / SPIKE) - 0.5 * np.log(left) - 0.5 * change * mean**2 / left
-    wide_mean, wide_sd = mean / left, np.sqrt(variance / left)
-    inside = _log_mass(wide_mean, wide_sd, priors.low, priors.high)
-    gain = gain + inside - _log_mass(np.zeros_like(priors.low), priors.slab, priors.low, priors.high)
-    return np.where(out, -np.inf, gain)
+    return _naming(information, score, priors, active, np.arange(len(priors.floor))[:, None])
 
 
 def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
@@ -139,22 +129,27 @@ def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, a
 
     Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
     """
-    size, diagonal = len(score), np.eye(2)
+    size = len(score)
     pairs = np.stack(np.divmod(np.arange(size * size), size), axis=1)
+    gain = _naming(information, score, priors, active, pairs)
+    return np.where(pairs[:, 0] == pairs[:, 1], -np.inf, gain).reshape(size, size)
+
+
+def _naming(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...], at: np.ndarray) -> np.ndarray:
+    """Gain of log Z by naming several effects more, for P sets of them; ``at``: their numbers, shape (P, m)."""
     sigma = covariance(information, priors.deviation(active))
-    mean, change = (score @ sigma)[pairs], (priors.slab**-2.0 - SPIKE**-2.0)[pairs]
-    own = sigma[pairs[:, :, None], pairs[:, None]]
-    taken = np.linalg.inv(own + diagonal / change[:, None])
-    wide_mean = mean - (own @ taken @ mean[..., None])[..., 0]
+    mean, change = (score @ sigma)[..., at], (priors.slab**-2.0 - SPIKE**-2.0)[at]
+    own, unit = sigma[at[:, :, None], at[:, None]], np.eye(at.shape[1])
+    taken = np.linalg.inv(own + unit / change[:, None])
+    wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", own, taken, mean, optimize=True)
     wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
-    gain = -np.log(priors.slab / SPIKE)[pairs].sum(1) - 0.5 * np.linalg.slogdet(diagonal + change[..., None] * own)[1]
-    gain -= 0.5 * np.einsum("pi,pij,pj->p", mean, taken, mean)
-    low, high, slab = priors.low[pairs], priors.high[pairs], priors.slab[pairs]
-    gain += (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(1)
+    gain = -np.log(priors.slab / SPIKE)[at].sum(1) - 0.5 * np.linalg.slogdet(unit + change[..., None] * own)[1]
+    gain = gain - 0.5 * np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
+    low, high, slab = priors.low[at], priors.high[at], priors.slab[at]
+    gain = gain + (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(-1)
     out = ~priors.visible
     out[list(active)] = True
-    gain[out[pairs].any(1) | (pairs[:, 0] == pairs[:, 1])] = -np.inf
-    return gain.reshape(size, size)
+    return np.where(out[at].any(1), -np.inf, gain)
 
 
 def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:

@@ -218,18 +218,15 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     return regathered(point, point.integrals, theta=np.array(theta, dtype=float), windows=windows, grams=grams, about=about)
 
 
-def advantage(
-    priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]], switches: np.ndarray | None = None
-) -> float:
+def advantage(priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]], switches: np.ndarray) -> float:
     """Nats by which the first set of effects is ahead, each set at whichever of both points suits it better.
 
     The noise levels of a point were estimated without the floors; a set may do better with the levels of another set. Between
     points that fly different kinds of blocks there is no such choice: neither's derivatives hold for the other.
-    ``switches``: which effects are another kind of block, shape (K,), bool; default: none.
+    ``switches``: which effects are another kind of block, shape (K,), bool.
     """
     points = first[0], second[0]
-    kinds = [np.zeros(0) if switches is None else point.theta[switches] != 0.0 for point in points]
-    if not np.array_equal(*kinds):
+    if not np.array_equal(*(point.theta[switches] != 0.0 for point in points)):
         return first[0].evidence(priors, first[1]) - second[0].evidence(priors, second[1])
     ahead, behind = (max(point.evidence(priors, active) for point in points) for active in (first[1], second[1]))
     return ahead - behind

@@ -74,7 +74,8 @@ class InitialFit:
         ]  # directions in which windows' initial states are fitted
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
-        self._spreads: dict[int, tuple[float, np.ndarray]] = {}  # and the samples' deviation with these
+        # deviation of each window's samples from a flight without gusts: noise, and how far gusts may have led by then
+        self._spreads = [np.hypot(flights.sigma(w), own) for w, own in enumerate(self._drift)]
         self._scales: dict[int, tuple] = {}  # the last slopes and deviations of a window, and what comes of them
         self._sensitive, ends = zip(*[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))])
         self._shortened = flights.ended(ends)
@@ -164,17 +165,9 @@ class InitialFit:
 
     def _cost(self, w: int, residual: np.ndarray) -> float:
         """Huber's cost of a window's residual; infinite where one is not finite."""
-        off = np.abs(residual) / self._spread(w)
+        off = np.abs(residual) / self._spreads[w]
         cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
         return cost if np.isfinite(cost) else np.inf
-
-    def _spread(self, w: int) -> np.ndarray:
-        """Deviation of a window's samples from a flight without gusts: noise, and how far gusts may have led by then."""
-        gusts, spread = self._spreads.get(w, (np.nan, None))
-        if gusts != self._gusts[w]:
-            spread = np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
-            self._spreads[w] = float(self._gusts[w]), spread
-        return spread
 
     def _lower_gusts(self, w: int, residual: np.ndarray) -> bool:
         """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
@@ -184,6 +177,7 @@ class InitialFit:
         if not calmer:
             return False
         self._gusts[w] = min(calmer)
+        self._spreads[w] = np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
         return True
 
     def _slopes(self, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
@@ -207,7 +201,7 @@ class InitialFit:
 
     def _scaled(self, w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Prior deviations of a window's state, its derivatives in these and the samples' deviations, and their inner products."""
-        slopes, spread = self.slopes[w], self._spread(w)
+        slopes, spread = self.slopes[w], self._spreads[w]
         known = self._scales.get(w)
         if known is None or known[0] is not slopes or known[1] is not spread:
             sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in self._free[w]])
@@ -224,7 +218,7 @@ class InitialFit:
         Returns steps, shape (T, directions); falls of the cost, shape (T,).
         """
         ds, (sd, scaled, bend) = self._free[w], self._scaled(w)
-        off = residual / self._spread(w)
+        off = residual / self._spreads[w]
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         if np.any(weight < 1.0):
             bend = scaled.T @ (scaled * weight[:, None])
