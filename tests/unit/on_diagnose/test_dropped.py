@@ -36,13 +36,13 @@ def test_a_column_is_what_the_missing_command_changes():
     inside = np.flatnonzero((np.append(acts[1:], np.inf) > c.start) & (acts < c.end) & (np.arange(len(acts)) > 0))
     assert columns[len(columns) // 2].shape[1] == len(inside)
     lane, largest = [Lane(w, 0, w, rough=True)], 0.0
-    replay = model._replay([setting])
-    plain = flights.fly(replay, [setting], states, lane, model.substep).seen
+    simulation = model.simulation(setting)
+    plain = flights.fly(simulation, states, lane).seen
     for column, k in zip(columns[len(columns) // 2].T[::9], inside[::9]):
         sent = flights.recording.data["command"].copy()
         sent[first + k] = sent[first + k - 1]
         recording = Recording(flights.recording.windows, flights.recording.data | {"command": sent})
-        seen = flights.fly(replay, [setting], states, lane, model.substep, recording).seen
+        seen = flights.fly(simulation, states, lane, recording).seen
         change = (seen - plain)[: int(flights.rows[w]), 0].ravel()
         np.testing.assert_allclose(column, change, atol=1e-12)
         largest = max(largest, np.abs(change).max())

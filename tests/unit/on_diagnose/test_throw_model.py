@@ -151,7 +151,7 @@ def test_one_throw_s_landing_rests_on_what_was_fitted_to_all(monkeypatch):
     alone = ThrowModel(logs, paper_plant(), only=list(PLANTED)).landings(wrong, [1])
     model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
     model.landings({})
-    monkeypatch.setattr(InitialFit, "fit", lambda self, *a: fits.append(self.setting) or fit(self, *a))
+    monkeypatch.setattr(InitialFit, "fit", lambda self, *a: fits.append(self.simulation.settings[0]) or fit(self, *a))
     among = model.landings(wrong, [1])
     assert model.setting not in fits
     assert len(fits) == 2  # before the throw, and up to the separation

@@ -8,28 +8,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim.effects.setting import Setting
-from sim.kernels.replay.lanes import Recording, Replay
-from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Flights, Lane, downloaded
+from sim.kernels.replay.lanes import Recording
+from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Flights, Lane, Simulation
 from visthrow.diagnose.throw.states import States
 
 
 def without_each_command(
-    flights: Flights, windows: Sequence[int], known: float, setting: Setting, states: States, substep: float, device: str
+    flights: Flights, windows: Sequence[int], known: float, simulation: Simulation, states: States
 ) -> list[np.ndarray]:
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
     ``windows``: their numbers; ``known``: delay of the commands by which those that act in a window are told [s]: their number is the same
-    in all settings; ``substep``: largest integration step [s]. Returns for each of these windows, shape (N, T), with the T commands that
-    differ from the one before.
+    in all settings; ``simulation``: of one setting.
+    Returns for each of these windows, shape (N, T), with the T commands that differ from the one before.
     """
-    replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
     commands = [_acting(flights, w, known) for w in windows]
     found, first = [], 0
     while first < len(windows):
         fits = int(np.searchsorted(np.cumsum([1 + len(own) for own in commands[first:]]), BATCH, "right"))
         part = slice(first, first + max(fits, 1))
-        found += _flown(flights, windows[part], commands[part], replay, setting, states, substep)
+        found += _flown(flights, windows[part], commands[part], simulation, states)
         first = part.stop
     return found
 
@@ -44,15 +42,14 @@ def _acting(flights: Flights, w: int, delay: float) -> np.ndarray:
 
 
 def _flown(
-    flights: Flights, windows: Sequence[int], commands: Sequence[np.ndarray], replay: Replay, setting: Setting, states: States,
-    substep: float,
-) -> list[np.ndarray]:  # fmt: skip
+    flights: Flights, windows: Sequence[int], commands: Sequence[np.ndarray], simulation: Simulation, states: States
+) -> list[np.ndarray]:
     """Of a few windows: a lane with all commands, then one without each of them, which leaves the first at the knot before."""
     lanes, times, sent, run, kept = [], [], [], [], 0
     for w, own in zip(windows, commands):
         f = flights.flights[flights.cuts[w].flight]
         part = slice(max(own.min(initial=1) - 1, 0), own.max(initial=len(f.command_time) - 2) + 2)
-        acts = f.command_time[own] + setting.plant.vehicle.queue.delay
+        acts = f.command_time[own] + simulation.settings[0].plant.vehicle.queue.delay
         knots = np.clip((acts - flights.cuts[w].start) // KNOT_SPACING, 0, flights.knots[w] - 2).astype(int)  # the last is the end
         whole = len(lanes)
         run.append(Lane(whole, 0, w, keep=kept, rough=True))
@@ -69,7 +66,7 @@ def _flown(
     fields = {name: values[at] for name, values in flights.recording.windows.items()}
     fields |= {"command_first": np.append(0, ends[:-1]), "command_last": ends}
     data = flights.recording.data | {"command_time": np.concatenate(times), "command": np.concatenate(sent)}
-    seen = flights.repeated(at).fly(replay, [setting], states, run, substep, Recording(fields, data)).seen
+    seen = flights.repeated(at).fly(simulation, states, run, Recording(fields, data)).seen
     found, first = [], 0
     for w, own in zip(windows, commands):
         part = seen[: int(flights.rows[w]), first : first + len(own) + 1]

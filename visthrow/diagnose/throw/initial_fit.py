@@ -9,13 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED
-from sim.kernels.replay.lanes import Replay
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
-from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
-from visthrow.diagnose.throw.states import Direction, States, concerns, moved_along, rows_of, stacked
+from visthrow.diagnose.throw.replay import Flights, Lane, Simulation
+from visthrow.diagnose.throw.states import Direction, States, concerns, directions, moved_along, rows_of, stacked
 
 DAMPING, DAMPING_MOST = 1e-3, 1e5  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
 ROUNDS = 25
@@ -56,21 +54,13 @@ class _Trial:
 class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
-    def __init__(
-        self, flights: Flights, retained: np.ndarray, directions: tuple[Direction, ...], setting: Setting, *, lag: float, substep: float,
-        device: str,
-    ):  # fmt: skip
-        """Make ready.
-
-        ``directions``: in which states may be wrong; ``lag``: of the release, as far as known [s]; ``substep``: largest integration step
-        [s].
-        """
-        self.flights, self.retained, self.directions, self.setting = flights, retained, directions, setting
-        self.substep = substep
+    def __init__(self, flights: Flights, retained: np.ndarray, simulation: Simulation, lag: float):
+        """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far as known [s]."""
+        self.flights, self.retained, self.simulation = flights, retained, simulation
+        self.directions = directions(simulation.settings[0].plant)
         self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
-        self.replay = Replay([setting.plant], [setting.sensing], device, download=downloaded)
         self._free = [
-            [d for d, x in enumerate(directions) if concerns(x, cut) and x.field not in TRUSTED] for cut in flights.cuts
+            [d for d, x in enumerate(self.directions) if concerns(x, cut) and x.field not in TRUSTED] for cut in flights.cuts
         ]  # directions in which windows' initial states are fitted
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
@@ -160,7 +150,7 @@ class InitialFit:
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
         """Residuals of windows, of what depends on their initial states; a row of the states for each."""
         f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
-        seen = f.fly(self.replay, [self.setting], states, lanes, self.substep, self._shortened).seen
+        seen = f.fly(self.simulation, states, lanes, self._shortened).seen
         return [self._sensitive[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
 
     def _cost(self, w: int, residual: np.ndarray) -> float:
@@ -190,7 +180,7 @@ class InitialFit:
             first.append(len(lanes))
             lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]]]
         there = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
-        seen = self.flights.fly(self.replay, [self.setting], there, lanes, self.substep, self._shortened).seen
+        seen = self.flights.fly(self.simulation, there, lanes, self._shortened).seen
         slopes = {}
         for at, w in zip(first, which):
             ds, rows = self._free[w], int(self.flights.rows[w])

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from sim.kernels.replay.kernel import ATTACHED
-from sim.kernels.replay.lanes import Replay
 from visthrow.diagnose.throw.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
-from visthrow.diagnose.throw.replay import Flights, Lane, downloaded
+from visthrow.diagnose.throw.replay import Flights, Lane
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]
 HEAD = 0.4  # of it, over which the initial state is fitted [s]
@@ -112,8 +111,7 @@ def _fly(model: Any, theta: Mapping[str, float], spans: Mapping[int, tuple[float
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
     onward = Flights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
-    replay = Replay([setting.plant], [setting.sensing], model.device, download=downloaded)
-    seen = onward.fly(replay, [setting], states, lanes, model.substep).seen
+    seen = onward.fly(model.simulation(setting), states, lanes).seen
     out = np.full((len(flown), 3), np.nan)
     for i, c in enumerate(flown):
         first, count = 2 * int(onward.windows["vehicle_count"][i]), int(onward.windows["payload_count"][i])

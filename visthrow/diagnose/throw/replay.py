@@ -1,9 +1,9 @@
 """Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes of a batch share."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -23,6 +23,39 @@ FINEST = 0.01  # of the square of the step: a tenth of the step asked for
 ROUGHER = 3.0  # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
 STABLE = 1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
 BATCH, CUDA_BATCH = 4096, 32768  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
+
+
+def downloaded(array: wp.array) -> np.ndarray:
+    """What a replay has written, on the host."""
+    return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
+
+
+def rough_step(setting: Setting, substep: float) -> float:
+    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest lag allows."""
+    controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
+    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind != "geometric" else []
+    lags += [motor.time_constant] if motor.kind != "instant" else []
+    lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
+    nominal = substep * np.sqrt(max(setting.step_square, FINEST))
+    longer = substep * np.sqrt(max(setting.step_square, FINEST) + ROUGHER)
+    return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
+
+
+class Simulation:
+    """Plants and sensors that lanes are flown with.
+
+    Attributes:
+        settings: a lane names its by the row.
+    """
+
+    def __init__(self, settings: Sequence[Setting], substep: float, device: str, download: Callable[[wp.array], Any] = downloaded):
+        """Move them to a device.
+
+        ``substep``: largest integration step [s]; ``download``: makes of the device's arrays what flights return.
+        """
+        self.settings = list(settings)
+        self.replay = Replay([s.plant for s in settings], [s.sensing for s in settings], device, download=download)
+        self.steps = np.array([(substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep)) for s in settings])
 
 
 class Lane(NamedTuple):
@@ -152,26 +185,20 @@ class Flights:
             self._known["measured", w] = measured
         return (self._known["measured", w] - seen[: int(self.rows[w]), lane]).ravel()
 
-    def fly(
-        self, replay: Replay, settings: Sequence[Setting], states: States, lanes: Sequence[Lane], substep: float,
-        recording: Recording | None = None,
-    ) -> Replayed:  # fmt: skip
-        """Fly lanes; ``settings`` are those of the replay's rows.
+    def fly(self, simulation: Simulation, states: States, lanes: Sequence[Lane], recording: Recording | None = None) -> Replayed:
+        """Fly lanes.
 
         Args:
-            replay: built of the settings' plants and sensings.
-            settings: whose step sizes count.
+            simulation: whose settings the lanes choose from.
             states: initial states that the lanes choose from.
             lanes: at most some thousand, for the memory's sake.
-            substep: largest integration step [s].
             recording: the windows, if not as they are.
         """
         given = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
-        steps = np.array([(substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep)) for s in settings])
-        given["substep"] = steps[given["plant"], given.pop("rough").astype(int)] * self._fineness[given["window"]]
+        given["substep"] = simulation.steps[given["plant"], given.pop("rough").astype(int)] * self._fineness[given["window"]]
         kept = given["keep"] >= 0
         knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
-        return replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)
+        return simulation.replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)
 
     def repeated(self, windows: np.ndarray) -> "Flights":
         """The same as it concerns :meth:`fly`, of windows that stand there more than once."""
@@ -184,32 +211,13 @@ class Flights:
         return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
 
 
-def downloaded(array: wp.array) -> np.ndarray:
-    """What a replay has written, on the host."""
-    return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
-
-
-def rough_step(setting: Setting, substep: float) -> float:
-    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest lag allows."""
-    controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
-    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind != "geometric" else []
-    lags += [motor.time_constant] if motor.kind != "instant" else []
-    lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
-    nominal = substep * np.sqrt(max(setting.step_square, FINEST))
-    longer = substep * np.sqrt(max(setting.step_square, FINEST) + ROUGHER)
-    return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
-
-
-def carried(flights: Flights, replay: Replay, setting: Setting, substep: float) -> tuple[States, States]:
+def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
     """Initial states of all windows: smoothed measurements and, for what nobody measures, what flying through the windows before gives.
 
+    ``flights``: the windows, those of one flight in order of time; ``simulation``: of one setting.
     Returns the states, and those at the windows' ends that they lead to.
-
-    Args:
-        flights: the windows, those of one flight in order of time.
-        replay: whose row 0 is the setting.
-        substep: largest integration step [s].
     """
+    (setting,) = simulation.settings
     by_flight: dict[int, list[int]] = {}
     for w, c in enumerate(flights.cuts):
         by_flight.setdefault(c.flight, []).append(w)
@@ -226,7 +234,7 @@ def carried(flights: Flights, replay: Replay, setting: Setting, substep: float) 
             if gap:
                 states[w]["gyro"] = states[w]["rate_b"].copy()
         lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
-        flown = flights.fly(replay, [setting], stacked([states[w] for w in now]), lanes, substep)
+        flown = flights.fly(simulation, stacked([states[w] for w in now]), lanes)
         for row, w in enumerate(now):
             ends[w] = {name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()}
     return stacked(states), stacked(ends)

@@ -14,7 +14,6 @@ from camera.params import CameraParams
 from sim.effects.effect import SettingEffect, apply
 from sim.effects.setting import Setting, generalised
 from sim.kernels.replay.kernel import ATTACHED
-from sim.kernels.replay.lanes import Replay
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.likelihood.threads import aside, each
@@ -28,7 +27,7 @@ from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
-from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, carried, downloaded
+from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, Simulation, carried, downloaded
 from visthrow.diagnose.throw.states import Direction, States, concerns, directions, moved_along, resampled, rows_of
 from visthrow.logs.flightlog import FlightLog
 
@@ -113,12 +112,14 @@ class ThrowModel:
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
         states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
-        steps = [self._step(e, theta.get(e.name, 0.0)) for e in self._graded]
-        settings = [setting, *[e.apply(setting, step) for e, step in zip(self._graded, steps)]]
-        replay, begun = self._replay(settings, download=wp.to_torch), perturbed(states, self._directions)
+        entries = self.entries.values()
+        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
+        settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
+        graded, begun = len(self._graded), perturbed(states, self._directions)
+        simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
         found: list[Window] = []
         for batch in self._batches():
-            found += self._linearised(replay, settings, np.array(steps), begun, batch)
+            found += self._linearised(simulation, steps[:graded], begun, batch)
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, found)
@@ -129,11 +130,6 @@ class ThrowModel:
                 dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
                 for i, w in enumerate(found)
             ]
-        if not self._direct:
-            return found
-        entries = list(self.entries.values())
-        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
-        settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
         return [with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._retained, found)]
 
     def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
@@ -144,22 +140,22 @@ class ThrowModel:
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = {**theta, e.name: 0.0 if on else 1.0}
         other = apply(self.entries, self.setting, elsewhere)
-        lanes = [Lane(w, 0, w) for w in self._retained]
         start = self._latest[self._switches(elsewhere)] = self._settled(other)
-        seen = self.flights.fly(self._replay([other]), [other], start, lanes, self.substep).seen
         sign = -1.0 if on else 1.0
-        return [sign * (x.residual - self.flights.residual(seen, w, lane)) for lane, (w, x) in enumerate(zip(self._retained, windows))]
+        return [sign * (x.residual - there) for x, there in zip(windows, self._flown(other, start))]
+
+    def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
+        """Residuals of all windows' replayed samples in a setting."""
+        seen = self.flights.fly(self.simulation(setting), states, [Lane(w, 0, w) for w in self._retained]).seen
+        return [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
 
     def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled last with the same kinds of blocks."""
         setting = apply(self.entries, self.setting, theta)
-        lanes = [Lane(w, 0, w) for w in self._retained]
         states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
         if about is not None:
             states, moves = self._following(setting, theta, about)
-        states = resampled(states, setting.plant.rope.segments)
-        seen = self.flights.fly(self._replay([setting]), [setting], states, lanes, self.substep).seen
-        flown = [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
+        flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
         held = [[(kind, kind.samples(w)[1]) for kind in self._direct] for w in self._retained]
         direct = [[x - kind.predicted(w, setting) for kind, x in own if len(x)] for w, own in zip(self._retained, held)]
         full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
@@ -172,7 +168,7 @@ class ThrowModel:
         """
         setting = apply(self.entries, self.setting, theta)
         states, known = self._settled_at.get(_key(theta), self._fitted()[0]), self.setting.plant.vehicle.queue.delay
-        return without_each_command(self.flights, self._retained[list(windows)], known, setting, states, self.substep, self.device)
+        return without_each_command(self.flights, self._retained[list(windows)], known, self.simulation(setting), states)
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
@@ -210,14 +206,9 @@ class ThrowModel:
     def step_error(self, finer: int = 4) -> dict[str, float]:
         """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
-        settings = [self.setting, fine]
-        count, f = len(self._retained), self.flights
-        lanes = [Lane(w, s, w) for s in range(2) for w in self._retained]
-        seen = f.fly(self._replay(settings), settings, self._fitted()[0], lanes, self.substep).seen
-        worst = np.zeros(len(self.channels))
-        for lane, w in enumerate(self._retained):
-            off = np.abs(f.residual(seen, w, lane) - f.residual(seen, w, count + lane)) / f.sigma(w)
-            np.fmax.at(worst, self._channel(w), off)
+        worst, states = np.zeros(len(self.channels)), self._fitted()[0]
+        for w, plain, other in zip(self._retained, self._flown(self.setting, states), self._flown(fine, states)):
+            np.fmax.at(worst, self._channel(w), np.abs(plain - other) / self.flights.sigma(w))
         return dict(zip(self.channels, worst.tolist()))
 
     def landings(self, theta: Mapping[str, float], flights: Sequence[int] | None = None) -> Landings:
@@ -237,19 +228,17 @@ class ThrowModel:
         setting = apply(self.entries, self.setting, theta)
         return setting, self._settled(setting)
 
-    def _replay(self, settings: Sequence[Setting], download: Callable[[wp.array], Any] = downloaded) -> Replay:
-        return Replay([s.plant for s in settings], [s.sensing for s in settings], self.device, download=download)
+    def simulation(self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded) -> Simulation:
+        """Settings ready to be flown in, with this model's steps."""
+        return Simulation(settings, self.substep, self.device, download)
 
     def _through(self, setting: Setting) -> tuple[States, States]:
         """See :func:`visthrow.diagnose.throw.replay.carried`."""
-        return carried(self.flights, self._replay([setting]), setting, self.substep)
+        return carried(self.flights, self.simulation(setting))
 
     def _initial_fit(self, setting: Setting) -> InitialFit:
         """What fits initial states in a setting."""
-        return InitialFit(
-            self.flights, self._retained, directions(setting.plant), setting, lag=self.setting.plant.release.lag, substep=self.substep,
-            device=self.device,
-        )  # fmt: skip
+        return InitialFit(self.flights, self._retained, self.simulation(setting), self.setting.plant.release.lag)
 
     def _fitted(self, states: States | None = None) -> tuple[States, dict[int, np.ndarray]]:
         """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by them; of the same windows, once."""
@@ -299,10 +288,8 @@ class ThrowModel:
             room -= lanes
         return batches
 
-    def _linearised(
-        self, replay: Replay, settings: list[Setting], steps: np.ndarray, states: States, batch: list[int]
-    ) -> list[Window]:
-        f, needs = self.flights, np.array([exact(e) for e in self._graded], dtype=bool)
+    def _linearised(self, simulation: Simulation, steps: np.ndarray, states: States, batch: list[int]) -> list[Window]:
+        f, settings, needs = self.flights, simulation.settings, np.array([exact(e) for e in self._graded], dtype=bool)
         plans, lanes, kept = [], [], 0
         known: dict[tuple, np.ndarray] = {}
         for w in batch:
@@ -312,7 +299,7 @@ class ThrowModel:
             plans.append(plan)
             lanes += own
             kept += 2 * int(f.knots[w])
-        flown = f.fly(replay, settings, states, lanes, self.substep)
+        flown = f.fly(simulation, states, lanes)
 
         def slopes(plan: Plan) -> list[torch.Tensor]:
             return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
