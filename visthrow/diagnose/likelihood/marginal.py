@@ -198,8 +198,13 @@ def check(window: Window, effects: int, channels: int) -> None:
         raise DiagnoseError(f"{where}: {n} residuals and {effects} effects, but {wrong or window.effects.shape}")
     if n and (window.channel.max() >= channels or not np.all(window.sigma > 0.0)):
         raise DiagnoseError(f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0")
-    if not all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent)):
+    if not finite(window):
         raise DiagnoseError(f"{where}: a residual or a derivative is not finite")
+
+
+def finite(window: Window) -> bool:
+    """Whether a window was simulated."""
+    return all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent))
 
 
 def correlated(gram: Gram, window: Window, time: float) -> Gram:

@@ -9,8 +9,9 @@ import numpy as np
 from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
+from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import each, keep
-from visthrow.diagnose.models.interface import Model, Window
+from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
 from visthrow.diagnose.select.result import Diagnosis
@@ -108,11 +109,6 @@ def ahead(model: Model, other: Model) -> float:
         problem = Problem.of(m, own, [number[key] for key in shared])
         value.append(linearise(problem, np.zeros(len(m.effects)), windows=own).evidence(problem.priors, ()))
     return value[0] - value[1]
-
-
-def finite(window: Window) -> bool:
-    """Whether a window was simulated."""
-    return all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent))
 
 
 def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:

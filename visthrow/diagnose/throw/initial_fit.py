@@ -257,12 +257,5 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
 
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
-    count, out = len(states["pos_w"]), stacked([states] * (1 + len(directions)))
-    for field in dict.fromkeys(d.field for d in directions):
-        own = [d for d, direction in enumerate(directions) if direction.field == field]
-        rows = ((1 + np.array(own))[:, None] * count + np.arange(count)).ravel()
-        steps = np.repeat(np.diag([directions[d].step for d in own]), count, axis=0)
-        there = moved_along(rows_of(out, rows), [directions[d] for d in own], steps)
-        for name, value in there.items():
-            out[name][rows] = value
-    return out
+    count = len(states["pos_w"])
+    return stacked([states, *(moved_along(states, [d], np.full((count, 1), d.step)) for d in directions)])
