@@ -290,7 +290,7 @@ def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
 
 def _between(channel: Channel, start: float, end: float) -> Channel:
     keep = (channel.time >= start) & (channel.time <= end)
-    return dataclasses.replace(channel, time=channel.time[keep], values=channel.values[keep], valid=channel.valid[keep])
+    return channel.only(keep)
 
 
 def hidden_text(record: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ vehicle, so that whatever reads one reads them all.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +84,10 @@ class Channel:
             raise LogError(f"frame '{self.frame}'; {suggest(self.frame, FRAMES)}")
         for name, array in (("time", time), ("values", values), ("valid", valid)):
             object.__setattr__(self, name, array)
+
+    def only(self, keep: np.ndarray) -> "Channel":
+        """Return some of the samples; ``keep``: shape (T,), bool."""
+        return replace(self, time=self.time[keep], values=self.values[keep], valid=np.asarray(self.valid)[keep])
 
     def at(self, time: float) -> np.ndarray:
         """Return the value at a time [s], linear between samples."""

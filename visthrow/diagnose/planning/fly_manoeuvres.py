@@ -19,8 +19,7 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.models.trim import command_of
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.throw.effects import effects_for
-from visthrow.diagnose.throw.throw_model import ThrowModel
+from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, plant_of

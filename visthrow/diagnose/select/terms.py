@@ -97,13 +97,9 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
     of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
     shares = zip(*each(lambda batch: _products(batch, layout, point.device), batches))
     square, information, score, cross = (_summed(values, of, len(rows)) for values in shares)
-    if point.varies:
-        information, score, cross = freed_beside(information, score, cross, point.plain, point.varies)
-    else:
-        information, score, cross = (values[0] for values in (information, score, cross))
-    square = square.sum(0)
+    information, score, cross = freed_beside(information, score, cross, point.plain, point.varies)
     count = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
-    return Screen(terms, np.sqrt(square / max(count, 1)), information, score, cross)
+    return Screen(terms, np.sqrt(square.sum(0) / max(count, 1)), information, score, cross)
 
 
 def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarray:

@@ -83,7 +83,8 @@ def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
         thrust_n = np.maximum(weight * (1.0 + slope * (share / hover - 1.0)), 0.0)
         values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
         command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
-        made[i] = _between(FlightLog({**log.channels, "command": command}, log.meta), start, end)
+        channels = {**log.channels, "command": command}
+        made[i] = FlightLog({name: c.only((c.time >= start) & (c.time <= end)) for name, c in channels.items()}, log.meta)
         shares.append((hover, slope))
     if not shares:
         return made, ()
@@ -117,15 +118,6 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
         return hover, 1.0, start, end
     return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
-
-
-def _between(log: FlightLog, start: float, end: float) -> FlightLog:
-    """A stretch of a log."""
-    channels = {}
-    for name, c in log.channels.items():
-        keep = (c.time >= start) & (c.time <= end)
-        channels[name] = Channel(c.time[keep], c.values[keep], c.unit, c.frame, c.valid[keep])
-    return FlightLog(channels, log.meta)
 
 
 def _followed(log: FlightLog) -> relations.Relation | None:

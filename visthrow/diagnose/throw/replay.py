@@ -92,9 +92,8 @@ class Flights:
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
         self.windows = {name: np.zeros(len(self.cuts)) for name in WINDOW_FIELDS}
-        empty = np.zeros((0, 3))
         parts: dict[str, list[Samples]] = {"vehicle": [], "attitude": [], "payload": [], "gyro": []}
-        counts = {"vehicle": 0, "payload": 0, "gyro": 0}
+        counts = dict.fromkeys(parts, 0)
         for w, c in enumerate(self.cuts):
             f = self.flights[c.flight]
             given = {
@@ -102,17 +101,15 @@ class Flights:
                 "latch": f.latch if c.payload == ATTACHED else NEVER, "clock_zero": f.start,
                 "command_first": lengths[c.flight], "command_last": lengths[c.flight + 1],
             }  # fmt: skip
-            sources = {"vehicle": f.vehicle, "payload": f.payload if c.payload in (ATTACHED, LOOSE) else None, "gyro": f.gyro}
-            for (name, source), delay in zip(sources.items(), delays):
-                rows = self._rows(source, c, delay)
-                given |= {f"{name}_first": counts[name], f"{name}_count": len(rows)}
-                counts[name] += len(rows)
-                chosen = source or Samples(np.zeros(0), empty, 1.0)
-                parts[name].append(Samples(chosen.time[rows], chosen.values[rows], chosen.sigma))
-                if name == "vehicle":
-                    parts["attitude"].append(Samples(f.attitude.time[rows], f.attitude.values[rows], f.attitude.sigma))
-            for name, value in given.items():
-                self.windows[name][w] = value
+            sources = f.vehicle, f.attitude, f.payload if c.payload in (ATTACHED, LOOSE) else None, f.gyro
+            for name, source, delay in zip(parts, sources, (delays[0], *delays)):
+                own = source or Samples(np.zeros(0), np.zeros((0, 3)), 1.0)
+                span = own.between(c.start + delay + EARLY, c.end + delay)
+                parts[name].append(Samples(own.time[span], own.values[span], own.sigma))
+                given |= {f"{name}_first": counts[name], f"{name}_count": len(own.time[span])}
+                counts[name] += len(own.time[span])
+            for name in self.windows:
+                self.windows[name][w] = given[name]
         self.windows = {k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()}
         self.samples = parts
         data = {
@@ -123,12 +120,6 @@ class Flights:
         }  # fmt: skip
         self.recording = Recording(self.windows, data)
         self.rows = self.recording.rows
-
-    def _rows(self, source: Samples | None, c: Cut, delay: float) -> np.ndarray:
-        if source is None:
-            return np.zeros(0, dtype=int)
-        span = source.between(c.start + delay + EARLY, c.end + delay)
-        return np.arange(span.start, span.stop)
 
     def like(self, w: int) -> tuple[int, bool]:
         """What :meth:`alike` depends on: the same of two windows, the same answer."""

@@ -16,13 +16,13 @@ from sim.effects.setting import Setting, generalised
 from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
+from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import channels_of, direct_measurements, needs_no_flight, with_direct
 from visthrow.diagnose.throw.dropped import without_each_command
-from visthrow.diagnose.throw.effects import effects_for
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
@@ -334,6 +334,29 @@ class ThrowModel:
                 rings[c.flight] = last + RINGING
             cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
         return cuts
+
+
+def effects_for(
+    setting: Setting, channels: set[str], payload: bool, releases: bool, simpler: bool = False
+) -> dict[str, SettingEffect]:
+    """Return effects that make sense in a setting and for logs with these channels, bounded by the setting's own values.
+
+    ``simpler``: whether blocks simpler than the setting's are considered.
+    """
+    chosen = {}
+    for name, e in catalogue().items():
+        if e.simpler and not simpler:
+            continue
+        if e.block in ("rope", "rope mount", "payload", "payload air") and not payload:
+            continue
+        if (e.block in ("release", "ballistic") and not releases) or not e.applies(setting):
+            continue
+        if any(c in e.channels and c not in channels for c in ("rate_b", "keypoints", "landing")):
+            continue
+        if name.startswith(("payload_marker", "mocap_delay_payload")) and "payload_pos_w" not in channels:
+            continue
+        chosen[name] = e.bounded(setting)
+    return chosen
 
 
 def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
@@ -84,9 +84,7 @@ def _until_landing(log: FlightLog) -> FlightLog:
         return log
     channels = dict(log.channels)
     for name in channels.keys() & {"payload_pos_w", "payload_vel_w", "cable_points_w"}:
-        c = channels[name]
-        keep = c.time <= log["landing"].time[0]
-        channels[name] = replace(c, time=c.time[keep], values=c.values[keep], valid=c.valid[keep])
+        channels[name] = channels[name].only(channels[name].time <= log["landing"].time[0])
     return FlightLog(channels, log.meta)
 
 
