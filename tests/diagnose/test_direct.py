@@ -40,7 +40,7 @@ class Eyes:
         release = self.setting.plant.release
         cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, True)]
         self.view = CameraView(self.logs, flights, cuts, self.setting)
-        self.windows = [w for w in range(len(cuts)) if len(self.view.samples(w)[0])]
+        self.windows = sorted(self.view.windows)
 
     def off(self) -> np.ndarray:
         """Measured less predicted, in deviations."""
@@ -96,7 +96,7 @@ def test_every_effect_of_the_camera_is_measured_by_keypoints_alone(flown, name):
 def test_a_box_counts_once_and_what_is_not_seen_is_no_noise(flown):
     """Four numbers of a box stand in eight coordinates; a lost point's zeros are no samples."""
     eyes, pixel = Eyes(flown, {}), 1.0 / (FOCAL * HALF_VIEW)
-    views = [eyes.view._windows[w] for w in eyes.windows]
+    views = [eyes.view.windows[w] for w in eyes.windows]
     assert all(view["valid"][:, 4:].sum() <= 4 * len(view["time"]) for view in views)
     assert np.median([view["sigma"] for view in views]) == pytest.approx(pixel, rel=0.1)
     log = eyes.logs[0]

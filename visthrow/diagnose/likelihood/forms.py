@@ -60,12 +60,6 @@ def errors(windows: Sequence[Window], groups: Sequence[int], noise: Noise, resid
     return Errors(*sums)
 
 
-def left_ahead(window: Window, noise: Noise) -> np.ndarray:
-    """Residuals of a window in sigmas once its initial state is fitted to its head, shape (N,); 0 in the head."""
-    left, _, horizon = predicted(window, noise, window.residual)
-    return np.where(horizon < 0, 0.0, left)
-
-
 def predicted(window: Window, noise: Noise, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predict the end of a window from its head.
 

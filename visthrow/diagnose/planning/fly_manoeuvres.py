@@ -109,13 +109,9 @@ def vehicle_of(params: FlyerParams, known: PlantParams) -> PlantParams:
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
     """Deviation of each channel, as stated by the model times the scale that was found."""
-    work = diagnosis.work
-    out = {}
-    for c, name in enumerate(work.problem.model.channels):
-        sigma = [w.sigma[w.channel == c] for w in work.after.windows if np.any(w.channel == c)]
-        if sigma:
-            out[name] = float(np.median(np.concatenate(sigma)) * work.after.noise.scale[c])
-    return out
+    point, channels = diagnosis.work.after, diagnosis.work.problem.model.channels
+    noise = {name: point.sigma(c) * float(point.noise.scale[c]) for c, name in enumerate(channels)}
+    return {name: sigma for name, sigma in noise.items() if np.isfinite(sigma)}
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from visthrow.diagnose.likelihood.evidence import (
     estimate,
     log_evidence,
 )
-from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Errors, errors, left_ahead, unit_of
+from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Errors, errors, predicted, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
@@ -166,8 +166,7 @@ def channel_gains(work: Work, cross: Crossed, box: np.ndarray | None = None) -> 
 
 def _channel(name: str, c: int, after: Point, own: Errors, before: np.ndarray, box: np.ndarray | None) -> ChannelGain:
     error, count = own.square[:, c], own.count[:, c].sum()
-    rows = [w.sigma[w.channel == c] for w in after.windows if np.any(w.channel == c)]
-    sigma = float(np.median(np.concatenate(rows)))
+    sigma = after.sigma(c)
 
     def rms(square: np.ndarray) -> float:
         return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
@@ -327,10 +326,10 @@ def _kind(work: Work, channel: int) -> str:
     for window in point.windows:
         spans.setdefault(window.flight, []).append(window.time.mean())
     for window in point.windows:
-        rows, left = window.channel == channel, left_ahead(window, point.noise)
+        rows, (left, _, horizon) = window.channel == channel, predicted(window, point.noise, window.residual)
         if not rows.any():
             continue
-        square, times = left[rows] ** 2, window.time[rows]
+        square, times = np.where(horizon < 0, 0.0, left**2)[rows], window.time[rows]
         if len(square) % 3 == 0 and np.all(np.diff(times.reshape(-1, 3), axis=1) == 0.0):
             by_axis += square.reshape(-1, 3).sum(0)
         by_flight[window.flight] += float(square.sum())

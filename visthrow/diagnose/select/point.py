@@ -111,6 +111,11 @@ class Point:
         """Of all flights, about theta = 0, shape (K,)."""
         return self.statistics.absolute.sum(0)
 
+    def sigma(self, channel: int) -> float:
+        """Median of what the model states as a channel's noise, in its unit; NaN where there is no sample."""
+        own = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
+        return float(np.median(own)) if len(own) else float("nan")
+
     def evidence(self, priors: Priors, active: Sequence[int]) -> float:
         """log Z of a set of effects, comparable between points with other noise levels."""
         own = log_evidence(self.information, self.score, priors, list(active))

@@ -4,9 +4,9 @@ Each kind predicts its samples from what motion capture saw, taken back through 
 it depends on sensors, camera and landing plane alone. Its samples stand behind the simulated ones of their window.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,9 +35,10 @@ ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius
 
 
 class DirectMeasurement(Protocol):
-    """Samples of one channel in each window."""
+    """Samples of one channel in some windows."""
 
     channel: str
+    windows: Mapping[int, Any]  # by their numbers, those that have samples
 
     def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Stamps [s], values and sigma of a window, shape (N,), (N,), ()."""
@@ -88,10 +89,8 @@ def with_direct(
         settings: the one that is linearised about, then one for each effect, a step away.
         steps: of the effects, 0 for those without a derivative here, shape (K,).
     """
-    for kind in kinds:
+    for kind in (kind for kind in kinds if number in kind.windows):
         time, values, sigma = kind.samples(number)
-        if not len(time):
-            continue
         plain = kind.predicted(number, settings[0])
         columns = np.zeros((len(time), len(steps)))
         for k in np.flatnonzero(steps):
@@ -123,22 +122,20 @@ class LandingHeight:
 
     def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut]):
         """Give each landing to the last window of its flight that counts."""
-        self._points: dict[int, tuple[float, np.ndarray]] = {}
+        self.windows: dict[int, tuple[float, np.ndarray]] = {}
         for n, flight in enumerate(flights):
             own = [w for w, c in enumerate(cuts) if c.flight == n and c.retained]
             if flight.landing_point is not None and flight.latch != NEVER and own:
-                self._points[own[-1]] = flight.landing, flight.landing_point
+                self.windows[own[-1]] = flight.landing, flight.landing_point
 
     def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
         """See :class:`DirectMeasurement`."""
-        if window not in self._points:
-            return np.zeros(0), np.zeros(0), LANDING_SIGMA
-        time, point = self._points[window]
+        time, point = self.windows[window]
         return np.array([time]), point[2:], LANDING_SIGMA
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
         """See :class:`DirectMeasurement`."""
-        x, point = setting.sensing, self._points[window][1]
+        x, point = setting.sensing, self.windows[window][1]
         there = _origin(x, point[None])[0] - np.array(x.payload_offset)
         there[2] = setting.plant.release.landing_height
         seen = Rotation.from_rotvec(x.frame_tilt).apply(there + np.array(x.payload_offset)) * (1.0 + x.scale)
@@ -155,24 +152,22 @@ class CameraView:
 
         ``logs``: flights. flights: the same as the replay takes them. cuts: windows. setting: the diagnosed one.
         """
-        self._nominal, self._windows = setting, {}
+        self._nominal, self.windows = setting, {}
         for w, c in enumerate(cuts):
             if c.retained and seen_by_camera(logs[c.flight]) and flights[c.flight].payload is not None:
                 view = _view(logs[c.flight], flights[c.flight], c, setting.sensing)
                 if view is not None:
-                    self._windows[w] = view
+                    self.windows[w] = view
 
     def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
         """See :class:`DirectMeasurement`."""
-        if window not in self._windows:
-            return np.zeros(0), np.zeros(0), LEAST_KEYPOINT_SIGMA
-        view = self._windows[window]
+        view = self.windows[window]
         time = np.broadcast_to(view["time"][:, None, None], view["points"].shape)
         return time[view["valid"]].ravel(), view["points"][view["valid"]].ravel(), view["sigma"]
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
         """See :class:`DirectMeasurement`; NaN where the lens is none."""
-        view, x = self._windows[window], setting.sensing
+        view, x = self.windows[window], setting.sensing
         try:
             lens = self._nominal.camera
             row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]

@@ -156,8 +156,8 @@ class ThrowModel:
         if about is not None:
             states, moves = self._following(setting, theta, about)
         flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
-        held = [[(kind, kind.samples(w)[1]) for kind in self._direct] for w in self._retained]
-        direct = [[x - kind.predicted(w, setting) for kind, x in own if len(x)] for w, own in zip(self._retained, held)]
+        held = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
+        direct = [[kind.samples(w)[1] - kind.predicted(w, setting) for kind in own] for w, own in zip(self._retained, held)]
         full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
         return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
 
