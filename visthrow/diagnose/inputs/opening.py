@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import WHOLE, add_common
-from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
+from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.diagnose.models.interface import Model
 from visthrow.logs.check.run import label
 from visthrow.logs.flightlog import FlightLog
@@ -48,7 +48,8 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
         raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.model}")
     else:
         model = setup.model_of(chosen, logs)
-        model = _only(model, args.only.split(",")) if args.only is not None else model
+        if args.only is not None:
+            model.choose(args.only.split(","))
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
     # day of each flight, from 0: what its log says, else those of one folder are of one
@@ -81,33 +82,6 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     known |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)
     return put_right([log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **known))
-
-
-class _Part:
-    """A model with some of its effects."""
-
-    def __init__(self, model: Model, keep: Sequence[int]) -> None:
-        self.whole, self._keep = model, list(keep)
-        self.effects, self.channels = [model.effects[j] for j in keep], model.channels
-
-    def __getattr__(self, name: str):
-        return getattr(self.whole, name)
-
-    def with_laws(self, laws):
-        """See :class:`visthrow.diagnose.models.numeric.NumericModel`."""
-        return _Part(self.whole.with_laws(laws), self._keep)
-
-    def windows(self, theta):
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
-        from dataclasses import replace
-
-        return [replace(w, effects=w.effects[:, self._keep]) for w in self.whole.windows(theta)]
-
-
-def _only(model: Model, names: Sequence[str]) -> Model:
-    known = [e.name for e in model.effects]
-    expect_known(names, known, "no effect '{}' for these logs", DiagnoseError)
-    return _Part(model, [known.index(name) for name in names])
 
 
 def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:

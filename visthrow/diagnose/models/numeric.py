@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sim.params import LawParams
-from visthrow.common.errors import LogError, expect_known
+from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.interface import Effect, Linearised, Window
 from visthrow.diagnose.models.laws import carries, term_of
 from visthrow.logs.check.signals import noise
@@ -106,6 +106,12 @@ class NumericModel(ABC):
                     raise LogError(f"the law {term.formula} cannot act here: {self.lawless or 'this model has no ' + ', '.join(lacking)}")
         self._base, self.laws = base, (*self.laws, *laws)
         self.effects = tuple(replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b)) for e, b in zip(self.effects, base.tolist()))
+
+    def choose(self, names: Sequence[str]) -> None:
+        """Keep these effects alone. Raises DiagnoseError for one that it does not know."""
+        known = {effect.name: effect for effect in self.effects}
+        expect_known(names, known, "no effect '{}' for these logs", DiagnoseError)
+        self.effects = tuple(known[name] for name in names)
 
     def plain(self) -> "NumericModel":
         """The same model without what it was extended by."""
@@ -230,15 +236,16 @@ class NumericModel(ABC):
     def _by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
         """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central differences; (N, directions) a stretch."""
         stretches, first = len(self.stretches), self.stretches[0]
-        counts = {"theta": len(self.effects), "nuisance": len(first.nuisance), "latent": len(first.latent_block)}
-        count = counts[name]
+        counts = {"theta": len(self.numbers), "nuisance": len(first.nuisance), "latent": len(first.latent_block)}
+        asked = np.arange(counts[name]) if name != "theta" else np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
+        count = len(asked)
         steps = np.broadcast_to({
             "theta": np.array([EFFECT_STEP * effect.prior_sd for effect in self.effects]),
             "nuisance": NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches]),
             "latent": np.full(count, self.latent_step),
         }[name], (stretches, count))  # fmt: skip
         moves = {key: np.zeros((stretches * count, n)) for key, n in counts.items()}
-        moves[name] = (steps[:, :, None] * np.eye(count)).reshape(stretches * count, count)
+        moves[name] = (steps[:, :, None] * np.eye(counts[name])[asked]).reshape(stretches * count, counts[name])
         still = Lanes(np.repeat(np.arange(stretches), count), size, np.repeat(self._start, count, axis=0), 0.0)
         moved = [Lanes(still.owner, *(getattr(still, key) + sign * move for key, move in moves.items())) for sign in (1.0, -1.0)]
         sides = [self._run(lanes) for lanes in moved]

@@ -59,20 +59,19 @@ def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[Fl
     ``diagnosis``: for the sizes of what was found and the sensors' noise; ``made``: gives a setup's own model of some logs.
     Raises DiagnoseError: no vehicle flies in this model.
     """
-    whole = getattr(model, "whole", model)
-    if isinstance(whole, ThrowModel):
-        plant, device, asked = apply(whole.entries, whole.setting, diagnosis.theta).plant, whole.device, {e.name for e in whole.effects}
+    if isinstance(model, ThrowModel):
+        plant, device, asked = apply(model.entries, model.setting, diagnosis.theta).plant, model.device, {e.name for e in model.effects}
 
         def own(flight: "Flight") -> Model:
             log, carries = flight.log(noise), flight.manoeuvre.payload
-            there = effects_for(whole.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release))
-            return ThrowModel([log], whole.setting.plant, sensing=whole.setting.sensing, device=device,
-                              substep=COARSE * whole.substep, only=[n for n in there if n in asked], carries=carries)  # fmt: skip
-    elif isinstance(whole, FlyerModel) and made is not None:
-        plant, device = vehicle_of(whole.params, plant_of(config.load(Experiment, config.find("train", "state")))), "cpu"
+            there = effects_for(model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release))
+            return ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=device,
+                              substep=COARSE * model.substep, only=[n for n in there if n in asked], carries=carries)  # fmt: skip
+    elif isinstance(model, FlyerModel) and made is not None:
+        plant, device = vehicle_of(model.params, plant_of(config.load(Experiment, config.find("train", "state")))), "cpu"
 
         def own(flight: "Flight") -> Model:
-            return made([flight.setup_log(whole.params, noise, ("battery_voltage",) * whole.has_voltage)])
+            return made([flight.setup_log(model.params, noise, ("battery_voltage",) * model.has_voltage)])
     else:
         raise DiagnoseError("manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's with or without payload")
     noise = _sensor_noise(diagnosis)
@@ -80,7 +79,7 @@ def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[Fl
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
         return [flight.simulated(own) for flight in fly(plant, manoeuvres, seed, device)]
 
-    return simulate, lambda manoeuvre: carried(manoeuvre, whole.params) if isinstance(whole, FlyerModel) else manoeuvre
+    return simulate, lambda manoeuvre: carried(manoeuvre, model.params) if isinstance(model, FlyerModel) else manoeuvre
 
 
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
