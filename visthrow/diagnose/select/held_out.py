@@ -27,7 +27,7 @@ from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import compares_phases, floors_of
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
 from visthrow.diagnose.select.scatter import allowed, deviations, differences, freed
 from visthrow.diagnose.select.selector import MOST_NAMES
@@ -279,30 +279,25 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
         if f.name in gone and f.name not in kept and f.verdict in (result.FOUND, result.CLASS) else f
         for f in diagnosis.findings
     )  # fmt: skip
-    theta, spread, work = _sized(diagnosis.work, list(kept))
+    work, known = diagnosis.work, [e.name for e in diagnosis.work.problem.effects]
+    active = [known.index(name) for name in kept]
+    theta, spread, _ = sized(work.problem, work.after, active)
+    work = replace(work, active=tuple(active)) if active else replace(work, after=work.before, active=())
     return replace(diagnosis, findings=findings, theta=theta, covariance=spread, work=work)
 
 
-def _sized(work: Work, names: Sequence[str]) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], Work]:
-    """Sizes with which some of the names alone explain the flights, their covariance, and the work of these."""
-    known, priors, point = [e.name for e in work.problem.effects], work.problem.priors, work.after
-    active = [known.index(name) for name in names]
-    if not active:
-        return {}, (), replace(work, after=work.before, active=())
-    theta = estimate(point.information, point.score, priors, active)
-    unlike = differences(point.statistics, priors, active, theta)
-    scaled = joint(covariance(point.information, priors.deviation(active)), unlike, theta, active, priors.floor)
-    sizes = {name: float(theta[j] * priors.floor[j]) for name, j in zip(names, active)}
-    return sizes, scaled, replace(work, active=tuple(active))
+def sized(problem: Problem, point: Point, active: Sequence[int]) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], np.ndarray]:
+    """Sizes with which named effects alone explain the flights, and their covariance with what numerics and differences among flights add.
 
-
-def joint(
-    spread: np.ndarray, unlike: np.ndarray, theta: np.ndarray, active: Sequence[int], floor: np.ndarray
-) -> tuple[tuple[float, ...], ...]:
-    """Covariance of named sizes in their units, with what numerics and differences among flights add."""
-    more = OWN_FLOOR**2 + unlike * allowed(theta) ** 2
-    own = (spread + np.diag(more))[np.ix_(active, active)] * np.outer(floor[active], floor[active])
-    return tuple(tuple(map(float, row)) for row in own)
+    Returns both in the effects' units, and the variance that the differences add to each effect, see :func:`differences`, shape (K,).
+    """
+    priors, named = problem.priors, list(active)
+    theta = estimate(point.information, point.score, priors, named)
+    unlike = differences(point.statistics, priors, named, theta)
+    spread = covariance(point.information, priors.deviation(named)) + np.diag(OWN_FLOOR**2 + unlike * allowed(theta) ** 2)
+    own = spread[np.ix_(named, named)] * np.outer(priors.floor[named], priors.floor[named])
+    sizes = {problem.effects[j].name: float(theta[j] * priors.floor[j]) for j in named}
+    return sizes, tuple(tuple(map(float, row)) for row in own), unlike
 
 
 def _share(held: HeldOut) -> str:

@@ -20,10 +20,10 @@ from visthrow.diagnose.likelihood.marginal import TAIL
 from visthrow.diagnose.models.interface import Effect, Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
-from visthrow.diagnose.select.held_out import joint
+from visthrow.diagnose.select.held_out import sized
 from visthrow.diagnose.select.point import SMALL_STEP, Point, moved, with_fitted_noise, with_floors_noise, with_varying
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, allowed, deviations, differences, freed
+from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, allowed, deviations, freed
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import bare
@@ -62,13 +62,10 @@ def conclude(search: Selector) -> Diagnosis:
     if not active and search.active:
         point = search.nominal
     point = replace(point, plain=search.about_means(active, varies) if here else freed(point.plain, varies), varies=Varies())
-    point = replace(point, theta=estimate(point.information, point.score, search.priors, active))
-    spread, floor = covariance(point.information, search.priors.deviation(active)), search.priors.floor
-    unlike = differences(point.plain, search.priors, active, point.theta)
+    theta, spread, unlike = sized(search.problem, point, active)
     findings = tuple(_finding(search, point, j, active, unlike[j], withdrawn) for j in range(len(model.effects)))
     return Diagnosis(
-        overall, block, tuple(reasons), findings, {search.name(j): float(point.theta[j] * floor[j]) for j in active},
-        joint(spread, unlike, point.theta, active, floor), search.least, tuple(search.steps),
+        overall, block, tuple(reasons), findings, theta, spread, search.least, tuple(search.steps),
         tuple((tuple(map(search.name, m.active)), 0.0 - m.nats) for m in search.sets), found, _different(explanations),
         _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
