@@ -1,9 +1,5 @@
-"""Start of Warp for the simulator: forward only, and quiet."""
-
-import warp as wp
+"""Start of Warp for the simulator."""
 
 from camera.warp_start import start
 
-wp.config.enable_backward = False
-wp.config.max_unroll = 4  # longer unrolled loops cost half a minute of compile time and gain nothing
 start()

@@ -75,3 +75,16 @@ def test_the_check_itself(arguments, count):
     text = f"@wp.kernel(module='unique')\ndef k(\n {arguments}\n):\n    pass\n"
     (kernel,) = kernels(text)
     assert len(problems(text, kernel)) == count
+
+
+def settings(text: str) -> set[str]:
+    """Return the settings of Warp that a text assigns."""
+    targets = [target for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Assign) for target in node.targets]
+    return {ast.unparse(target) for target in targets if ast.unparse(target).startswith(("wp.config.", "warp.config."))}
+
+
+def test_kernels_are_compiled_alike_in_all_processes():
+    """How they are is part of their hash: pictures were compiled a second time where no simulator had been imported before."""
+    files = [path for package in ("camera", "sim", "visthrow", "hil") for path in (ROOT / package).rglob("*.py")]
+    found = {path.relative_to(ROOT).as_posix() for path in files if settings(path.read_text(encoding="utf-8"))}
+    assert found == {"camera/warp_start.py"}
