@@ -72,7 +72,7 @@ class Fisheye:
         behind = z < 0.0
         # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each side of the lens
         # plane.
-        reach = distance + torch.where(behind, -z, z)
+        reach = distance + z.abs()
         tangent = torch.where(behind, reach, radius) / torch.where(behind, radius, reach)
         return tangent.atan() * 2.0, radius, distance
 

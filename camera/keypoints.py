@@ -45,7 +45,7 @@ class KeypointCamera:
         self.radius: float | torch.Tensor = params.payload_radius
         self.square_w = goal_square(params.goal_side).to(device=device, dtype=dtype)
         self.edge_reads = params.noise.invalid_reads == "edge"
-        self._identity = torch.eye(2, device=device, dtype=dtype)
+        self._axes = torch.eye(2, 3, device=device, dtype=dtype)
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
     def extrinsics(self, rotation_error: torch.Tensor, position_error: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -86,11 +86,12 @@ def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Ten
     """
     if square_w is None:
         square_w = goal_square(side).to(goal_w)
-    return torch.nn.functional.pad(goal_w[:, :2], (0, 1)).unsqueeze(-2) + square_w
+    flat = goal_w[:, None, :2] + square_w[:, :2]
+    return torch.cat([flat, square_w[:, 2:].expand(len(goal_w), -1, -1)], -1)
 
 
 def ball_extremes_c(
-    fisheye: Fisheye, ball_c: torch.Tensor, radius: float | torch.Tensor, identity: torch.Tensor | None = None
+    fisheye: Fisheye, ball_c: torch.Tensor, radius: float | torch.Tensor, axes: torch.Tensor | None = None
 ) -> torch.Tensor:
     """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the image.
 
@@ -106,13 +107,13 @@ def ball_extremes_c(
         fisheye: The lens.
         ball_c: Centre of the ball [m], shape (E, 3), camera frame.
         radius: Radius of the ball [m], one or shape (E,).
-        identity: eye(2) on the ball's device, to save making it.
+        axes: eye(2, 3) on the ball's device, to save making it.
 
     Returns:
         Unit rays, shape (E, 4, 3), camera frame: left, top, right, bottom.
     """
-    if identity is None:
-        identity = torch.eye(2, device=ball_c.device, dtype=ball_c.dtype)
+    if axes is None:
+        axes = torch.eye(2, 3, device=ball_c.device, dtype=ball_c.dtype)
     x, y, z = ball_c.unbind(-1)
     distance = (x * x + y * y + z * z + AXIS_EPSILON).sqrt()
     centre = ball_c / distance.unsqueeze(-1)
@@ -123,12 +124,11 @@ def ball_extremes_c(
     slope = fisheye.slope_from_angle(theta)
     q = (slope * centre[:, 2] - g) / (s * s)
     across = centre[:, :2]
-    row = across.unsqueeze(-1)  # (E, 2, 1): the image axis whose gradient it is
-    tangent = row * (across * q.unsqueeze(-1)).unsqueeze(-2) + g[:, None, None] * identity
-    along = row * -slope[:, None, None]
-    tx, ty, tz = tangent[..., 0:1], tangent[..., 1:2], along
+    along = torch.cat([across * q.unsqueeze(-1), -slope.unsqueeze(-1)], -1)
+    gradient = across.unsqueeze(-1) * along.unsqueeze(-2) + g[:, None, None] * axes  # (E, 2, 3): of u, of v
+    tx, ty, tz = gradient.unbind(-1)
     size = (tx * tx + ty * ty + tz * tz + AXIS_EPSILON).sqrt()
-    step = torch.cat([tangent, along], -1) * (sine[:, None, None] / size)
+    step = gradient * (sine.unsqueeze(-1) / size).unsqueeze(-1)
     middle = (centre * cosine.unsqueeze(-1)).unsqueeze(-2)
     return torch.cat([middle - step, middle + step], -2)
 
@@ -185,7 +185,7 @@ def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[tor
         outline's point on that side is inside the field of view and on the sensor. Extremes beyond the field of view
         are clipped to its edge first.
     """
-    rays = ball_extremes_c(camera.fisheye, ball_c, camera.radius, camera._identity)
+    rays = ball_extremes_c(camera.fisheye, ball_c, camera.radius, camera._axes)
     extremes, valid = camera.fisheye.project_normalized(rays, clip=True)
     return box_midpoints(extremes), valid
 
@@ -218,7 +218,7 @@ def keypoints(
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
     points_c = points_c_from_w(torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b)
-    rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._identity)
+    rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._axes)
     seen, valid = camera.fisheye.project_normalized(torch.cat([points_c[:, :4], rays_c], -2), clip=True)
     points = torch.cat([seen[:, :4], box_midpoints(seen[:, 4:])], -2)
     return by_rule(camera, points, valid)
@@ -238,7 +238,7 @@ def by_rule(camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor) -
     if camera.edge_reads:
         return points, valid
     box = valid[:, GOAL_KEYPOINTS:]
-    flanks, ends = box[:, 0::2].all(1, keepdim=True), box[:, 1::2].all(1, keepdim=True)
+    flanks, ends = (box[:, :2] & box[:, 2:]).split(1, 1)  # left and right, top and bottom
     whole = box & torch.cat([ends, flanks, ends, flanks], 1)
     valid = torch.cat([valid[:, :GOAL_KEYPOINTS], whole], 1)
-    return torch.where(valid.unsqueeze(-1), points, torch.zeros_like(points)), valid
+    return torch.where(valid.unsqueeze(-1), points, 0.0), valid

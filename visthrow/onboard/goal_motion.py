@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, goal_corners_w
-from camera.mount import points_c_from_w
+from camera.mount import points_c_from_w, rotate
 from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
 
 SUMS = 7  # width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y
@@ -48,7 +48,8 @@ def fit(sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tens
         The new sums and the velocity [m/s], shape (E, 2), world frame.
     """
     t, w = time[:, None], weight[:, None]
-    new = torch.cat([w, w * t, w * t * t, w * goal_xy, w * t * goal_xy], dim=-1)
+    wt = w * t
+    new = torch.cat([w, wt, wt * t, w * goal_xy, wt * goal_xy], dim=-1)
     sums = torch.where(fresh[:, None], 0.0, sums) + new
     total, first, second, place, moved = sums[:, :1], sums[:, 1:2], sums[:, 2:3], sums[:, 3:5], sums[:, 5:7]
     mean = first / total.clamp(min=1e-9)
@@ -79,52 +80,44 @@ def measured_goal(layout: Layout, frame: Tensor, valid: Tensor | None, camera: K
         offset, hanging = frame[:, VEHICLE : VEHICLE + 2], frame[:, VEHICLE + 2 : VEHICLE + 4]
         goal_xy = frame[:, :2] + hanging + offset
         return goal_xy, torch.full_like(goal_xy[:, 0], POSITION_SIGMA**-2)
-    goals, weight = goal_by_corner(layout, frame, valid, camera)
+    rot_wb = rotation_in(frame)
+    goals, weight = goal_by_corner(frame, valid, camera, rot_wb, rays_w(camera, rot_wb, _corners(layout, frame)))
     total = weight.sum(-1)
     return (weight[..., None] * goals).sum(1) / total.clamp(min=1e-9)[:, None], total
 
 
-def goal_by_corner(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
-    """Goal in the world as each corner of one vision frame shows it; arguments as of :func:`measured_goal`.
-
-    Returns positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
-    """
-    corners = frame[:, VEHICLE : VEHICLE + layout.goal].unflatten(1, (GOAL_KEYPOINTS, 2))
-    rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(corners))
-    rot_wb = rotation_in(frame)
-    rays_w = rays_c @ camera.rot_cb @ rot_wb.transpose(1, 2)  # rows: (R_wb R_bc r)^T
-    lens_w = frame[:, :3] + (rot_wb @ camera.position_b)
-    height = lens_w[:, None, 2].clamp(min=0.1)
-    reach = height / (-rays_w[..., 2]).clamp(min=GRAZING)
-    goals = lens_w[:, None, :2] + reach[..., None] * rays_w[..., :2] - camera.square_w[:, :2]
-    followed = valid[:, :GOAL_KEYPOINTS] & (rays_w[..., 2] < -GRAZING)
-    return goals, followed * (height / (ANGLE_SIGMA * reach * reach)).square()
+def _corners(layout: Layout, frame: Tensor) -> Tensor:
+    """Goal corners of vision frames, normalised [-], shape (E, 4, 2)."""
+    return frame[:, VEHICLE : VEHICLE + layout.goal].unflatten(1, (GOAL_KEYPOINTS, 2))
 
 
-def goal_in_frame(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera) -> tuple[Tensor, Tensor]:
-    """Goal as one vision frame shows it, and its inverse variance; as :func:`measured_goal`, but a wrong corner is outvoted."""
-    goals, weight = goal_by_corner(layout, frame, valid, camera)
-    return middle(goals, weight > 0.0), weight.sum(-1)
-
-
-def located(layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor) -> Tensor:
-    """Goal and payload in the world; arguments as of :func:`measured_goal`, and of the goal so far.
+def rays_w(camera: KeypointCamera, rot_wb: Tensor, points: Tensor) -> Tensor:
+    """Directions in which points of the image lie, shape (E, K, 3), world frame.
 
     Args:
-        layout, frame, valid, camera: see there.
-        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has seen it, bool, shape (E,).
+        camera: of the image. rot_wb: attitude, shape (E, 3, 3). points: normalised [-], shape (E, K, 2).
+    """
+    rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(points))
+    return rotate(rot_wb, rotate(camera.rot_cb.T, rays_c))
+
+
+def goal_by_corner(frame: Tensor, valid: Tensor, camera: KeypointCamera, rot_wb: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Goal in the world as each corner of one vision frame shows it.
+
+    Args:
+        frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame, shape (E, 3, 3).
+        rays: to the corners, shape (E, 4, 3), world frame.
 
     Returns:
-        Goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the goal is known, 1; world frame, shape (E, 6).
-        What is not known is 0.
+        Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
     """
-    box, bits = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)), valid[:, GOAL_KEYPOINTS:]
-    centre = middle(box, bits)
-    ray_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(centre))
-    rot_wb = rotation_in(frame)
-    ray_w = (ray_c[:, None] @ camera.rot_cb @ rot_wb.transpose(1, 2))[:, 0]
-    hangs = bits.any(-1, keepdim=True)
-    return torch.cat([(goal_xy - frame[:, :2]) * known[:, None], ray_w * hangs, known[:, None].to(frame.dtype)], dim=-1)
+    lens_w = frame[:, :3] + rotate(rot_wb, camera.position_b.expand(1, -1))[:, 0]
+    height, down = lens_w[:, None, 2].clamp(min=0.1), -rays[..., 2]
+    reach = height / down.clamp(min=GRAZING)
+    goals = lens_w[:, None, :2] + reach[..., None] * rays[..., :2] - camera.square_w[:, :2]
+    followed = valid[:, :GOAL_KEYPOINTS] & (down > GRAZING)
+    sharpness = height / (ANGLE_SIGMA * reach * reach)
+    return goals, followed * (sharpness * sharpness)
 
 
 class Fitted(NamedTuple):
@@ -141,27 +134,48 @@ def fitted_goal(
     layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None, sums: Tensor, time: Tensor, fresh: Tensor
 ) -> Fitted:
     """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
-    measured = goal_in_frame if layout.located else measured_goal
-    sums, velocity = fit(sums, time, *measured(layout, frame, valid, camera), fresh)
-    moves = velocity if layout.motion else None
     if not layout.located:
-        return Fitted(sums, moves, None, frame, valid)
-    goal_xy, known = place(sums, time, moves), sums[:, 0] > 0.0
-    places = located(layout, frame, valid, camera, goal_xy, known)
-    return Fitted(sums, moves, places, *predicted(layout, frame, valid, camera, goal_xy, known))
+        sums, velocity = fit(sums, time, *measured_goal(layout, frame, valid, camera), fresh)
+        return Fitted(sums, velocity if layout.motion else None, None, frame, valid)
+    return _located(layout, frame, valid, camera, sums, time, fresh)
+
+
+def _located(
+    layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, sums: Tensor, time: Tensor, fresh: Tensor
+) -> Fitted:
+    """:func:`fitted_goal` where the layout says where keypoints lie: of four points of goal or box a wrong one is outvoted.
+
+    The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the goal is known, 1; world frame. What
+    is not known is 0.
+    """
+    box, box_valid = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)), valid[:, GOAL_KEYPOINTS:]
+    rot_wb = rotation_in(frame)
+    rays = rays_w(camera, rot_wb, torch.cat([_corners(layout, frame), middle(box, box_valid)[:, None]], dim=1))
+    goals, weight = goal_by_corner(frame, valid, camera, rot_wb, rays[:, :GOAL_KEYPOINTS])
+    one, two, three, four = weight.unbind(-1)
+    sums, velocity = fit(sums, time, middle(goals, weight > 0.0), one + two + three + four, fresh)
+    moves = velocity if layout.motion else None
+    goal_xy, known = place(sums, time, moves), sums[:, :1] > 0.0
+    hangs = box_valid.any(-1, keepdim=True)
+    places = torch.cat([(goal_xy - frame[:, :2]) * known, rays[:, GOAL_KEYPOINTS] * hangs, known.to(frame.dtype)], dim=-1)
+    return Fitted(sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, known))
 
 
 def predicted(
-    layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, goal_xy: Tensor, known: Tensor
+    layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, rot_wb: Tensor, goal_xy: Tensor, known: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The frame, and its validity, with corners that are not seen where the goal so far would be seen; arguments as of :func:`located`."""
-    rot_wb = rotation_in(frame)
+    """The frame, and its validity, with corners that are not seen where the goal so far would be seen.
+
+    Args:
+        layout, frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame, shape (E, 3, 3).
+        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has seen it, bool, shape (E, 1).
+    """
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
     points, inside = camera.fisheye.project_normalized(corners_c, clip=True)
     seen, end = valid[:, :GOAL_KEYPOINTS], VEHICLE + layout.goal
-    filled = ~seen & inside & known[:, None]
-    corners = torch.where(filled[..., None], points, frame[:, VEHICLE:end].unflatten(1, (GOAL_KEYPOINTS, 2)))
+    filled = inside & known & ~seen
+    corners = torch.where(filled[..., None], points, _corners(layout, frame))
     frame = torch.cat([frame[:, :VEHICLE], corners.flatten(1), frame[:, end:]], dim=-1)
     return frame, torch.cat([seen | filled, valid[:, GOAL_KEYPOINTS:]], dim=-1)
 
@@ -169,7 +183,11 @@ def predicted(
 def middle(points: Tensor, valid: Tensor) -> Tensor:
     """Median of four points, shape (E, 4, 2), over those that are valid, shape (E, 4): a wrong one is outvoted; 0 where none is."""
     count = valid.sum(-1, keepdim=True)
-    ascending = torch.where(valid.unsqueeze(-1), points, torch.inf).sort(dim=1).values
-    low, high = ((count - 1).clamp(min=0) // 2), (count // 2).clamp(max=3)
-    rows = [ascending.gather(1, row.unsqueeze(-1).expand(-1, 1, 2))[:, 0] for row in (low, high)]
-    return torch.where(count > 0, 0.5 * (rows[0] + rows[1]), 0.0)
+    one, two = torch.where(valid.unsqueeze(-1), points, torch.inf).split(2, 1)
+    small, large = torch.minimum(one, two), torch.maximum(one, two)  # of two pairs, each
+    first, inner = torch.minimum(small[:, 0], small[:, 1]), torch.maximum(small[:, 0], small[:, 1])
+    outer = torch.minimum(large[:, 0], large[:, 1])
+    second, third = torch.minimum(inner, outer), torch.maximum(inner, outer)
+    lower = torch.where(count > 2, second, first)
+    upper = torch.where(count > 3, third, torch.where(count > 1, second, first))
+    return torch.where(count > 0, (lower + upper) * 0.5, 0.0)

@@ -116,20 +116,20 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
 
 @lru_cache
 @torch.inference_mode(False)
-def _of_rotation(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which two products of quaternion entries make an entry of the matrix, the second's sign, that of both, and what they add to."""
+def _of_rotation(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Which products of quaternion entries make the entries of the matrix, two each, their signs, and what they add to."""
     one, two = [5, 1, 2, 1, 0, 6, 2, 6, 0], [10, 11, 7, 11, 10, 3, 7, 3, 5]  # of xx, xy, xz, xw, yx, ...
-    rows = [1, -1, 1, 1, 1, -1, -1, 1, 1], [-1, 1, 1, 1, -1, 1, 1, 1, -1], [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    second, both, base = (torch.tensor(row, device=device, dtype=dtype) for row in rows)
-    return torch.tensor([*one, *two], device=device), second, both, base
+    signs = [-1, 1, 1, 1, -1, 1, 1, 1, -1, -1, -1, 1, 1, -1, -1, -1, 1, -1]
+    identity = torch.eye(3, device=device, dtype=dtype).flatten()
+    return torch.tensor([*one, *two], device=device), torch.tensor(signs, device=device, dtype=dtype), identity
 
 
 def rotation_from_quat(quat: Tensor) -> Tensor:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
-    chosen, second, both, base = _of_rotation(quat.device, quat.dtype)
+    chosen, signs, identity = _of_rotation(quat.device, quat.dtype)
     products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
-    one, two = products.flatten(-2).index_select(-1, chosen).unflatten(-1, (2, 9)).unbind(-2)
-    rot_wb: Tensor = torch.addcmul(base, both, torch.addcmul(one, second, two)).unflatten(-1, (3, 3))
+    one, two = (products.flatten(-2).index_select(-1, chosen) * signs).unflatten(-1, (2, 9)).unbind(-2)
+    rot_wb: Tensor = (identity + (one + two)).unflatten(-1, (3, 3))
     return rot_wb
 
 
