@@ -45,7 +45,7 @@ HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 GROUND = 0.12  # height of the vehicle that counts as landed [m]
 LEVEL_TIME = 0.5  # an aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]
 
-WARM_CALLS = 3  # calls of the policy before it is to fly: code, data and the traced operations are at hand after two
+WARM_CALLS = 3  # calls of the policy before it is to fly: the first records its operations, the others find code and data at hand
 MOST_ERRORS = 100  # tracebacks that are kept
 
 

@@ -8,7 +8,6 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 
 from hil.control.loop import AutoOperator, Loop
 from hil.control.recording.playback import replay
@@ -65,7 +64,7 @@ def test_a_policy_that_asks_too_early_is_held_back_and_throws_all_the_same(monke
         out = act(pilot, *args)
         if len(asked) < 8 and len(args) > 6:  # a warm-up knows no time
             asked.append(args[-1])
-            pilot._previous = torch.cat([pilot._previous[:, :4], torch.ones(1, 1)], dim=-1)
+            pilot._previous = np.append(pilot._previous[:, :4], np.ones((1, 1), np.float32), axis=1)
             out = dataclasses.replace(out, release=np.array([True]))
         return out
 

@@ -30,6 +30,9 @@ from visthrow.onboard.traced import Traced
 VIEWS = {"pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "payload_w": 3, "goal_w": 3, "attached": 1}
 """What one step is shown, and the width of each: the columns of one array."""
 
+SHARED = ("goal_w", "attached")
+"""Of these one may serve all."""
+
 JITTER = 2e-3
 """By which steps may be off their times without being counted as late [s]: the payload moves some millimetres in it."""
 
@@ -58,6 +61,11 @@ def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
     """Return a camera with the policy's own rule for what is out of view: it is the program's, not the camera's."""
     rule = policy.contract.get("camera", {}).get("invalid_reads", params.noise.invalid_reads)
     return replace(params, noise=replace(params.noise, invalid_reads=rule))
+
+
+def _resampled(history: np.ndarray, seen: np.ndarray, ages: list[float], period: float) -> np.ndarray:
+    """`visthrow.onboard.observations.resampled`, of arrays; ``seen``: history with this step in it."""
+    return ob.resampled(torch.from_numpy(history), torch.from_numpy(seen)[:, 0], ages, period).numpy()
 
 
 class Pilot:
@@ -103,28 +111,28 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
         self.policy, self.count = policy, count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
-        self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
+        self._views, self._time = np.zeros((count, sum(VIEWS.values())), dtype=np.float32), np.zeros(count, dtype=np.float32)
         self._observe, self._observe_given = Traced(self._observed), Traced(self._observed)
-        self._decide, self._later = Traced(self._decision), torch.zeros(count, dtype=torch.bool)
+        self._decide, self._later = Traced(self._decision), np.zeros(count, dtype=bool)
         self.spent = (0.0, 0.0)
-        self._first = torch.tensor([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=torch.float32)
+        self._first = np.array([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=np.float32)
         self.start()
 
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
-        self._previous = self._first.repeat(self.count, 1)
-        self._history = torch.zeros(self.count, 1 + self.layout.history, self.layout.payload)
-        self._answers = torch.zeros(self.count, 1 + self.layout.response, ob.RESPONSE)
-        self._memory = self.policy.begin(self.count)
-        self._fresh = torch.ones(self.count, dtype=torch.bool)
-        self._goal_fit, self._steps = goal_motion.empty_sums(self.count), 0
+        self._previous = self._first.repeat(self.count, 0)
+        self._history = np.zeros((self.count, 1 + self.layout.history, self.layout.payload), dtype=np.float32)
+        self._answers = np.zeros((self.count, 1 + self.layout.response, ob.RESPONSE), dtype=np.float32)
+        self._memory = self.policy.begin(self.count).numpy()
+        self._fresh = np.ones(self.count, dtype=bool)
+        self._goal_fit, self._steps = goal_motion.empty_sums(self.count).numpy(), 0
         self._times: tuple[float, ...] = ()  # of the rows of history and response, newest first; those beyond are copies of the oldest [s]
         self._unasked = self._previous[:, 4]  # what the action before the last one said of the release
 
     @property
     def previous_action(self) -> np.ndarray:
         """Clipped action of the last call, hover before the first one, shape (E, 5)."""
-        return self._previous.numpy()
+        return self._previous
 
     @torch.inference_mode()
     def act(
@@ -147,7 +155,7 @@ class Pilot:
         begin = time.perf_counter()
         goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
-        given = () if keypoints is None else tuple(torch.from_numpy(np.array(part)) for part in keypoints)
+        given = () if keypoints is None else tuple(map(np.asarray, keypoints))
         observation, *rest = self._seen(views, given)
         if now is not None and self._bridged(now, rest):
             observation, *rest = self._seen(views, given)
@@ -160,26 +168,25 @@ class Pilot:
         action, command, release, self._memory = self._decide(observation, self._memory)
         self._unasked = self._previous[:, 4]
         self._previous, self._fresh, self._steps = action, self._later, self._steps + 1
-        points, valid = (part.numpy() for part in seen) if seen else (None, None)
-        out = PilotOutput(action.numpy(), command.numpy(), release.numpy(), observation.numpy(), points, valid)
+        points, valid = seen if seen else (None, None)
         self.spent = (decided - begin, time.perf_counter() - decided)
-        return out
+        return PilotOutput(action, command, release, observation, points, valid)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of none, as in training."""
-        self._previous = torch.cat([self._previous[:, :4], self._unasked[:, None]], dim=-1)
+        self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
-    def _seen(self, views: Tensor, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    def _seen(self, views: np.ndarray, given: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
         """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
-        carried: tuple[Tensor, ...] = (self._previous, self._history, self._fresh)
+        carried: tuple[np.ndarray, ...] = (self._previous, self._history, self._fresh)
         if self.layout.response:
             carried += (self._answers,)
         if self.layout.fits:
-            carried += (self._goal_fit, torch.full((self.count,), self._steps * self.period))
-        observed: tuple[Tensor, ...] = (self._observe_given if given else self._observe)(views, *carried, *given)
-        return observed
+            self._time[:] = self._steps * self.period
+            carried += (self._goal_fit, self._time)
+        return (self._observe_given if given else self._observe)(views, *carried, *given)
 
-    def _bridged(self, now: float, seen: Sequence[Tensor]) -> bool:
+    def _bridged(self, now: float, seen: Sequence[np.ndarray]) -> bool:
         """Make history and response those of steps a period apart, as in training; whether steps before this one were late or missing.
 
         Args:
@@ -190,15 +197,15 @@ class Pilot:
         due = [now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER]
         late = len(due) != len(times) or any(abs(time - when) > JITTER for time, when in zip(times, due))
         if late:
-            self._history = ob.resampled(self._history, seen[0][:, 0], ages, period)
+            self._history = _resampled(self._history, seen[0], ages, period)
             if self.layout.response:
-                self._answers = ob.resampled(self._answers, seen[1][:, 0], ages, period)
+                self._answers = _resampled(self._answers, seen[1], ages, period)
             self._steps += max(round(ages[0] / period) - 1, 0)
             times = tuple(due)
         self._times = (now, *times[: rows - 1])
         return late
 
-    def _measured(self, *views: np.ndarray | bool) -> Tensor:
+    def _measured(self, *views: np.ndarray | bool) -> np.ndarray:
         """The measurements of one step side by side, shape (E, 20): the columns of :data:`VIEWS`.
 
         Raises ValueError: one of another shape.
@@ -206,12 +213,11 @@ class Pilot:
         at = 0
         for (name, width), value in zip(VIEWS.items(), views):
             array = np.asarray(value)
-            shared = array.shape == (1, width) and name in ("goal_w", "attached")
-            if array.shape != (self.count, width) and not shared:
+            if array.shape != (self.count, width) and not (name in SHARED and array.shape == (1, width)):
                 raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
             self._views[:, at : at + width] = array
             at += width
-        return torch.from_numpy(self._views)
+        return self._views
 
     def _observed(self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor) -> tuple[Tensor, ...]:
         """Assemble the observation, shape (E, D).
@@ -265,7 +271,7 @@ class Pilot:
         if self.camera is None:
             raise PolicyError("this pilot has no camera")
         still, goal_w = np.zeros((self.count, 3)), np.asarray(goal_w).reshape(-1, 3)
-        views = self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1)))
+        views = torch.from_numpy(self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1))))
         pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
         points, valid = seen_keypoints(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()
