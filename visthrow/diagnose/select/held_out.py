@@ -65,28 +65,19 @@ def select(
         least: threshold [nats].
         begin: a set to begin from; causes that hide each other are not found one by one.
     """
-    active = _without_idle(information, score, priors, least, list(begin))
-    while len(active) < MOST_NAMES:
+    active, new = list(begin), []
+    while True:
+        whole = log_evidence(information, score, priors, [*active, *new])
+        for j in list(active):  # without those that the others make superfluous
+            rest = [k for k in active if k != j]
+            if whole - (left := log_evidence(information, score, priors, [*rest, *new])) < least:
+                active, whole = rest, left
+        active += new
         gain = additions(information, score, priors, active)
         best = int(np.argmax(gain))
-        if gain[best] <= least:
-            break
-        active = [*_without_idle(information, score, priors, least, [*active, best], active), best]
-    return active
-
-
-def _without_idle(
-    information: np.ndarray, score: np.ndarray, priors: Priors, least: float, active: list[int], asked: Sequence[int] | None = None
-) -> list[int]:
-    """A set without those that the others make superfluous; ``asked``: which may go, and which alone are returned."""
-    asked = list(active if asked is None else asked)
-    whole = log_evidence(information, score, priors, active)
-    for j in list(asked):
-        rest = [k for k in active if k != j]
-        if whole - log_evidence(information, score, priors, rest) < least:
-            active, whole = rest, log_evidence(information, score, priors, rest)
-            asked.remove(j)
-    return asked
+        if len(active) >= MOST_NAMES or gain[best] <= least:
+            return active
+        new = [best]
 
 
 def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
