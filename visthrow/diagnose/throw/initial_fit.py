@@ -65,7 +65,7 @@ class InitialFit:
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
         self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
         # deviation of each window's samples from a flight without gusts: noise, and how far gusts may have led by then
-        self._spreads = [np.hypot(flights.sigma(w), own) for w, own in enumerate(self._drift)]
+        self._spreads = [np.hypot(flights.sigma[w], own) for w, own in enumerate(self._drift)]
         self._scales: dict[int, tuple] = {}  # the last slopes and deviations of a window, and what comes of them
         self._sensitive, ends = zip(*[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))])
         self._shortened = flights.ended(ends)
@@ -161,13 +161,13 @@ class InitialFit:
 
     def _lower_gusts(self, w: int, residual: np.ndarray) -> bool:
         """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
-        square, noise, drift = residual**2, self.flights.sigma(w) ** 2, self._drift[w] ** 2
+        square, noise, drift = residual**2, self.flights.sigma[w] ** 2, self._drift[w] ** 2
         samples = np.count_nonzero(self._sensitive[w])
         calmer = [g for g in CALMER if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < samples]
         if not calmer:
             return False
         self._gusts[w] = min(calmer)
-        self._spreads[w] = np.hypot(self.flights.sigma(w), self._gusts[w] * self._drift[w])
+        self._spreads[w] = np.hypot(self.flights.sigma[w], self._gusts[w] * self._drift[w])
         return True
 
     def _slopes(self, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
@@ -223,7 +223,7 @@ class InitialFit:
 
 def drift(flights: Flights, w: int) -> np.ndarray:
     """How far gusts may have led a window's samples by their time, as a deviation, shape (N,)."""
-    since = np.maximum(flights.time(w) - flights.cuts[w].start, 0.0)
+    since = np.maximum(flights.time[w] - flights.cuts[w].start, 0.0)
     return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
 
 
@@ -232,7 +232,7 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
 
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
     """
-    c, time = flights.cuts[w], flights.time(w)
+    c, time = flights.cuts[w], flights.time[w]
     left = flights.flights[c.flight].latch + lag - EARLIER
     if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
         return np.ones(len(time)), c.end
@@ -245,8 +245,8 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
     ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as known [s].
     Returns changes in the state's units by the effects' sizes, shape (D, K).
     """
-    samples = len(flights.time(w))  # and those of a camera, which tell nothing of states
-    weight = (sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma(w), drift(flights, w)))[:, None]
+    samples = len(flights.time[w])  # and those of a camera, which tell nothing of states
+    weight = (sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma[w], drift(flights, w)))[:, None]
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight
     by_effect = (by_state * weight).T @ window.effects[:samples]

@@ -89,7 +89,7 @@ class Plan:
         c, (effects, states, latents) = f.cuts[w], slopes
         own = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
-            c.flight, c.phase, f.time(w), channel, residual, f.sigma(w), effects, states,
+            c.flight, c.phase, f.time[w], channel, residual, f.sigma[w], effects, states,
             np.array([directions[d].spread(c) for d in self.nuisances]), latents,
             np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
             np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.after_slack,

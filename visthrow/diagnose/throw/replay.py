@@ -79,6 +79,7 @@ class Flights:
 
     Attributes:
         cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in vectors. recording: for a replay.
+        time: stamps of each window's samples [s], shape (N,). sigma: their noise.
     """
 
     def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float]):
@@ -87,7 +88,6 @@ class Flights:
         ``delays``: of vehicle, payload and gyro that the setting knows of [s].
         """
         self.flights, self.cuts = list(flights), list(cuts)
-        self._known: dict[tuple[str, int], np.ndarray] = {}
         self.knots = np.array([int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts])
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
@@ -120,6 +120,14 @@ class Flights:
         }  # fmt: skip
         self.recording = Recording(self.windows, data)
         self.rows = self.recording.rows
+        self.time = self._of_samples("time", ("vehicle", "vehicle", "payload", "gyro"))
+        self.sigma = self._of_samples("sigma", ("vehicle", "attitude", "payload", "gyro"))
+        pairs = [np.stack((own.values, np.zeros_like(own.values)), axis=1).reshape(-1, 3) for own in parts["vehicle"]]
+        self._measured = [np.concatenate((own, p.values, g.values)) for own, p, g in zip(pairs, parts["payload"], parts["gyro"])]
+
+    def _of_samples(self, what: str, names: Sequence[str]) -> list[np.ndarray]:
+        groups = zip(*([getattr(own, what) for own in self.samples[name]] for name in names))
+        return [self.spread(w, *own) for w, own in enumerate(groups)]
 
     def like(self, w: int) -> tuple[int, bool]:
         """What :meth:`alike` depends on: the same of two windows, the same answer."""
@@ -141,21 +149,6 @@ class Flights:
         parts = self.samples[name]
         return Samples(np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0)
 
-    def time(self, w: int) -> np.ndarray:
-        """Stamps of a window's samples [s], shape (N,)."""
-        return self._of_samples("time", w)
-
-    def sigma(self, w: int) -> np.ndarray:
-        """Noise of a window's samples, shape (N,)."""
-        return self._of_samples("sigma", w)
-
-    def _of_samples(self, what: str, w: int) -> np.ndarray:
-        if (what, w) not in self._known:
-            names = ("vehicle", "vehicle" if what == "time" else "attitude", "payload", "gyro")
-            groups = [getattr(self.samples[name][w], what) for name in names]
-            self._known[what, w] = self.spread(w, *groups)
-        return self._known[what, w]
-
     def spread(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
         """A number for every sample of a window, from one for each row of its groups."""
         s = self.samples
@@ -168,13 +161,7 @@ class Flights:
 
     def residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
         """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
-        if ("measured", w) not in self._known:
-            nv = int(self.windows["vehicle_count"][w])
-            measured = np.zeros((int(self.rows[w]), 3))
-            measured[0 : 2 * nv : 2] = self.samples["vehicle"][w].values
-            measured[2 * nv :] = np.concatenate((self.samples["payload"][w].values, self.samples["gyro"][w].values))
-            self._known["measured", w] = measured
-        return (self._known["measured", w] - seen[: int(self.rows[w]), lane]).ravel()
+        return (self._measured[w] - seen[: int(self.rows[w]), lane]).ravel()
 
     def fly(self, simulation: Simulation, states: States, lanes: Sequence[Lane], recording: Recording | None = None) -> Replayed:
         """Fly lanes.

@@ -208,7 +208,7 @@ class ThrowModel:
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         worst, states = np.zeros(len(self.channels)), self._fitted()[0]
         for w, plain, other in zip(self._retained, self._flown(self.setting, states), self._flown(fine, states)):
-            np.fmax.at(worst, self._channel(w), np.abs(plain - other) / self.flights.sigma(w))
+            np.fmax.at(worst, self._channel(w), np.abs(plain - other) / self.flights.sigma[w])
         return dict(zip(self.channels, worst.tolist()))
 
     def landings(self, theta: Mapping[str, float], flights: Sequence[int] | None = None) -> Landings:
