@@ -341,14 +341,11 @@ class _Chooser:
         return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
 
     def _relation(self, path: Group, rate: Group, least: float) -> relations.Relation | None:
-        time, values = self.time, path.values
-        good = np.isfinite(time) & np.all(np.isfinite(values), axis=1)
-        both = good & np.all(np.isfinite(rate.values), axis=1)
-        both[1:] &= np.diff(np.maximum.accumulate(np.nan_to_num(time))) > 0.0
-        if np.sum(both) < 100:
+        time, both = unit_evidence.rising(self.time, np.hstack((path.values, rate.values)))
+        if len(time) < 100:
             return None
-        at, derived = relations.derivative(time[both], values[both], 0.1)
-        found = relations.relate(at, derived, time[both], rate.values[both], reach=0.2)
+        at, derived = relations.derivative(time, both[:, : path.values.shape[1]], 0.1)
+        found = relations.relate(at, derived, time, both[:, path.values.shape[1] :], reach=0.2)
         return found if found is not None and found.correlation > least and abs(found.delay) < 0.15 else None
 
     def _velocities(self) -> None:

@@ -41,7 +41,7 @@ def by_lean(time: np.ndarray, path: np.ndarray, attitudes: Mapping[str, Channel]
     Returns:
         Each pair of units that goes together; none where nothing leans.
     """
-    time, path = _rising(time, path)
+    time, path = rising(time, path)
     found = []
     at, acc = physics.accelerations(time, path, "m", _SPAN)
     for angle, attitude in attitudes.items():
@@ -60,7 +60,7 @@ def by_lean(time: np.ndarray, path: np.ndarray, attitudes: Mapping[str, Channel]
 
 def by_fall(time: np.ndarray, path: np.ndarray) -> str:
     """Find the unit in which a part of a path falls freely: gravity along one axis and nothing level; "" where none does."""
-    acc = physics.accelerations(*_rising(time, path), "m")[1]
+    acc = physics.accelerations(*rising(time, path), "m")[1]
     if not len(acc):
         return ""
     down = GRAVITY * np.vstack([np.eye(3), -np.eye(3)])
@@ -92,7 +92,7 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
     return best if off[best] < MASS_BAD else ""
 
 
-def _rising(time: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rising(time: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that are numbers, later than those before."""
     good = np.isfinite(time) & np.all(np.isfinite(path), axis=1)
     time, path = time[good], path[good]

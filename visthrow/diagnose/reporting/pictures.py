@@ -199,23 +199,19 @@ def confusion(diagnosis: Diagnosis) -> bytes:
     """Correlations of the effects' estimates with all of them free: what these flights cannot tell apart."""
     work = diagnosis.work
     visible = np.flatnonzero(work.problem.priors.visible)
-    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))
+    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))[np.ix_(visible, visible)]
     deviation = np.sqrt(np.diag(sigma))
     correlation = sigma / np.outer(deviation, deviation)
-    off = np.abs(correlation - np.eye(len(correlation)))
-    off[~work.problem.priors.visible] = 0.0
-    strongest = np.argsort(-np.where(np.isin(np.arange(len(off)), work.active), 2.0, off.max(axis=1)))
-    at = np.sort([j for j in strongest if work.problem.priors.visible[j]][:SHOWN_EFFECTS])
-    names = [work.problem.model.effects[j].name for j in at]
+    strongest = np.where(np.isin(visible, work.active), 2.0, np.abs(correlation - np.eye(len(visible))).max(axis=1, initial=0.0))
+    at = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
+    names = [work.problem.model.effects[j].name for j in visible[at]]
     figure, axes = _figure(1, 1, 1.6 + 0.3 * len(at))
-    axis = axes[0, 0]
-    image = axis.imshow(correlation[np.ix_(at, at)], vmin=-1.0, vmax=1.0, cmap="RdBu_r")
-    for i in range(len(at)):
-        for j in range(len(at)):
-            value = correlation[at[i], at[j]]
-            if i != j and abs(value) > 0.3:
-                colour = "white" if abs(value) > 0.7 else style.INK
-                axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+    axis, shown = axes[0, 0], correlation[np.ix_(at, at)]
+    image = axis.imshow(shown, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    for (i, j), value in np.ndenumerate(shown):
+        if i != j and abs(value) > 0.3:
+            colour = "white" if abs(value) > 0.7 else style.INK
+            axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
     axis.set_xticks(range(len(at)), names, rotation=60, ha="right", fontsize=8)
     axis.set_yticks(range(len(at)), names, fontsize=8)
     figure.colorbar(image, ax=axis, shrink=0.7, label="correlation")
