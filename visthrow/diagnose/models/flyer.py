@@ -133,7 +133,6 @@ class FlyerModel(NumericModel):
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         p, start = self.params, stretch.data["start"]
-        delays = {0: self.of(lanes, "pose_delay"), 1: self.of(lanes, "payload_delay"), 2: np.zeros(len(path))}
         out = np.empty((len(path), len(stretch.time)))
         for channel, name in enumerate(self.channels):
             own = stretch.channel == channel
@@ -145,7 +144,7 @@ class FlyerModel(NumericModel):
                 grid = start + p.step * np.arange(path.shape[1])
                 out[:, own] = np.array([on_grid(grid, x[:, at : at + 3], time) for x in path]).reshape(len(path), -1)
                 continue
-            late = time[None] - delays[channel][:, None]
+            late = time[None] - self.of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
             value, rate = path[..., 0:3], path[..., 3:6]
             if name == "payload_pos_w":
                 value, rate = value + path[..., 6:9], rate + path[..., 9:12]

@@ -27,6 +27,7 @@ FEWEST = 20  # samples of a window
 FARTHEST = 2.0 * np.pi  # median distance from where the pendulum hangs [rad]: no free swing goes round and round most of the time
 SMOOTH = 0.02  # dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator
 
+
 @dataclass(frozen=True)
 class PendulumParams:
     """The pendulum that is assumed before anything is found."""
@@ -131,4 +132,3 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
             )
         )  # fmt: skip
     return found
-

@@ -73,7 +73,6 @@ class TrimModel(NumericModel):
         per_map = thrust / (np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None])
         return command_of(p.thrust_map, per_map)
 
-
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; nothing tells the attitude, hence not the body's velocity either."""
         data, (start, end) = stretch.data, np.unique(stretch.latent_time)
