@@ -38,11 +38,9 @@ def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple
     of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
     floors = floors_of(problem, after)
     for block in blocks:
-        phases = [phase for b, phase in after.noise.latent_sd if b == block]
-        limits = {phase: of[phase].upper_limit(block) for phase in phases}
-        quiet_phase = min(limits, key=limits.get)
-        quiet = limits[quiet_phase]
-        for phase in phases:
+        limits = {phase: of[phase].upper_limit(block) for b, phase in after.noise.latent_sd if b == block}
+        quiet = min(limits.values())
+        for phase in limits:
             level = after.noise.latent_sd[block, phase]
             nats, most = 0.0, max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
             if level > most:
