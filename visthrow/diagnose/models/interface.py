@@ -30,11 +30,11 @@ class Window:
     phase: str  # hover, flight, throw or ballistic; free text for other models
     time: np.ndarray  # of the samples, in the flight's clock [s], shape (N,)
     channel: np.ndarray  # index into Model.channels, shape (N,)
-    residual: np.ndarray  # measured minus simulated, in the channel's unit, shape (N,)
+    residual: np.ndarray  # measured minus simulated, from b = 0 along the derivatives, in the channel's unit, shape (N,)
     sigma: np.ndarray  # standard deviation of the sensor noise, same unit, shape (N,)
     effects: np.ndarray  # S: derivative of the simulated sample by theta, shape (N, K)
     nuisance: np.ndarray  # X, shape (N, D)
-    nuisance_sd: np.ndarray  # vague prior of b, shape (D,)
+    nuisance_sd: np.ndarray  # vague prior of b, about 0, shape (D,)
     latent: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
     latent_block: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # index into LATENT_BLOCKS, shape (G,)
     latent_axis: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # 0, 1, 2 for x, y, z, shape (G,)

@@ -13,7 +13,7 @@ from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.replay import Flights, Lane, Simulation
-from visthrow.diagnose.throw.states import Direction, States, concerns, directions, moved_along, rows_of, stacked
+from visthrow.diagnose.throw.states import MOVED, Direction, States, concerns, directions, moved_along, rows_of, stacked
 
 DAMPING, DAMPING_MOST = 1e-3, 1e5  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
 ROUNDS = 25
@@ -43,7 +43,6 @@ class _Trial:
     """A step of each of L windows."""
 
     states: States  # where it leads
-    steps: np.ndarray  # shape (L, directions)
     damping: np.ndarray  # shape (L,)
     hoped: np.ndarray  # fall of the cost that it promises, shape (L,)
     whole: np.ndarray  # that of the least damped one that was tried, shape (L,)
@@ -73,12 +72,11 @@ class InitialFit:
     def fit(self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
-        ``starts``: states to begin with, each window with the best of its own; those that do not count keep the last; ``slopes``: of
-        windows' samples by their states, as :attr:`slopes` of another fit has them.
+        ``starts``: states to begin with, each window with the best of its own, and how far they were moved before; those that do not count
+        keep the last; ``slopes``: of windows' samples by their states, as :attr:`slopes` of another fit has them.
         """
         count = len(self.flights.cuts)
-        moves, damping = np.zeros((count, len(self.directions))), np.full(count, DAMPING)
-        left, promised = self.retained, np.full(count, np.inf)
+        damping, left, promised = np.full(count, DAMPING), self.retained, np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         states, residuals, cost = self._best(starts)
@@ -86,7 +84,7 @@ class InitialFit:
         for _ in range(ROUNDS):
             self.slopes |= self._slopes(states, left[stale[left]])
             aged &= ~stale
-            trial = self._tried(states, left, residuals, moves, damping, doubtful)
+            trial = self._tried(states, left, residuals, damping, doubtful)
             helps = trial.cost < cost[left]
             tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
             tried[left], hoped[left], whole[left] = trial.cost, np.where(helps, trial.hoped, trial.whole), trial.whole
@@ -96,7 +94,6 @@ class InitialFit:
             states = {name: value.copy() for name, value in states.items()}
             for name, value in states.items():
                 value[left[rows]] = trial.states[name][rows]
-            moves[left[rows]] += trial.steps[rows]
             fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
             enough = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
             little = better & (fall < enough)
@@ -130,22 +127,22 @@ class InitialFit:
         return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))}, cost
 
     def _tried(
-        self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], moves: np.ndarray, damping: np.ndarray,
-        doubtful: np.ndarray,
+        self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], damping: np.ndarray, doubtful: np.ndarray,
     ) -> _Trial:  # fmt: skip
         """The next step of each window that is left, or the best of several."""
         rungs = np.where(doubtful[left], len(LADDER), 1)
         which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
         dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
         each(self._scaled, left)
-        found = [self._increments(w, residuals[w], moves[w], its) for w, its in zip(left, dampings)]
+        found = [self._increments(w, residuals[w], states[MOVED][w], its) for w, its in zip(left, dampings)]
         tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*found))
         there = moved_along(rows_of(states, which), self.directions, steps)
+        there[MOVED] = there[MOVED] + steps
         seen = self._residuals(there, which)
         cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
         best = np.array([at + cost[at : at + n].argmin() for at, n in zip(first, rungs)])
         rest = [seen[lane] for lane in best]
-        return _Trial(rows_of(there, best), steps[best], tries[best], hoped[best], hoped[first], cost[best], rest)
+        return _Trial(rows_of(there, best), tries[best], hoped[best], hoped[first], cost[best], rest)
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
         """Residuals of windows, of what depends on their initial states; a row of the states for each."""

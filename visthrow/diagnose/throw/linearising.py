@@ -79,17 +79,18 @@ class Plan:
 
     def window_of(
         self, flights: Flights, setting: Setting, directions: Sequence[Direction], channel: np.ndarray, residual: np.ndarray,
-        slopes: Sequence[np.ndarray], knots: Mapping[str, np.ndarray],
+        slopes: Sequence[np.ndarray], knots: Mapping[str, np.ndarray], moved: np.ndarray,
     ) -> Window:  # fmt: skip
         """What comes of the lanes.
 
-        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated quantities at all its knots.
+        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated quantities at all its knots; ``moved``: how far
+        each window's state was moved from where its prior has its middle, shape (W, directions): there the residual is taken.
         """
         w, f = self.window, flights
         c, (effects, states, latents) = f.cuts[w], slopes
         own = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
-            c.flight, c.phase, f.time[w], channel, residual, f.sigma[w], effects, states,
+            c.flight, c.phase, f.time[w], channel, residual + states @ moved[w, list(self.nuisances)], f.sigma[w], effects, states,
             np.array([directions[d].spread(c) for d in self.nuisances]), latents,
             np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
             np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.after_slack,

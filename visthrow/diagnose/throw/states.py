@@ -30,6 +30,8 @@ HUNG = 0.1
 0.02 rad out of noise; they whip, and tell of the rope's and the payload's mass what is not so."""
 
 States = dict[str, np.ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
+MOVED = "moved"
+"""Beside the fields: how far a fit moved each state along the directions from where their prior has its middle, shape (S, directions)."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,16 @@ from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
 from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, Simulation, carried, downloaded
-from visthrow.diagnose.throw.states import Direction, States, concerns, directions, moved_along, resampled, rows_of
+from visthrow.diagnose.throw.states import (
+    MOVED,
+    Direction,
+    States,
+    concerns,
+    directions,
+    moved_along,
+    resampled,
+    rows_of,
+)
 from visthrow.logs.flightlog import FlightLog
 
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
@@ -89,6 +98,7 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
+        self._before: dict[frozenset[str], list[np.ndarray]] = {}  # what the fits of the latest states took from windows' residuals
         self._lock = threading.Lock()  # residuals may be asked for side by side
         self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
@@ -120,6 +130,7 @@ class ThrowModel:
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(simulation, steps[:graded], begun, batch)
+        self._before[self._switches(theta)] = [x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, found)]
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, found)
@@ -142,7 +153,12 @@ class ThrowModel:
         other = apply(self.entries, self.setting, elsewhere)
         start = self._latest[self._switches(elsewhere)] = self._settled(other)
         sign = -1.0 if on else 1.0
-        return [sign * (x.residual - there) for x, there in zip(windows, self._flown(other, start))]
+        before = self._before[self._switches(theta)]
+        return [sign * (x.residual - own - there) for x, own, there in zip(windows, before, self._flown(other, start))]
+
+    def _moved(self, states: States, w: int) -> np.ndarray:
+        """How far a window's state is from the middle of its prior, in its directions, shape (D,)."""
+        return states[MOVED][w, [concerns(x, self.flights.cuts[w]) for x in self._directions]]
 
     def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
@@ -150,12 +166,17 @@ class ThrowModel:
         return [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
 
     def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled last with the same kinds of blocks."""
+        """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled last with the same kinds of blocks.
+
+        Until windows are asked for, they are those of the states that were fitted; then those from the middle of the states' prior.
+        """
         setting = apply(self.entries, self.setting, theta)
         states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
+        before = self._before.get(self._switches(theta), [np.zeros(1)] * len(self._retained)) if about is None else []
         if about is not None:
             states, moves = self._following(setting, theta, about)
         flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
+        flown = [r + own for r, own in zip(flown, before)] or flown
         held = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
         direct = [[kind.samples(w)[1] - kind.predicted(w, setting) for kind in own] for w, own in zip(self._retained, held)]
         full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
@@ -183,7 +204,8 @@ class ThrowModel:
             _, owns, by_effect = self._follows
         sizes = by_effect @ change
         states = moved_along(self._settled_at[_key(about.theta)], found, sizes)
-        return states, {i: sizes[self._retained[i], own] for i, own in owns.items()}
+        moved = sizes + self._settled_at[_key(about.theta)][MOVED]
+        return states, {i: moved[self._retained[i], own] for i, own in owns.items()}
 
     def _ways(self, found: Sequence[Direction], about: Linearised, effects: int) -> tuple[dict[int, list[int]], np.ndarray]:
         """Which directions each window's state has, and how it follows the effects in them, shape (W, directions, K)."""
@@ -218,7 +240,7 @@ class ThrowModel:
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other = copy.copy(self)
-        other._settled_at, other._follows, other._secants = {}, None, {}  # of other windows
+        other._settled_at, other._before, other._follows, other._secants = {}, {}, None, {}  # of other windows
         other.flights = self._cut(self.flights.flights, cuts)
         other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return other
@@ -234,7 +256,9 @@ class ThrowModel:
 
     def _through(self, setting: Setting) -> tuple[States, States]:
         """See :func:`visthrow.diagnose.throw.replay.carried`."""
-        return carried(self.flights, self.simulation(setting))
+        states, ends = carried(self.flights, self.simulation(setting))
+        states[MOVED] = np.zeros((len(self.flights.cuts), len(directions(setting.plant))))
+        return states, ends
 
     def _initial_fit(self, setting: Setting) -> InitialFit:
         """What fits initial states in a setting."""
@@ -266,9 +290,11 @@ class ThrowModel:
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting)
-        starts = [resampled(states, setting.plant.rope.segments), self._through(setting)[0]]
         ways = [[(x.field, x.axis, x.part) for x in found] for found in (fitter.directions, directions(self.setting.plant))]
-        return fitter.fit(starts, slopes if ways[0] == ways[1] else None)
+        start = dict(resampled(states, setting.plant.rope.segments))
+        if ways[0] != ways[1]:
+            start[MOVED] = np.stack([states[MOVED][:, ways[1].index(x)] if x in ways[1] else np.zeros(len(states[MOVED])) for x in ways[0]], 1)
+        return fitter.fit([start, self._through(setting)[0]], slopes if ways[0] == ways[1] else None)
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
@@ -312,7 +338,7 @@ class ThrowModel:
 
         def window(i: int) -> Window:
             w, own = plans[i].window, parts[3 * i : 3 * i + 3]
-            given = self._channel(w), f.residual(nominal, w, i), own, flown.knots
+            given = self._channel(w), f.residual(nominal, w, i), own, flown.knots, states[MOVED]
             return still(plans[i].window_of(f, settings[0], self._directions, *given), blocks, settings[0].plant.air.wind_w)
 
         return each(window, range(len(plans)))
