@@ -130,7 +130,17 @@ def test_importing_visthrow_and_the_command_line_is_cheap():
 
 
 def test_a_process_that_throws_on_the_reference_plant_needs_no_trainer():
-    """Tensordict brings torch's compiler along, which takes about as long to import as torch itself."""
-    code = "import sys, visthrow.throws.reference_protocol, visthrow.throws.loading; print(*sys.modules)"
+    """Tensordict brings torch's compiler along, which takes about as long to import as torch itself; so did a pilot's first step."""
+    code = """
+import sys
+import numpy as np
+import visthrow.throws.reference_protocol
+from visthrow.onboard.pilot import Pilot
+from visthrow.throws.loading import load_policy
+loaded = load_policy("vision")
+level, still = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
+Pilot(loaded.policy, loaded.experiment.camera).act(still, level, still, still, still - [0.0, 0.0, 0.4], still)
+print(*sys.modules)
+"""
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert {"tensordict", "rsl_rl", "torch._dynamo"}.isdisjoint(result.stdout.split())

@@ -76,6 +76,11 @@ class Traced:
 class _Recording(TorchDispatchMode):
     """Keeps what reaches torch, and puts what is new side by side."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Say that nobody compiles this: torch would import its compiler, 1.3 s of a core at the first recording, to leave it alone."""
+        return False
+
     def __init__(self) -> None:
         super().__init__()
         self.calls: list[Call] = []
