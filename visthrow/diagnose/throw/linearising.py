@@ -83,8 +83,8 @@ class Plan:
     ) -> Window:  # fmt: skip
         """What comes of the lanes.
 
-        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated quantities at all its knots; ``moved``: how far
-        each window's state was moved from where its prior has its middle, shape (W, directions): there the residual is taken.
+        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated quantities at all its knots; ``moved``:
+        how far each window's state was moved from where its prior has its middle, shape (W, directions): there the residual is taken.
         """
         w, f = self.window, flights
         c, (effects, states, latents) = f.cuts[w], slopes

@@ -293,7 +293,8 @@ class ThrowModel:
         ways = [[(x.field, x.axis, x.part) for x in found] for found in (fitter.directions, directions(self.setting.plant))]
         start = dict(resampled(states, setting.plant.rope.segments))
         if ways[0] != ways[1]:
-            start[MOVED] = np.stack([states[MOVED][:, ways[1].index(x)] if x in ways[1] else np.zeros(len(states[MOVED])) for x in ways[0]], 1)
+            moved = dict(zip(ways[1], states[MOVED].T))
+            start[MOVED] = np.stack([moved.get(way, np.zeros(len(states[MOVED]))) for way in ways[0]], axis=1)
         return fitter.fit([start, self._through(setting)[0]], slopes if ways[0] == ways[1] else None)
 
     @staticmethod
