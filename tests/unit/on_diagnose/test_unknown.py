@@ -236,6 +236,14 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
         np.testing.assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
 
 
+def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
+    at = beside_a_law(with_a_name_for_the_law(0.1), [1])
+    strongest = terms.strongest_forces(at.nominal)
+    found, beside = (terms.shortlist(at.problem, at.nominal, [], strongest, 4.0, names) for names in ([], [1]))
+    assert DRAG in [effect.term for effect in found]
+    assert DRAG not in [effect.term for effect in beside]
+
+
 def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
     """Appended to what the windows say it is the column that a linearisation gives; without it nothing has changed."""
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)

@@ -387,7 +387,8 @@ class Selector(SearchState):
         instead = [(self.nominal, self.terms)] if self.names else []
         for point, rest in [*instead, *([(self.point, self.names)] if self.terms else [])]:
             stead = [log_evidence(point.information, point.score, self.priors, s) for s in (self.active, rest)]
-            short += terms.shortlist(self.problem, point, rest, strongest, max(self.least, HOPELESS * (stead[0] - stead[1])))
+            enough = max(self.least, HOPELESS * (stead[0] - stead[1]))
+            short += terms.shortlist(self.problem, point, rest, strongest, enough, [j for j in self.names if j not in rest])
         short = list({effect.term: effect for effect in reversed(short)}.values())
         if not short:
             return False

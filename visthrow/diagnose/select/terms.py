@@ -144,13 +144,26 @@ def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: i
 
 def gains(point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach`` strong at the knots."""
-    sigma = covariance(point.information, priors.deviation(list(active)))
-    own = np.maximum(of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0)
-    score = of.score - of.cross @ (sigma @ point.score)
+    own, score = _beside(point, priors.deviation(list(active)), of)
     prior = reach / np.maximum(of.size, 1e-12 * of.size.max() + 1e-300)
     gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
     gain[of.size <= 1e-9 * of.size.max()] = -np.inf
     return gain, prior
+
+
+def _beside(point: Point, deviation: np.ndarray, of: Screen) -> tuple[np.ndarray, np.ndarray]:
+    """Information and score of each term, of what effects of these prior deviations leave."""
+    sigma = covariance(point.information, deviation)
+    own = np.maximum(of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0)
+    return own, of.score - of.cross @ (sigma @ point.score)
+
+
+def _unsaid(point: Point, priors: Priors, active: Sequence[int], of: Screen, name: int) -> np.ndarray:
+    """The same as :func:`beyond` of each term that is screened."""
+    deviation = priors.deviation(list(active))
+    deviation[name] = priors.slab[name] / NARROW
+    own, score = _beside(point, deviation, of)
+    return 0.5 * score**2 / np.maximum(own, 1e-300)
 
 
 def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
@@ -213,11 +226,13 @@ def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     return own, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
-def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float) -> list[TermEffect]:
+def shortlist(
+    problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float, names: Sequence[int] = ()
+) -> list[TermEffect]:
     """The terms that say most beside a set of names, by the linear statistics.
 
     ``strongest``: latent force of each block where the model stood alone [N or N m]; ``least``: nats that a term must bring beyond its
-    price.
+    price; ``names``: that are not in the set: a term that one of these says as well is none.
     """
     calm, parts = calmed(point)
     known = [Known(window.knots) for window in point.windows]
@@ -228,6 +243,8 @@ def shortlist(problem: Problem, point: Point, active: Sequence[int], strongest: 
     for block, of in screens.items():
         gain, prior = gains(calm, problem.priors, active, of, UNKNOWN_RATIO * strongest[block])
         gain -= [price[term.depth] for term in of.terms]
+        said = [_unsaid(calm, problem.priors, active, of, name) < LAW for name in names]
+        gain[np.any(said, axis=0)] = -np.inf
         found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
     there = {e.term for e in problem.effects if isinstance(e, TermEffect)}
     best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[:WEIGHED]
