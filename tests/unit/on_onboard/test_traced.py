@@ -9,6 +9,7 @@ import torch.nn.functional as F
 
 from hil.params import HilParams
 from visthrow import config
+from visthrow.onboard import traced
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.pilot import VIEWS, Pilot
 from visthrow.onboard.policy import Policy
@@ -38,7 +39,7 @@ def drawn_views(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("given", [False, True])
-@pytest.mark.parametrize("count", [1, 7])
+@pytest.mark.parametrize("count", [1, 3, 7])
 @pytest.mark.parametrize("name", ["state", "vision", "vision_betaflight"])
 def test_observation_and_decision_of_shipped_policies(name, count, given):
     pilot = Pilot(Policy.load(find_policy(name)), config.load(HilParams, config.find("hil", "fake")).camera, count)
@@ -120,6 +121,12 @@ def test_a_copy_has_memory_of_its_own():
     other = copy.deepcopy(traced)
     equal(other, [np.full((1, 3), 2.0, np.float32)])
     equal(traced, [np.full((1, 3), 3.0, np.float32)])
+
+
+def test_a_recording_that_gives_other_numbers_is_refused(monkeypatch):
+    monkeypatch.setitem(traced.EXACT, "add", np.subtract)
+    with pytest.raises(RuntimeError, match=r"result 0 of .*lambda.* is another one"):
+        Traced(lambda x: (x + 1.0,))(np.ones(3, dtype=np.float32))
 
 
 def test_a_function_with_a_memory_is_refused():
