@@ -43,6 +43,9 @@ SINGLE = (
 )  # fmt: skip
 """Effects that a few seconds of flight show and the tool finds quickly."""
 PAIRED = ("com_x", "com_y", "rope_length", "wind_x", "rotor_drag", "motor_1", "marker_rot_x", "mass_payload")
+LOST = 0.08
+"""Share of lost commands: told in 32 of 34 such worlds. Of 0.15 it was told alone in 20 of 23, for flights seem to differ besides; of 0.05
+in 14 of 20."""
 UNKNOWN_LAWS = ("law_ball_swirl", "law_vehicle_swirl", "law_speed_thrust")
 
 
@@ -68,7 +71,7 @@ def kinds(rng: np.random.Generator) -> list[Kind]:
     singles[-1] = replace(singles[-1], plant="string")
     pair = Kind(tuple(map(str, rng.choice(PAIRED, 2, replace=False))), "rod")
     law = Kind((str(rng.choice(UNKNOWN_LAWS)),), "rod")
-    return [*singles, pair, law, Kind((), "rod", lost=0.15), Kind((), "rod"), Kind((), "string")]
+    return [*singles, pair, law, Kind((), "rod", lost=LOST), Kind((), "rod"), Kind((), "string")]
 
 
 def right(recipe: Recipe, verdict: dict) -> bool:
