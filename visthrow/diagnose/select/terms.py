@@ -159,7 +159,7 @@ def _beside(point: Point, deviation: np.ndarray, of: Screen) -> tuple[np.ndarray
 
 
 def _unsaid(point: Point, priors: Priors, active: Sequence[int], of: Screen, name: int) -> np.ndarray:
-    """The same as :func:`beyond` of each term that is screened."""
+    """Nats of each screened term that a name, whatever its size, does not explain, shape (T,); see :func:`beyond`."""
     deviation = priors.deviation(list(active))
     deviation[name] = priors.slab[name] / NARROW
     own, score = _beside(point, deviation, of)

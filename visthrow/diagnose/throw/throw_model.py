@@ -172,11 +172,11 @@ class ThrowModel:
         """
         setting = apply(self.entries, self.setting, theta)
         states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
-        before = self._before.get(self._switches(theta), [np.zeros(1)] * len(self._retained)) if about is None else []
         if about is not None:
             states, moves = self._following(setting, theta, about)
         flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
-        flown = [r + own for r, own in zip(flown, before)] or flown
+        if about is None and (before := self._before.get(self._switches(theta))) is not None:
+            flown = [r + own for r, own in zip(flown, before)]
         held = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
         direct = [[kind.samples(w)[1] - kind.predicted(w, setting) for kind in own] for w, own in zip(self._retained, held)]
         full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
