@@ -192,7 +192,7 @@ def _struct(t: Types, struct: type, fields: Mapping, values: Mapping[str, np.nda
     for name, (kind, by_row) in fields.items():
         value = np.asarray(values[name], dtype=np.int32 if kind == "int" else real)
         value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if by_row else value)
-        setattr(out, name, wp.array(value, dtype=scalar[kind], device=device))
+        setattr(out, name, wp.array(value, dtype=scalar[kind], device=device, copy=device != "cpu"))
     return out
 
 

@@ -345,9 +345,10 @@ def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Stati
         column, score = statistics.information[:, :, j], statistics.score
         own = column[:, j]
         part = size**2 / (1.0 + size**2 * own)
+        said = (part[:, None] * column)[:, :, None] * column[:, None, :]
         statistics = replace(
             statistics,
-            information=statistics.information - part[:, None, None] * column[:, :, None] * column[:, None, :],
+            information=np.subtract(statistics.information, said, out=said),
             score=score - (part * score[:, j])[:, None] * column,
             square=statistics.square - part * score[:, j] ** 2 + np.log1p(size**2 * own),
         )

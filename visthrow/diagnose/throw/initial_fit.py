@@ -6,6 +6,7 @@ long as each brings what it promised, and may come from another setting whose st
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -254,5 +255,9 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
 
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
-    count = len(states["pos_w"])
-    return stacked([states, *(moved_along(states, [d], np.full((count, 1), d.step)) for d in directions)])
+    rows, parts = np.arange(len(states["pos_w"])), [states]
+    for _, own in groupby(directions, key=lambda d: d.field):
+        group = list(own)
+        steps = np.repeat(np.diag([d.step for d in group]), len(rows), axis=0)
+        parts.append(moved_along(rows_of(states, np.tile(rows, len(group))), group, steps))
+    return stacked(parts)
