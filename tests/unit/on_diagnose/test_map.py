@@ -112,18 +112,52 @@ def test_what_is_not_known_is_asked(tmp_path):
         table_of(tmp_path / "a.ulg")
 
 
-@pytest.mark.parametrize(("length", "angle"), [("m", "rad"), ("cm", "rad"), ("mm", "rad"), ("m", "deg"), ("mm", "deg")])
+def unnamed(columns: dict[str, np.ndarray], length: str, angle: str, above: float = 0.0) -> dict[str, np.ndarray]:
+    """Position, over a point so far above the floor, and angles, in units that no name says."""
+    angles = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, :0:-1] / UNITS[angle][1]
+    path = (columns["pos_w"] - [0.0, 0.0, above]) / UNITS[length][1]
+    return {"time": columns["time"], **named("pos", path), "roll": angles[:, 0], "pitch": angles[:, 1], "yaw": 0.0 * angles[:, 0]}
+
+
+@pytest.mark.parametrize(("length", "angle"), [(of, leaning) for of in ("m", "cm", "mm") for leaning in ("rad", "deg")])
 def test_gravity_says_the_units_that_no_name_says(length, angle):
     """A gentle flight, whose degrees could be radians: in the right units it accelerates level as it leans."""
-    columns = flight(20.0, scale=0.05)
-    angles = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, :0:-1] / UNITS[angle][1]
-    path = columns["pos_w"] / UNITS[length][1]
-    found = propose({"time": columns["time"], **named("pos", path), "roll": angles[:, 0], "pitch": angles[:, 1],
-                     "yaw": 0.0 * angles[:, 0]}, "a.csv")  # fmt: skip
+    found = propose(unnamed(flight(20.0, scale=0.05), length, angle), "a.csv")
     assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": length, "quat_wb": angle}
     assert f"{length} by gravity" in found.why["pos_w"]
     assert f"{angle} by gravity" in found.why["quat_wb"]
     assert not found.questions
+
+
+@pytest.mark.parametrize(("seed", "asked"), [(0, False), (2, True)])
+def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_about(seed, asked):
+    """About the origin both stay in a hall, and a hundredth of the path is near a 57th of the lean."""
+    found = propose(unnamed(flight(20.0, seed=seed, scale=0.05), "cm", "deg", above=2.9), "a.csv")
+    if asked:
+        (question,) = found.questions
+        assert "are they in m and rad (0.97 times) or cm and deg (0.97 times)?" in question
+        assert "are a guess" in question
+        assert not any("by gravity" in why for why in found.why.values())
+    else:
+        assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "cm", "quat_wb": "deg"}
+        assert not found.questions
+    both = {c.name: c.unit for c in propose(unnamed(flight(20.0, seed=seed, scale=0.05), "m", "rad", above=2.9), "a.csv").mapping.channels}
+    assert both == {"pos_w": "m", "quat_wb": "rad"}
+
+
+def test_angles_that_would_turn_a_flight_over_are_in_degrees():
+    found = propose(unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
+    assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "mm", "quat_wb": "deg"}
+    assert "in rad half of the time tilted by more than 93 deg" in found.why["quat_wb"]
+    assert not found.questions
+
+
+def test_a_path_that_names_its_unit_tells_that_of_the_angles_to_one_that_does_not():
+    columns = unnamed(flight(20.0, seed=2, scale=0.05), "cm", "deg", above=2.9)
+    second = {f"mocap_pos_{letter}_cm": columns[f"pos_{letter}"] + 1.0 for letter in "xyz"}
+    found = propose(columns | second, "a.csv")
+    assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "cm", "mocap_pos_w": "cm", "quat_wb": "deg"}
+    assert not any("a guess" in question for question in found.questions)
 
 
 def test_a_hover_in_millimetres_is_no_flight_of_a_kilometre():

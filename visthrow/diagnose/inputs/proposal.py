@@ -257,7 +257,8 @@ class _Chooser:
             unit = self._length_unit(group)
             if unit and "marker_pos_c" not in self.made:
                 self._take("marker_pos_c", group, unit, "three columns that move smoothly; their name speaks of a camera", frame="camera")
-        paths = [(g, unit) for g in groups if "cam" not in g.stem.lower() and (unit := self._length_unit(g))]
+        units = {g.columns: self._length_unit(g) for g in sorted(groups, key=lambda g: not g.unit) if "cam" not in g.stem.lower()}
+        paths = [(g, units[g.columns]) for g in groups if units.get(g.columns)]
         pay = self._payload(paths)
         vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[0]]
         for group, unit in vehicles:
@@ -285,16 +286,21 @@ class _Chooser:
         leans = unit_evidence.by_lean(self.time, group.values, self.attitudes, [named] if named else unit_evidence.LENGTHS)
         if len(leans) > 1:
             leans = [lean for lean in leans if lean[0] in fit] or leans
-        if len({angle for _, angle, _ in leans}) == 1:
-            self._settle_angles(leans[0][1], group)
+        if len(leans) > 1:
+            leans = [lean for lean in leans if unit_evidence.USUAL[0] < lean[2] < unit_evidence.USUAL[1]] or leans
+        if len(leans) == 1:
+            angle = leans[0][1]
+            self._settle_angles(angle, f"{angle} by gravity: {group.columns[0]} and its neighbours accelerate as they lean")
         if named:
             return named
-        if len({unit for unit, _, _ in leans}) == 1:
+        if len(leans) == 1:
             self.by[group.columns] = f"{leans[0][0]} by gravity: it accelerates by {leans[0][2]:.2g} times what its lean makes"
             return leans[0][0]
         if unit := unit_evidence.by_fall(self.time, group.values):
             self.by[group.columns] = f"{unit} by gravity: a part of it falls freely"
             return unit
+        if leans:
+            return self._guess_pair(group, leans)
         unit = next(iter(fit), "m")
         self.by[group.columns] = f"{unit} by the size of a hall: {far:.3g} from the origin"
         if len(fit) != 1:
@@ -302,13 +308,26 @@ class _Chooser:
             self.found.questions.append(f"{', '.join(group.columns)} reach {far:.3g} from the origin: '{unit}' is a guess; {others}")
         return unit
 
-    def _settle_angles(self, unit: str, path: Group) -> None:
-        """Take the unit of the vehicle's angles that a path's accelerations show."""
+    def _guess_pair(self, path: Group, leans: list[unit_evidence.Lean]) -> str:
+        """Ask which units of a path and of the angles go together, where gravity allows several. Returns the path's of the likeliest."""
+        unit, angle, ratio = min(leans, key=lambda lean: abs(np.log(lean[2])))
+        listed, angles = ", ".join(path.columns), ", ".join(self.made["quat_wb"][0].columns)
+        pairs = " or ".join(f"{of} and {leaning} ({times:.2g} times)" for of, leaning, times in leans)
+        self.found.questions.append(
+            f"{listed} and the angles {angles}: are they in {pairs}? So many times what its lean makes it accelerates, and all of these "
+            f"may be; '{unit}' and '{angle}' are a guess"
+        )
+        self._settle_angles(angle, f"{angle} is a guess")
+        self.by[path.columns] = f"{unit} is a guess: it accelerates by {ratio:.2g} times what its lean makes"
+        return unit
+
+    def _settle_angles(self, unit: str, why: str) -> None:
+        """Take a unit of the vehicle's angles."""
         if len(self.attitudes) > 1:
             entry = replace(self.made["quat_wb"][0], unit=unit)
             self.attitudes = {unit: self.attitudes[unit]}
             self.made["quat_wb"] = (entry, self.attitudes[unit])
-            self.found.why["quat_wb"] += f"; {unit} by gravity: {path.columns[0]} and its neighbours accelerate as they lean"
+            self.found.why["quat_wb"] += f"; {why}"
 
     def _ask_angles(self) -> None:
         if len(self.attitudes) > 1:
@@ -372,9 +391,12 @@ class _Chooser:
             unit = group.unit if group.unit in ("deg", "rad") else "deg" if largest > _TURN else "rad"
             self._take("quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler")
             if "quat_wb" in self.made and largest <= _TURN and not group.unit:
-                entry = self.made["quat_wb"][0]
+                entry, radians = self.made["quat_wb"]
                 degrees, _ = make_channel(self.time, group.values, replace(entry, unit="deg"), "table")
-                self.attitudes = {unit: self.made["quat_wb"][1], "deg": degrees}
+                self.attitudes = {unit: radians, "deg": degrees}
+                tilt = physics.median_tilt(radians)
+                if tilt > physics.STEEPEST:
+                    self._settle_angles("deg", f"deg: in rad half of the time tilted by more than {tilt:.0f} deg")
 
     def _rates(self) -> None:
         attitude = self.made.get("quat_wb", (None, None))[1]

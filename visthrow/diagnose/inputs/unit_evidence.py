@@ -17,8 +17,11 @@ THRUSTS = ("N", "gf", "mN", "kgf")
 LIGHTEST = 0.01
 """Of what is tracked and flies by four rotors [kg]: from 10 up a number of kilograms may be one of grams."""
 
+USUAL = (0.7, 1.4)
+"""What vehicles of 13 recorded flights accelerate by, over what their lean makes."""
+
 _SPAN = 0.2  # over which a path is differentiated: noise of motion capture of 1 mm makes 0.05 m/s^2, a lean of 0.3 deg [s]
-_DECADES = 0.5  # half of the least step between two lengths; vehicles of 13 recorded flights do 0.7 to 1.4 times what their lean does
+_DECADES = 0.5  # half of the least step between two lengths
 _LEANS = 0.02  # least acceleration of a lean that says something: 0.1 deg [m/s^2]
 _FALLS = 0.15  # of gravity, that a fall may be off by: drag of a light ball
 _SHARE = 0.1  # of a path, that falls where things are thrown: 0.18 and 0.21 of two recorded ones, at most 0.05 of 13 flights in any unit

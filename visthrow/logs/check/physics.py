@@ -9,9 +9,10 @@ from visthrow.common.constants import GRAVITY
 from visthrow.logs.axes import EVERY, MATRICES, OURS, is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, Known, Row
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 
 MOVES = 0.05  # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared
+STEEPEST = 75.0  # median tilt of a flight [deg]
 
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST, _FARTHEST = 60.0, 2000.0  # of vehicles that throw [m/s], [m]
@@ -22,7 +23,6 @@ BELONGS, FIRMLY, CLEARLY = 0.35, 0.7, 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN, _DELAY_BAD, _DELAY_KNOWN = 0.02, 0.05, 0.012  # between measurements of one motion [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
-_STEEPEST = 75.0  # median tilt of a flight [deg]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
 _PUSHED = 0.2  # RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
 _LONGER, _OTHER_CABLE = 0.05, 0.25  # of the model's length: markers sit off the ends, another cable
@@ -53,6 +53,12 @@ def usable(time: np.ndarray, values: np.ndarray, least: float) -> bool:
     return len(time) > 50 and bool(np.max(np.std(values, axis=0)) > least)
 
 
+def median_tilt(attitude: Channel) -> float:
+    """Middle of an attitude's angle from upright [deg]."""
+    up = Rotation.from_quat(attitude.samples()[1]).apply([0.0, 0.0, 1.0])[:, 2]
+    return float(np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0)))))
+
+
 def _plausible(log: FlightLog) -> Iterator[Row]:
     for name, channel in log.channels.items():
         if channel.unit != "m" or channel.values.shape[1:] != (3,) or np.sum(channel.valid) < 50 or "setpoint" in name:
@@ -78,9 +84,8 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
     """Commands, voltages and angles of a size that only another unit gives them."""
     for name in ("quat_wb", "est_quat_wb", "mocap_quat_wb"):
         if name in log and np.sum(log[name].valid) > 50:
-            up = Rotation.from_quat(log[name].samples()[1]).apply([0.0, 0.0, 1.0])[:, 2]
-            tilt = float(np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0)))))
-            if tilt > _STEEPEST:
+            tilt = median_tilt(log[name])
+            if tilt > STEEPEST:
                 text = f"half of the time tilted by more than {tilt:.0f} deg: degrees taken for radians, axes, or quaternion order?"
                 yield Row("units", name, "bad", text, {"median_tilt_deg": tilt})
     for name in _SHARES:
