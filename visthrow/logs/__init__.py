@@ -14,6 +14,8 @@ BLACKBOX = (".bbl", ".bfl", ".bf")
 """Of Betaflight; the last is that of its software in the loop."""
 AUTOPILOTS = (".ulg", ".bin", ".tlog")
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet")
+SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
+"""What says itself what it holds: no mapping is used for it."""
 RUN_LOG = "flight.npz"
 """In the folder of a run of ``visthrow hil``: its flight log."""
 
@@ -51,6 +53,13 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
 def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> list[FlightLog]:
     """Read several files; see :func:`read`."""
     return [log for path in paths for log in read(path, mapping)]
+
+
+def takes_mapping(path: str | Path) -> bool:
+    """Whether a mapping of columns is used where :func:`read` reads this: a table, or logs with one among them."""
+    parts = [str(path)] if Path(path).exists() else str(path).split("+")
+    files = [Path(part if Path(part).exists() else part.rpartition(":")[0]) for part in parts]
+    return any(not file.is_dir() and file.suffix.lower() not in SELF_DESCRIBING for file in files)
 
 
 def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
@@ -96,15 +105,14 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
     from visthrow.logs.readers import recordings, table
 
     path, ending = Path(path), Path(path).suffix.lower()
-    known = (".npz", *BLACKBOX, *AUTOPILOTS)
-    if ending not in known and not path.is_file():
+    if ending not in SELF_DESCRIBING and not path.is_file():
         raise _missing(path)
     if path.name.lower().endswith(TABLES):
         return table.read_table(path)
-    if ending in recordings.READERS or (ending not in known and recordings.is_card(path)):
+    if ending in recordings.READERS or (ending not in SELF_DESCRIBING and recordings.is_card(path)):
         return recordings.read_recording(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS))
-    raise LogError(f"{path}: ending '{path.suffix}'; a mapping is for {of_tables}; {', '.join(known)} say what they hold")
+    raise LogError(f"{path}: ending '{path.suffix}'; a mapping is for {of_tables}; {', '.join(SELF_DESCRIBING)} say what they hold")
 
 
 def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:

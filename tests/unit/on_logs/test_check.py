@@ -302,3 +302,23 @@ def test_command_line(tmp_path, capsys):
     assert (tmp_path / "01-a.npz.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "a.json").read_text())["logs"][0]["verdict"] == "ok"
     assert cli.main(["diagnose", "check", str(tmp_path / "b.npz")]) == 2
+
+
+def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, capsys):
+    """A flying model's cable and mass are of use without a table; a mapping is not, and is not ignored in silence."""
+    log = log_of(flight())
+    log.save(tmp_path / "a.npz")
+    log.save(tmp_path / "b.npz")
+    mapping = '[table.time]\ncolumn = "t"\n[[table.channels]]\nname = "current"\ncolumns = ["i"]\nunit = "A"\n'
+    (tmp_path / "mine.toml").write_text(f'about = "a table"\n{mapping}')
+    (tmp_path / "t.csv").write_text("t,i\n" + "".join(f"{0.01 * n},{n % 7}\n" for n in range(200)))
+    check_with = ["diagnose", "check", "--no-pictures", "--config"]
+    refused = "is not used: it says how the columns of a table are read"
+    for files, setup in (("a.npz", "mine.toml"), ("a.npz+b.npz", "mine.toml"), ("a.npz", "pendulum_encoder")):
+        name = str(tmp_path / setup) if setup.endswith(".toml") else setup
+        assert cli.main([*check_with, name, "+".join(str(tmp_path / file) for file in files.split("+"))]) == 2
+        assert refused in capsys.readouterr().err
+    assert cli.main(["diagnose", "explain", str(tmp_path / "a.npz"), "--config", str(tmp_path / "mine.toml")]) == 2
+    assert refused in capsys.readouterr().err
+    for files, setup in ((["a.npz", "t.csv"], str(tmp_path / "mine.toml")), (["a.npz"], "cf_payload")):
+        assert cli.main([*check_with, setup, *(str(tmp_path / file) for file in files)]) in (0, 1)

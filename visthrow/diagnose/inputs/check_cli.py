@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs.setup import known, read_logs
     from visthrow.logs.check.run import check, table
 
-    logs = read_logs(args.logs, args.config)
+    logs = read_logs(args.logs, args.config, models=("flyer",))  # whose cable and mass are looked at
     results = check(logs, known(args.config, args.plant))
     for number, (log, checked) in enumerate(zip(logs, results), start=1):
         print(table(checked, args.all) + "\n")

@@ -1,6 +1,6 @@
 """A diagnosis setup: how logs are read, which simulation they are held against, and its parameters."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from visthrow.diagnose.models.laws import term_of
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
-from visthrow.logs import read_all
+from visthrow.logs import read_all, takes_mapping
 from visthrow.logs.check.rows import Known
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
@@ -90,6 +90,17 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
     return Known(rope.length + rope.payload_offset, trained.vehicle.body.mass + rope.rope_mass + rope.payload_mass)
 
 
-def read_logs(paths: Sequence[str | Path], name: str | Path | None = None) -> list[FlightLog]:
-    """Read logs, tables by the mapping of the setup ``name``. Raises LogError, ConfigError: as the readers and :func:`load`."""
-    return read_all(paths, load(name).table if name is not None else None)
+def read_logs(paths: Sequence[str | Path], name: str | Path | None = None, models: Container[str] = MODELS) -> list[FlightLog]:
+    """Read logs, tables by the mapping of the setup ``name``.
+
+    ``models``: those that make a setup of use for logs that are no tables.
+    Raises LogError, ConfigError: as the readers and :func:`load`; ConfigError: no log is a table, and the setup is for tables alone.
+    """
+    chosen = load(name) if name is not None else None
+    logs = read_all(paths, chosen.table if chosen is not None else None)
+    if chosen is not None and chosen.table is not None and chosen.model not in models and not any(map(takes_mapping, paths)):
+        raise ConfigError(
+            f"the setup '{name}' is not used: it says how the columns of a table are read, and {', '.join(map(str, paths))} says itself "
+            "what it holds; expected a table, or no --config"
+        )
+    return logs
