@@ -34,6 +34,21 @@ class CapturableGaussian(GaussianDistribution):
         return self.mean + self.std * torch.randn_like(self.mean)
 
 
+class _Layer(torch.autograd.Function):
+    """A linear layer whose bias learns by a product: on an H100 torch's sum over 98,304 samples took two to eight times as long."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        return F.linear(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        x, weight = ctx.saved_tensors
+        through = gradient @ weight if ctx.needs_input_grad[0] else None
+        return through, gradient.T @ x, (gradient.new_ones(1, len(gradient)) @ gradient)[0]
+
+
 class Network(MLPModel):
     """rsl_rl's network whose hidden layers multiply in bfloat16 where asked; weights and the last layer stay float32."""
 
@@ -43,7 +58,7 @@ class Network(MLPModel):
 
     def forward(self, obs: TensorDict, masks=None, hidden_state=None, stochastic_output: bool = False) -> Tensor:
         """Output for observations; a sample of the distribution where ``stochastic_output`` is set."""
-        output = self.output(self.get_latent(obs))
+        output = self.output(self.prepared(obs))
         if self.distribution is None or not stochastic_output:
             return output
         self.distribution.update(output)
@@ -74,12 +89,14 @@ class Network(MLPModel):
 
     def output(self, latent: Tensor) -> Tensor:
         """Output of the layers for normalised observations, shape (N, D) or filled up with columns of zeros."""
-        first, *hidden, last = self.mlp
-        filled = latent.shape[-1] - first.in_features
-        weight = F.pad(first.weight, (0, filled)) if filled else first.weight
-        with torch.autocast(latent.device.type, torch.bfloat16, enabled=self.bfloat16, cache_enabled=False):
-            x = F.linear(latent, weight, first.bias)
-            for layer in hidden:
+        *layers, last = self.mlp
+        x = latent.to(torch.bfloat16) if self.bfloat16 else latent
+        for layer in layers:
+            if isinstance(layer, torch.nn.Linear):
+                filled = x.shape[-1] - layer.in_features
+                weight = F.pad(layer.weight, (0, filled)) if filled else layer.weight
+                x = _Layer.apply(x, weight.to(x.dtype), layer.bias.to(x.dtype))
+            else:
                 x = layer(x)
         return last(x.float())
 

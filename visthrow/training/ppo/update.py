@@ -41,6 +41,7 @@ class CapturedPPO(PPO):
         self._spread.grad = torch.zeros(actions, **make)
         self._updates = 0
         self._graph: torch.cuda.CUDAGraph | None = None
+        self._aside = torch.cuda.Stream(self.device) if self._cuda else None
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions, shape (E, A), and store what the rollout's end needs of them."""
@@ -130,7 +131,7 @@ class CapturedPPO(PPO):
 
     def _descend(self, seen: Tensor, known: Tensor, samples: list[Tensor]) -> None:
         """One gradient step on a minibatch: the networks' inputs, and what :func:`loss.loss` reads of the samples."""
-        mean, value, std = self.actor.output(seen), self.critic.output(known), self._std()
+        (mean, value), std = self._outputs(seen, known), self._std()
         columns = [t if t.shape[-1] > 1 else t.view(-1) for t in samples]
         self._launch(
             loss.loss, self._minibatch, self.clip_param, self.value_loss_coef, int(self.use_clipped_value_loss), self.actor_learns,
@@ -153,6 +154,18 @@ class CapturedPPO(PPO):
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
+
+    def _outputs(self, seen: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Outputs of actor and critic; on a GPU they, and their gradients, are worked out side by side: one multiplies while one moves."""
+        if self._aside is None:
+            return self.actor.output(seen), self.critic.output(known)
+        here = torch.cuda.current_stream()
+        self._aside.wait_stream(here)
+        with torch.cuda.stream(self._aside):
+            value = self.critic.output(known)
+        mean = self.actor.output(seen)
+        here.wait_stream(self._aside)
+        return mean, value
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are captured anew."""
