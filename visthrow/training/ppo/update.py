@@ -1,5 +1,7 @@
 """rsl_rl's PPO with an update that a CUDA graph can hold."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
 
 import torch
@@ -16,8 +18,8 @@ from visthrow.training.ppo.network import Network
 class CapturedPPO(PPO):
     """rsl_rl's PPO of networks without memory and with a Gaussian whose spread is the same for all samples.
 
-    Values and log-probabilities of a rollout are computed in a few large pieces at its end, samples are gathered in the
-    order of the minibatches once for all epochs, and the adaptive learning rate lives on the device.
+    Log-probabilities of a rollout are computed at its end, samples are gathered in the order of the minibatches once for all
+    epochs, the critic works on a stream of its own, and the adaptive learning rate lives on the device.
     """
 
     def __init__(self, actor: Network, critic: Network, storage, **settings):
@@ -43,11 +45,28 @@ class CapturedPPO(PPO):
         self._graph: torch.cuda.CUDAGraph | None = None
         self._aside = torch.cuda.Stream(self.device) if self._cuda else None
 
+    @contextmanager
+    def _beside(self) -> Iterator[None]:
+        """Launch on a stream of its own on a GPU, after what was launched before; :meth:`join` waits for it."""
+        if self._aside is None:
+            yield
+            return
+        self._aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._aside):
+            yield
+
+    def join(self) -> None:
+        """Let what is launched from here on wait for the critic."""
+        if self._aside is not None:
+            torch.cuda.current_stream().wait_stream(self._aside)
+
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions, shape (E, A), and store what the rollout's end needs of them."""
+        """Sample actions, shape (E, A), and store what the rollout's end needs of them; the critic works beside the simulation."""
         storage = self.storage
+        seen = storage.observations[storage.step].copy_(obs)
+        with self._beside():
+            storage.values[storage.step].copy_(self.critic(seen))
         actions = self.actor(obs, stochastic_output=True).detach()
-        storage.observations[storage.step].copy_(obs)
         storage.actions[storage.step].copy_(actions)
         storage.distribution_params[0][storage.step].copy_(self.actor.output_mean)
         return actions
@@ -66,12 +85,9 @@ class CapturedPPO(PPO):
 
     @torch.no_grad()
     def compute_returns(self, obs: TensorDict) -> None:
-        """Values, log-probabilities, returns and advantages of the stored steps, in place."""
+        """Log-probabilities, returns and advantages of the stored steps, in place."""
         storage = self.storage
-        for known, values in zip(
-            storage.observations.flatten(0, 1).split(self._minibatch), storage.values.flatten(0, 1).split(self._minibatch)
-        ):
-            values.copy_(self.critic.output(self.critic.prepared(known)))
+        self.join()
         self._last_value.copy_(self.critic(obs)[:, 0])
         self._old_std.copy_(self._std())
         storage.distribution_params[1].copy_(self._old_std.expand_as(storage.actions))
@@ -131,7 +147,10 @@ class CapturedPPO(PPO):
 
     def _descend(self, seen: Tensor, known: Tensor, samples: list[Tensor]) -> None:
         """One gradient step on a minibatch: the networks' inputs, and what :func:`loss.loss` reads of the samples."""
-        (mean, value), std = self._outputs(seen, known), self._std()
+        with self._beside():  # so are their gradients: one multiplies while the other moves memory
+            value = self.critic.output(known)
+        mean, std = self.actor.output(seen), self._std()
+        self.join()
         columns = [t if t.shape[-1] > 1 else t.view(-1) for t in samples]
         self._launch(
             loss.loss, self._minibatch, self.clip_param, self.value_loss_coef, int(self.use_clipped_value_loss), self.actor_learns,
@@ -154,18 +173,6 @@ class CapturedPPO(PPO):
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
-
-    def _outputs(self, seen: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs of actor and critic; on a GPU they, and their gradients, are worked out side by side: one multiplies while one moves."""
-        if self._aside is None:
-            return self.actor.output(seen), self.critic.output(known)
-        here = torch.cuda.current_stream()
-        self._aside.wait_stream(here)
-        with torch.cuda.stream(self._aside):
-            value = self.critic.output(known)
-        mean = self.actor.output(seen)
-        here.wait_stream(self._aside)
-        return mean, value
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are captured anew."""
