@@ -193,12 +193,15 @@ def _program(argv: list[str]) -> int:
     """Run what ``python`` would run: a file, or with ``-m`` a module."""
     before, module = sys.argv, argv[0] == "-m"
     sys.argv = argv[module:]
+    imported = sys.modules.pop(sys.argv[0], None) if module else None  # python -m begins without it
     try:
         (runpy.run_module if module else runpy.run_path)(sys.argv[0], run_name="__main__")
     except SystemExit as end:
         return int(end.code or 0)
     finally:
         sys.argv = before
+        if imported is not None:
+            sys.modules[imported.__name__] = imported
     return 0
 
 

@@ -1,5 +1,8 @@
 """The runner of blocks catches a page that shows what does not work."""
 
+import importlib
+import sys
+
 import pytest
 
 from tests.pages.blocks import ROOT, Runner, blocks_of, pages
@@ -46,6 +49,17 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
     runner.run(blocks_of(tmp_path / "again.md", root=tmp_path))
     assert not capfd.readouterr().out
     assert (tmp_path / "again_md" / "made.txt").exists()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_module_that_a_test_has_imported_runs_anew(tmp_path, monkeypatch):
+    (tmp_path / "counted.py").write_text("from pathlib import Path\nPath('ran.txt').write_text(__name__)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    before = importlib.import_module("counted")
+    run(tmp_path, "```sh\npython -m counted\n```\n")
+    assert (tmp_path / "work" / "page_md" / "ran.txt").read_text() == "__main__"
+    assert sys.modules.pop("counted") is before
 
 
 @pytest.mark.parametrize(
