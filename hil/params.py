@@ -10,7 +10,7 @@ from camera.params import CameraParams
 from hil.control.aim import AimParams
 from hil.control.calibrating import CalibrationParams
 from hil.control.realtime import RealtimeParams
-from hil.control.safety import CheckParams, FenceParams, GuardParams
+from hil.control.safety import CheckParams, FenceParams, GuardParams, outside
 from hil.control.states import StateParams
 from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.backends.betaflight import BetaflightParams
@@ -20,7 +20,7 @@ from hil.links.roster import MavlinkId, check_allowed
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
-from hil.poses.pose import BODIES, PAYLOAD, VEHICLE
+from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE
 from hil.poses.sources.images import ImageParams
 from hil.poses.sources.mavlink import BodyIds
 from hil.poses.sources.mocap import MocapParams, RigidBody
@@ -133,7 +133,8 @@ class HilParams(Bounded):
         kind, fence = self.source.kind, self.fence
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
             raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
-        inside = all(a <= x <= b for a, x, b in zip(fence.vehicle_low, self.home_w, fence.vehicle_high))
+        home = outside(self.home_w, fence.vehicle_low, fence.vehicle_high)
+        goal = None if GOAL in self.frames else outside(self.goal_w, fence.payload_low, fence.payload_high)
         for wrong, text in (
             (self.keypoints == "detector" and self.images is None,
              "keypoints of a detector, but no table [images]; expected its kind and path or device"),
@@ -144,10 +145,12 @@ class HilParams(Bounded):
             (kind not in LIVE and self.source.file is None, f"source.file is none; expected the file of the {kind} source"),
             (self.backend != "dry-run" and kind not in LIVE, f"backend {self.backend} with recorded poses ({kind}); a recording flies dry"),
             (kind == "mocap" and self.source.mocap is None, "source.mocap is missing; expected its system and host"),
-            (not inside, f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
+            (home is not None, f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
             (not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
              f"landing_height {self.landing_height} m; expected within the payload's fence, {fence.payload_low[2]} to "
              f"{fence.payload_high[2]} m of height"),
+            (goal is not None,
+             f"goal_w {self.goal_w} m; expected within the payload's fence, {fence.payload_low} to {fence.payload_high} m"),
         ):  # fmt: skip
             if wrong:
                 raise ConfigError(text)

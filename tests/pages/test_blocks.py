@@ -53,13 +53,14 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_module_that_a_test_has_imported_runs_anew(tmp_path, monkeypatch):
-    (tmp_path / "counted.py").write_text("from pathlib import Path\nPath('ran.txt').write_text(__name__)\n")
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "whole" / "part.py").write_text("from pathlib import Path\nPath('ran.txt').write_text(__name__)\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    before = importlib.import_module("counted")
-    run(tmp_path, "```sh\npython -m counted\n```\n")
+    before = importlib.import_module("whole.part")
+    run(tmp_path, "```sh\npython -m whole.part\n```\n")
     assert (tmp_path / "work" / "page_md" / "ran.txt").read_text() == "__main__"
-    assert sys.modules.pop("counted") is before
+    assert sys.modules.pop("whole.part") is before
 
 
 @pytest.mark.parametrize(

@@ -246,7 +246,6 @@ def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
     [
         (('frames.vehicle.quaternion="wxyz"', 'frames.payload.quaternion="wxyz"'), "heading|tilted"),
         (('frames.vehicle.axes="y,-x,z"', 'frames.payload.axes="y,-x,z"'), "heading"),
-        (("goal_w=[9.0, 0.0, 0.0]",), "goal x 9.00 m beyond"),
         (("home_w=[1.0, 0.0, 1.333]",), "from its hover point"),
     ],
 )
@@ -256,6 +255,23 @@ def test_the_checks_before_a_throw(overrides, message):
     assert state == "abort"
     assert any(word in reason for word in message.split("|")), reason
     assert not pilot.backend.sent, "nothing was ever sent"
+
+
+GOAL = 'frames.goal={axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0, marker_offset_b=[0.0, 0.0, 0.0]}'
+
+
+@pytest.mark.parametrize("x", [2.0, 9.0])
+def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_seen(x):
+    """The configured goal, which would lie outside, is none then."""
+
+    def with_goal(time, poses):
+        noise = 1e-4 * math.sin(1e3 * time)
+        return [*poses, dataclasses.replace(poses[0], body="goal", pos=(x + noise, 0.0, 0.0))] if poses else poses
+
+    overrides = (GOAL, "goal_w=[9.0, 0.0, 0.0]", "states.check=1.5")
+    pilot, decisions = thrown(overrides=overrides, seconds=4.0, poses=with_goal)
+    state, reason = changes(decisions)[2]
+    assert (state, "goal x 9.00 m beyond" in reason) == (("ready", False) if x == 2.0 else ("abort", True))
 
 
 def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
@@ -470,6 +486,7 @@ def test_another_camera_is_refused():
         ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
         ("states.armed=-1.0", "armed is -1.0; expected above 0"),
         ("home_w=[0.0, 0.0, 30.0]", "expected within the vehicle's fence"),
+        ("goal_w=[9.0, 0.0, 0.0]", r"goal_w \(9.0, 0.0, 0.0\) m; expected within the payload's fence, \(-3.0, -3.0, -0.05\) to \(3.0, 3.0, 3.0\) m"),
         ("landing_height=-3.0", "expected within the payload's fence"),
         ("link.system=300", "expected 1 to 255"),
     ],
