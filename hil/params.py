@@ -145,7 +145,8 @@ class HilParams(Bounded):
             (kind not in LIVE and self.source.file is None, f"source.file is none; expected the file of the {kind} source"),
             (self.backend != "dry-run" and kind not in LIVE, f"backend {self.backend} with recorded poses ({kind}); a recording flies dry"),
             (kind == "mocap" and self.source.mocap is None, "source.mocap is missing; expected its system and host"),
-            (home is not None, f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
+            (home is not None,
+             f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
             (not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
              f"landing_height {self.landing_height} m; expected within the payload's fence, {fence.payload_low[2]} to "
              f"{fence.payload_high[2]} m of height"),
