@@ -28,11 +28,9 @@ class ViewParams:
 
 def view_rotation(view: ViewParams) -> torch.Tensor:
     """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
-    yaw, pitch = math.radians(view.yaw_deg), math.radians(view.pitch_deg)
-    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
-    about_y = torch.tensor([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]], dtype=torch.float64)
-    about_x = torch.tensor([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]], dtype=torch.float64)
-    return about_y @ about_x
+    from scipy.spatial.transform import Rotation
+
+    return torch.from_numpy(Rotation.from_euler("YX", [view.yaw_deg, view.pitch_deg], degrees=True).as_matrix())
 
 
 def view_focal(view: ViewParams) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from hil.control.runner import Decision, OperatorInput, Runner
+from hil.control.states import State
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.pose import Pose
@@ -90,6 +91,13 @@ class Spy(DryRun):
 
     def abort(self, now: float) -> None:
         self.aborts += 1
+
+
+class AutoOperator:
+    """Arms whenever the run is ready."""
+
+    def words(self, state: str) -> OperatorInput:
+        return OperatorInput(arm=state == State.READY)
 
 
 def fly(

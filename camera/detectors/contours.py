@@ -236,9 +236,7 @@ def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
     return rays_c[best]
 
 
-def detected_keypoints(
-    camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray, rot_source: np.ndarray | None = None
-) -> tuple[torch.Tensor, torch.Tensor]:
+def detected_keypoints(camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of the training camera from what was seen, by the functions that training calls.
 
     The ball's cone gives its distance, its true radius being known, and from there on the box is training's own, with the
@@ -247,23 +245,21 @@ def detected_keypoints(
 
     Args:
         camera: of training.
-        seen: in the camera that took the frame.
+        seen: in the camera frame of training.
         rot_wb: attitude of the vehicle, body to world, shape (3, 3): says which corner is which.
-        rot_source: rotation from the camera that took the frame to that of training, shape (3, 3); left out, the same.
 
     Returns:
         Normalised keypoints [-], shape (8, 2), and validity, shape (8,); zero and invalid where nothing was seen.
     """
-    turn = np.eye(3) if rot_source is None else rot_source
     points = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, 2)
     valid = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, dtype=torch.bool)
     if seen.goal is not None:
         rot_wc = rot_wb @ camera.rot_cb.double().numpy().T
-        rays = ordered_corners(seen.goal.rays_c @ turn.T, rot_wc)
+        rays = ordered_corners(seen.goal.rays_c, rot_wc)
         corners, ok = camera.fisheye.project_normalized(torch.from_numpy(rays).float(), clip=True)
         points[:GOAL_KEYPOINTS], valid[:GOAL_KEYPOINTS] = corners, ok
     if seen.ball is not None:
-        ball_c = turn @ seen.ball.ray_c * (camera.params.payload_radius / math.sin(seen.ball.half_angle))
+        ball_c = seen.ball.ray_c * (camera.params.payload_radius / math.sin(seen.ball.half_angle))
         box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
         points[GOAL_KEYPOINTS:], valid[GOAL_KEYPOINTS:] = box[0], ok[0]
     points, valid = by_rule(camera, points[None], valid[None])

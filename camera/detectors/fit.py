@@ -128,10 +128,10 @@ class Pool:
         return self.blocks[int(torch.randint(len(self.blocks), (1,), generator=generator))]
 
 
-def rendered(camera: CameraParams, renderer: Renderer, count: int, seed: int, nuisances=None) -> tuple[Tensor, Labels, Fisheye]:
+def rendered(camera: CameraParams, renderer: Renderer, count: int, seed: int) -> tuple[Tensor, Labels, Fisheye]:
     """Frames of random scenes, their labels and their lens."""
     lens = Fisheye(camera.fisheye)
-    scenes = random_scenes(camera, renderer.textures, count, seed, nuisances)
+    scenes = random_scenes(camera, renderer.textures, count, seed)
     scenes = replace(scenes, lens=torch.cat([lens_row(camera.fisheye)[:9].expand(count, -1), scenes.lens[:, 9:]], -1))
     truth = truth_of(scenes, lens)
     thing = scenes.things[:, 0, 1:4].double() - scenes.pose[:, :3].double()

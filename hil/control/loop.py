@@ -51,13 +51,6 @@ class Lander:
         return replace(said, arm=False, land=said.land or self._calibrating.found is not None)
 
 
-class AutoOperator:
-    """Arms whenever the run is ready: for tests and for simulated vehicles, never for real ones."""
-
-    def words(self, state: str) -> OperatorInput:
-        return OperatorInput(arm=state == State.READY)
-
-
 @dataclass
 class Loop:
     """The turns of a run: wait for the tick, take poses in, tick, record."""

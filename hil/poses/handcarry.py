@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.ndimage import find_objects, label
 
 from hil.errors import RunError
 from hil.links.clock import Clock
@@ -105,9 +106,7 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     cosine = np.abs(np.sum(quat[late] * quat[early], axis=1)) / np.linalg.norm(quat[late], axis=1)
     rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
     still = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(int)))
-    stretches = [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2])]
-    return [s for s in stretches if times[s.stop - 1] - times[s.start] >= REST]
+    return [s for (s,) in find_objects(label(still)[0]) if times[s.stop - 1] - times[s.start] >= REST]
 
 
 def _mean(poses: Sequence[Pose], rest: slice) -> Pose:

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from hil.check import AutopilotCheck
-from hil.control.loop import AutoOperator, Loop
+from hil.control.loop import Loop
 from hil.control.states import OperatorInput
 from hil.fakes.px4 import LAND as PX4_LAND
 from hil.fakes.px4 import OFFBOARD, POSCTL, custom
 from hil.links import msp
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
-from tests.hil_flight import simple_policy
+from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers, throw
 

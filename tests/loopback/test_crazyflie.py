@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from hil.control.loop import AutoOperator, Loop
+from hil.control.loop import Loop
 from hil.control.runner import Runner
 from hil.errors import LinkError
 from hil.fakes.base import VEHICLE_ID, Options
@@ -22,6 +22,7 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.poses.sources.opening import open_source
 from tests.bench.processes import free_port
+from tests.hil_flight import AutoOperator
 from tests.sitl.direct import FlightClock
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy

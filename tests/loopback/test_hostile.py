@@ -10,12 +10,11 @@ import time
 import numpy as np
 import pytest
 
-from hil.control.loop import AutoOperator
 from hil.links.backends.base import FAILED
 from hil.links.pymav import Signed, mav
 from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
-from tests.hil_flight import simple_policy
+from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import HERE, cut, peers, throw
 from visthrow.onboard.actions import hover_action

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from hil.control.loop import AutoOperator, Loop
+from hil.control.loop import Loop
 from hil.control.recording.playback import replay
 from hil.control.recording.record import Recorder
 from hil.control.runner import Runner
@@ -21,6 +21,7 @@ from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.player import read_tlog
+from tests.hil_flight import AutoOperator
 from tests.loopback.wire import throw
 from visthrow import config
 from visthrow.onboard.pilot import Pilot

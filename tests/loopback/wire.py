@@ -3,7 +3,7 @@
 import math
 from collections import deque
 
-from hil.control.loop import AutoOperator, Loop
+from hil.control.loop import Loop
 from hil.control.runner import Runner
 from hil.fakes.base import VEHICLE_ID, Fake, Options
 from hil.fakes.mocap import MocapParams
@@ -14,6 +14,7 @@ from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.opening import parties
+from tests.hil_flight import AutoOperator
 from tests.mocap_faults import MocapFault
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy

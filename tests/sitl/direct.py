@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.loop import AutoOperator, Loop
+from hil.control.loop import Loop
 from hil.control.recording.flightlogs import read, throws
 from hil.control.recording.record import Recorder
 from hil.control.recording.report import throw_path
@@ -36,6 +36,7 @@ from hil.params import HilParams
 from hil.poses.sources.base import Source
 from hil.poses.sources.opening import open_source
 from hil.simulated import MOTORS
+from tests.hil_flight import AutoOperator
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 

@@ -128,13 +128,6 @@ def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return state[..., POS] - model.length * direction, state[..., VEL] - model.length * np.cross(rate, direction)
 
 
-def energy(model: Pendulum, state: np.ndarray) -> np.ndarray:
-    """Kinetic and potential energy of both bodies [J], shape (...)."""
-    pos, vel = vehicle(model, state)
-    kinetic = model.vehicle_mass * (vel**2).sum(-1) + model.payload_mass * (state[..., VEL] ** 2).sum(-1)
-    return 0.5 * kinetic + GRAVITY * (model.vehicle_mass * pos[..., 2] + model.payload_mass * state[..., 2])
-
-
 def hover(model: Pendulum, payload_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """State (..., 16) and input (..., 4) of hover with the payload at places [m], shape (..., 3)."""
     payload_w = np.asarray(payload_w, dtype=float)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import BallSeen, Detector, Seen
+from camera.detectors.contours import BallSeen, Detector, GoalSeen, Seen
 from camera.detectors.following import GATE, LOST
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
@@ -83,6 +83,26 @@ def test_a_detector_of_ones_own_is_named_by_the_configuration(pictures, monkeypa
     seen = Eyes(params, training()).look(pictures[0], 1.5)
     assert (seen.stamp, seen.corners) == (1.5, None)
     assert seen.ball == pytest.approx((0.0, 0.0, 1.0, 0.1))
+
+
+class Known(Blind):
+    """It reports a ball and a square in its own camera, whatever it is shown."""
+
+    corners = np.array([[0.1, 0.1, 1.0], [0.1, -0.1, 1.0], [-0.1, -0.1, 1.0], [-0.1, 0.1, 1.0]]) / np.sqrt(1.02)
+
+    def detect(self, image, known=None):
+        return dataclasses.replace(super().detect(image), goal=GoalSeen(self.corners, 1.0))
+
+
+def test_what_a_camera_mounted_otherwise_sees_is_told_in_that_of_training(pictures, monkeypatch):
+    """Pitched by 30 degrees its axis points forward and down: x of the body is up in the image of training."""
+    monkeypatch.setitem(DETECTORS, "known", Known)
+    mount = dataclasses.replace(training().mount, rpy_deg=(0.0, -30.0, 0.0))
+    seen = Eyes(ImageParams("camera", fisheye=SMALL, mount=mount, by="known"), training()).look(pictures[0], 0.0)
+    sine, cosine = 0.5, math.sqrt(0.75)
+    assert seen.ball == pytest.approx((0.0, -sine, cosine, 0.1))
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
+    np.testing.assert_allclose(seen.corners, Known.corners @ turn.T, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

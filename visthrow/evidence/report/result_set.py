@@ -44,9 +44,9 @@ class ResultSet:
                 best[name] = result
         return [best[name] for name in sorted(best)]
 
-    def shipped(self, name: str, plant: str, target: float, departures: Any = None) -> Result | None:
-        """Throws of a shipped policy under its own conditions, or with departures."""
-        found = self.policies(plant, target, policy=name, departures=departures or {})
+    def shipped(self, name: str, plant: str, target: float) -> Result | None:
+        """Throws of a shipped policy under its own conditions."""
+        found = self.policies(plant, target, policy=name, departures={})
         return found[0] if found else None
 
     def seeds(self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY) -> list[Result]:
