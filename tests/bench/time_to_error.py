@@ -19,10 +19,10 @@ def train(experiment: Any, device: str, seed: int, errors: Sequence[float], minu
         ``curve``: (wall time without evaluations [s], environment steps, error [m]) of each evaluation; ``reached``: error as
         text -> first of them within it, None where there is none.
     """
-    from visthrow.training.session import Evaluations
+    from visthrow.training.session import EVALUATION_SHARE, Regularly
     from visthrow.training.trainer import Trainer
 
-    trainer, evaluations = Trainer(experiment, device, seed), Evaluations(every, True)
+    trainer, evaluations = Trainer(experiment, device, seed), Regularly(every, EVALUATION_SHARE)
     curve: list[tuple[float, int, float]] = []
     reached: dict[str, Any] = {f"{error:g}": None for error in errors}
     spent = 0.0

@@ -35,7 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--evaluate-every", type=int, metavar="N",
         help="throw 200 times every N iterations (default: a twentieth of the time on a terminal, with --until and --view)",
     )  # fmt: skip
-    parser.add_argument("--checkpoint-every", type=int, default=100, metavar="N", help="iterations between checkpoints (default: 100)")
+    parser.add_argument(
+        "--checkpoint-every", type=int, metavar="N", help="iterations between checkpoints (default: a hundredth of the time)",
+    )  # fmt: skip
     parser.add_argument("--view", action="store_true", help="show a throw of each evaluation in this machine's browser")
     parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
     add_common(parser)

@@ -31,7 +31,9 @@ from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, f
 
 EVALUATION_TARGET = 2.0  # [m]
 
-EVALUATION_SHARE = 0.05  # of the wall time that evaluations may take where their number is left to the command
+EVALUATION_SHARE, CHECKPOINT_SHARE = 0.05, 0.01  # of the wall time that each may take where its number is left to the command
+
+FIRST = 20.0  # time after which the first of them comes then: what it costs is not known before [s]
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Options:
     minutes: float | None = None
     until: float | None = None  # [m]
     evaluate_every: int | None = None
-    checkpoint_every: int = 100
+    checkpoint_every: int | None = None
     resume: bool = False
     device: str = "auto"
     overrides: Sequence[str] = ()
@@ -159,19 +161,19 @@ DONE, REACHED, OVER, STOPPED = ENDS = ("finished", "reached the error that was a
 """Why a loop ended."""
 
 
-class Evaluations:
-    """When to throw on the way: every so many iterations, or as often as a share of the wall time allows."""
+class Regularly:
+    """When to do something on the way: every so many iterations, or as often as a share of the wall time allows."""
 
-    def __init__(self, every: int | None, wanted: bool):
-        """Begin; None leaves it to the clock, ``wanted`` says whether there are any then."""
-        self._every, self._wanted = every, wanted
-        self._after, self._cost = time.perf_counter(), 1.0
+    def __init__(self, every: int | None, share: float):
+        """Begin; ``every``: iterations, None leaves it to the clock; ``share``: of the wall time then, 0 for never."""
+        self._every, self._share = every, share
+        self._after, self._wait = time.perf_counter(), FIRST
 
     def due(self, iteration: int) -> bool:
-        """Whether to throw after this iteration."""
+        """Whether to do it after this iteration."""
         if self._every:
             return iteration % self._every == 0
-        return self._wanted and time.perf_counter() - self._after > self._cost / EVALUATION_SHARE
+        return self._share > 0.0 and time.perf_counter() - self._after > self._wait
 
     @contextlib.contextmanager
     def timed(self) -> Iterator[None]:
@@ -179,7 +181,7 @@ class Evaluations:
         begin = time.perf_counter()
         yield
         self._after = time.perf_counter()
-        self._cost = self._after - begin
+        self._wait = (self._after - begin) / self._share if self._share else FIRST
 
 
 def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None) -> str:
@@ -188,7 +190,8 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
     TrainError where a file cannot be written; what the last checkpoint holds is not lost.
     """
     start, kept, why, ranks = time.perf_counter(), trainer.iteration, DONE, trainer.ranks
-    evaluations = Evaluations(args.evaluate_every, bool(args.until or viewer or sys.stdout.isatty()))
+    evaluations = Regularly(args.evaluate_every, EVALUATION_SHARE if args.until or viewer or sys.stdout.isatty() else 0.0)
+    checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
     shown = viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
     log = TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes) if ranks.lead else None
     try:
@@ -201,8 +204,9 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
                         show(throws)
                 if log:
                     log.row(figures, throws)
-                if trainer.iteration % args.checkpoint_every == 0:
-                    trainer.save(folder / CHECKPOINT)
+                if ranks.agree(checkpoints.due(trainer.iteration)):
+                    with checkpoints.timed():
+                        trainer.save(folder / CHECKPOINT)
                     kept = trainer.iteration
                 if args.until and throws is not None and throws.within(args.until):
                     why = REACHED
