@@ -63,7 +63,9 @@ class CapturedPPO(PPO):
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions, shape (E, A), and store what the rollout's end needs of them; the critic works beside the simulation."""
         storage = self.storage
-        seen = storage.observations[storage.step].copy_(obs)
+        seen = storage.observations[storage.step]
+        for group, values in obs.items():  # one by one: copied at once they took four times as long
+            seen[group].copy_(values)
         with self._beside():
             storage.values[storage.step].copy_(self.critic(seen))
         actions = self.actor(obs, stochastic_output=True).detach()
