@@ -6,8 +6,6 @@ import inspect
 import json
 import signal
 import socket
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from hil.fakes.px4 import FakePx4
 from hil.links.clock import Clock
 from hil.links.device import LARGEST_DATAGRAM, UdpPort, refused
 from hil.links.mavlink_link import Link
+from visthrow.common.arguments import StopRequest
 from visthrow.common.errors import suggest
 
 KINDS = {"ardupilot": FakeArduPilot, "px4": FakePx4, "betaflight": FakeBetaflight, "crazyflie": FakeCrazyflie}
@@ -111,37 +110,15 @@ def make_fake(
     return KINDS[kind](plant, link, mocap, seed, options, port)
 
 
-@contextlib.contextmanager
-def interruptible() -> Iterator[threading.Event]:
-    """Event that the first Ctrl-C sets; the second interrupts.
-
-    An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and goes on.
-    """
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-
-    def take(number: int, frame: object) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-
-    before = signal.signal(signal.SIGINT, take)
-    try:
-        yield asked
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def serve(fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING) -> dict[str, Any]:
     """Fly in real time until ``after`` seconds after the landing, for ``most`` seconds, or until Ctrl-C; returns the report."""
     plant, begun, late = fake.plant, fake.plant.time, 0
     start = clock.now() - begun  # where the machine is late the vehicle's clock is as late as the vehicle
     fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
     fake.question_lag = 0.0
-    with contextlib.suppress(KeyboardInterrupt), interruptible() as asked, collected():  # a collection of all takes a tenth of a second
-        while plant.time - begun < most and not asked.is_set():
+    asked = StopRequest((signal.SIGINT,))
+    with contextlib.suppress(KeyboardInterrupt), asked as stop, collected():  # a collection of all takes a tenth of a second
+        while plant.time - begun < most and not stop.asked:
             time = plant.time + plant.period
             due = start + time
             late += clock.now() > due

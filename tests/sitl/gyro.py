@@ -59,7 +59,8 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
     (box,), (run,) = logs_of_blackbox(path := next(where.glob("LOG*"))), read(where / "run" / "throw-01.npz")
     if unfiltered:
         raw = read_blackbox(path)[0]
-        values = np.stack([raw.column(f"gyroUnfilt[{i}]") for i in range(3)], axis=1)
+        columns = dict(zip(raw.names, raw.main.T))
+        values = np.stack([columns[f"gyroUnfilt[{i}]"] for i in range(3)], axis=1)
         box.channels["rate_b"] = replace(box["rate_b"], values=np.radians(values.astype(float)))
     log = join([run, box])
     rate, setpoint, command = log["rate_b"], log["rate_setpoint_b"], log["command"]

@@ -1,10 +1,13 @@
-"""Commands and the options that they share, and the exit status of a process."""
+"""Commands and the options that they share, the exit status of a process, and how it is asked to stop."""
 
 import argparse
 import contextlib
 import importlib
 import math
-from collections.abc import Callable, Mapping
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from visthrow.common.errors import suggest
@@ -96,3 +99,31 @@ class _Lazy(argparse.ArgumentParser):
             near = f"; {suggest(unknown[0].split('=')[0], options)}" if unknown[0].startswith("-") else ""
             self.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
         return found, unknown
+
+
+class StopRequest:
+    """Signals taken down, ``asked``, while it is entered, so that no piece of work is cut in two; a second one interrupts.
+
+    An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and goes on. Threads beside the main one hear
+    no signals.
+    """
+
+    def __init__(self, signals: Sequence[int], said: str = "") -> None:
+        """Begin; ``said``: what the first one is answered on the terminal."""
+        self.asked, self._said = False, said
+        self._signals = signals if threading.current_thread() is threading.main_thread() else ()
+
+    def __enter__(self) -> "StopRequest":
+        self._before = {number: signal.signal(number, self._take) for number in self._signals}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, frame: object) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+        if self._said:
+            print(self._said, file=sys.stderr)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import correlate, correlation_lags
 
 from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
@@ -103,10 +104,8 @@ def _lag(a: Signal, b: Signal) -> tuple[float, float]:
     sizes = _sized(*a), _sized(*b)
     grids = [np.arange(time[0], time[-1], 1.0 / RATE) for time, _ in sizes]
     x, y = (np.interp(grid, time, size[:, 0]) - np.mean(size) for grid, (time, size) in zip(grids, sizes))
-    size = 2 ** int(np.ceil(np.log2(len(x) + len(y))))
-    cross = np.fft.irfft(np.fft.rfft(x, size) * np.conj(np.fft.rfft(y, size)), size)
-    lags = np.concatenate([np.arange(len(x)), np.arange(-len(y) + 1, 0)])
-    coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(cross[lags % size])]) / RATE
+    lags = correlation_lags(len(x), len(y))
+    coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(correlate(x, y, method="fft"))]) / RATE
     near = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
     scores = np.array([_alignment(*_both(a, b, offset)) for offset in near])
     at = int(np.argmax(scores))

@@ -18,7 +18,7 @@ from typing import Any
 
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.arguments import EXIT_INTERRUPTED
+from visthrow.common.arguments import EXIT_INTERRUPTED, StopRequest
 from visthrow.common.errors import CheckpointError, StorageError, TrainError
 from visthrow.common.storage import write_json
 from visthrow.onboard.policy import Policy, find_policy
@@ -136,29 +136,10 @@ def _resumed(args: Options) -> tuple:
     return experiment, None, folder, seed
 
 
-class StopRequest:
-    """Ctrl-C and SIGTERM taken down, ``asked``, while it is entered, so that no iteration is cut in two; a second Ctrl-C interrupts."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __enter__(self) -> "StopRequest":
-        self._before = {number: signal.signal(number, self._take) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _take(self, number: int, frame: object) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-        print("\nstopping after this iteration", file=sys.stderr)
-
-
 DONE, REACHED, OVER, STOPPED = ENDS = ("finished", "reached the error that was asked for", "the time is over", "stopped")
 """Why a loop ended."""
+
+STOPPING = "\nstopping after this iteration"
 
 
 class Regularly:
@@ -195,7 +176,7 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
     shown = viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
     log = TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes) if ranks.lead else None
     try:
-        with log or contextlib.nullcontext(), StopRequest() as stop, shown as show:
+        with log or contextlib.nullcontext(), StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING) as stop, shown as show:
             while trainer.iteration < last and why == DONE:
                 figures, throws = trainer.step(), None
                 if ranks.lead and evaluations.due(trainer.iteration):

@@ -50,10 +50,6 @@ class BlackboxLog:
     dropped: int = 0  # frames decoded but resting on a damaged one
     complete: bool = False  # whether the log ends with its end marker
 
-    def column(self, name: str) -> np.ndarray:
-        """One field of all main frames, shape (T,)."""
-        return self.main[:, self.names.index(name)]
-
 
 def read_blackbox(path: str | Path) -> list[BlackboxLog]:
     """Read every log of a raw file. Raises LogError: no such file, no blackbox file, or none of its logs holds a frame."""
