@@ -206,7 +206,7 @@ def _policy_sum(title: str, name: str, result: Result) -> tuple[str, ...]:
 
 
 def _verdicts(title: str, label: str, found: Sequence[Result], policies: Sequence[tuple[str, Result]], policies_on: str) -> list[str]:
-    """Whether the issue's claim holds: no setting as accurate and as fast, and at each setting's accuracy the policy faster."""
+    """Whether the paper's claim holds: no setting as accurate and as fast, and at each setting's accuracy the policy faster."""
     points, said = points_of(found), []
     for name, result in policies:
         own = np.array([result.of("duration").mean(), result.of("error").mean()])
