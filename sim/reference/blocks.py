@@ -4,6 +4,8 @@ Every function is pure and takes E environments at once. Body frame x forward, y
 is a time derivative. Written apart from the training simulator on purpose: it shares the equations, not the code.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from sim.params import (
@@ -18,7 +20,9 @@ from sim.params import (
     ThrustParams,
     VehicleParams,
 )
-from sim.reference.rotations import cross
+from sim.reference.rotations import cross, length
+
+_QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # of a row vector about z, without its z
 
 TIME_TOLERANCE = 1e-10  # times closer than this are one event [s]; a control period of 20 ms has no finer structure
 
@@ -35,13 +39,17 @@ def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> n
     return commands[index, np.arange(len(now))]
 
 
+@lru_cache(maxsize=8)
+def _layout(rotors: RotorParams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4); spins; motors that turn clockwise, and the others."""
+    x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
+    return np.stack((y / np.sum(y**2), -x / np.sum(x**2))), spin, np.flatnonzero(spin > 0.0), np.flatnonzero(spin < 0.0)
+
+
 def _motor_shares(torque: np.ndarray, rotors: RotorParams, torque_ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Thrust of each motor for roll and pitch, and for yaw [N], shapes (E, 4)."""
-    x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
-    roll = torque[:, :1] * y / np.sum(y**2)
-    pitch = -torque[:, 1:2] * x / np.sum(x**2)
-    yaw = torque[:, 2:] * spin / (4.0 * torque_ratio)
-    return roll + pitch, yaw
+    tilting, spin, _, _ = _layout(rotors)
+    return torque[:, :2] @ tilting, torque[:, 2:] * (spin / (4.0 * torque_ratio))
 
 
 def mixer(
@@ -62,18 +70,18 @@ def mixer(
 
     Convention: yaw takes the largest part of what is asked for that keeps the spread of the four within the limits.
     """
-    tilt, _ = _motor_shares(torque, rotors, torque_ratio)
+    tilting, spin, clockwise, other = _layout(rotors)
+    tilt = torque[:, :2] @ tilting
     room = f_max - f_min
-    extent = np.ptp(tilt, axis=1)
-    scale = np.where(extent > room, room / np.maximum(extent, 1e-300), 1.0)
+    extent = tilt.max(axis=1) - tilt.min(axis=1)
+    scale = np.minimum(room / np.maximum(extent, 1e-300), 1.0)
     tilt = tilt * scale[:, None]
     # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between the two kinds only.
-    spin = np.array(rotors.spin)
-    clockwise, other = tilt[:, spin > 0.0], tilt[:, spin < 0.0]
-    most = (room - (clockwise.max(axis=1) - other.min(axis=1))) / 2.0
-    least = -(room - (other.max(axis=1) - clockwise.min(axis=1))) / 2.0
+    rising, falling = tilt.take(clockwise, 1), tilt.take(other, 1)
+    most = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
+    least = -(room - (falling.max(axis=1) - rising.min(axis=1))) / 2.0
     amount = torque[:, 2] / (4.0 * torque_ratio)
-    clipped = np.clip(amount, np.minimum(least, 0.0), np.maximum(most, 0.0))
+    clipped = np.minimum(np.maximum(amount, np.minimum(least, 0.0)), np.maximum(most, 0.0))
     clipped_yaw = spin * clipped[:, None]
     wanted = thrust[:, None] / 4.0 + tilt + clipped_yaw
     raise_by = np.maximum(f_min - wanted.min(axis=1), 0.0)
@@ -116,7 +124,7 @@ def betaflight(
     integral_dot = np.array(gains.i_gain) * (setpoint - rate)
     growing = integral_dot * integral > 0.0
     full = np.abs(integral) >= np.array(gains.integral_limit)
-    delivered = np.where(full, 0.0, np.stack((tilt_share, tilt_share, yaw_share), -1))
+    delivered = np.where(full, 0.0, np.array((tilt_share, tilt_share, yaw_share)).T)
     integral_dot = np.where(growing, delivered * integral_dot, integral_dot)
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
     return np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None], setpoint_dot, gyro_dot, integral_dot
@@ -215,6 +223,8 @@ def drag_torque_ratio(params: ThrustParams) -> float:
 
 def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarray:
     """Return the factor on the rotors' thrust at heights of the centre of mass [m], shapes (E,). See ``AirParams``."""
+    if strength == 0.0:
+        return np.ones_like(height)
     ratio = radius / (4.0 * np.maximum(height, 0.5 * radius))
     return 1.0 + strength * (1.0 / (1.0 - ratio**2) - 1.0)
 
@@ -240,12 +250,12 @@ def aerodynamics(
         return np.zeros_like(rate), np.zeros_like(rate), np.zeros_like(thrust), np.zeros_like(thrust)
     v = air_velocity_b
     force = -np.array([params.drag_x, params.drag_y, params.drag_z]) * v
-    force = force - params.parasitic * np.linalg.norm(v, axis=1, keepdims=True) * v
+    force = force - params.parasitic * length(v) * v
     hub = v[:, None, :] + cross(rate[:, None, :], arms)
     thrust_change = thrust * (-params.inflow * hub[..., 2] + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2))
     torque_change = torque_ratio * thrust * (-params.torque_inflow * hub[..., 2])
     total = thrust.sum(axis=1)
-    flapping = params.flapping * total[:, None] * np.stack((-v[:, 1], v[:, 0], np.zeros_like(total)), -1)
+    flapping = params.flapping * total[:, None] * (v @ _QUARTER_TURN)
     return force, flapping, thrust_change, torque_change
 
 
@@ -294,7 +304,7 @@ def payload_force(
         hanging: shape (E,), bool.
     """
     through = velocity_w - wind_w
-    total = -drag * np.linalg.norm(through, axis=1, keepdims=True) * through
+    total = -drag * length(through) * through
     across = velocity_w - np.sum(velocity_w * along_w, axis=1, keepdims=True) * along_w
     return total - hanging[:, None] * (rope.swing_damping * across + rope.downwash * lift_w)
 

@@ -28,8 +28,7 @@ class VehicleErrors:
 def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
     """Return the rotor hubs from the centre of mass [m], shape (E, 4, 3)."""
     rotors = vehicle.rotors
-    hubs = np.stack((np.array(rotors.x), np.array(rotors.y), np.full(4, rotors.z)), -1)
-    return hubs[None] - errors.com_offset[:, None, :]
+    return np.array((rotors.x, rotors.y, (rotors.z,) * 4)).T - errors.com_offset[:, None, :]
 
 
 def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray) -> np.ndarray:

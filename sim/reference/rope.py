@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 
 from sim.params import BodyParams, RopeParams
 from sim.reference.model import build_attached, build_free
-from sim.reference.rotations import cross, quat_wxyz_from_matrix, rotation_from_direction, turned, turned_back
+from sim.reference.rotations import cross, length, quat_wxyz_from_matrix, rotation_from_direction, turned, turned_back
 
 
 class RopeDynamics:
@@ -43,14 +43,13 @@ class RopeDynamics:
         self._attached.set_models(self._attached_models)
         self._free = Batch(self._free_models[0], self.count, nthread=1)
         self._free.set_models(self._free_models)
-        for batch in (self._attached, self._free):
-            batch.bind("qacc")  # outputs are copied only where they were bound before the call
+        names = "qpos", "qvel", "xfrc_applied", "qacc"  # of these qacc is copied after each call
+        self._bound = {batch: [batch.bind(name) for name in names] for batch in (self._attached, self._free)}
         # The payload is the last body; with stretch it is its own, else its force acts on the last rod by its arm.
         self._centre = np.array([-model.body_ipos[-1, 2] for model in self._attached_models])
 
-    def _rod_couples(self, ids: np.ndarray, rates: np.ndarray, n: np.ndarray, above: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Damping couples on the rods [N m], shape (e, L, 3), and the one on the body above, shape (e, 3)."""
-        relative = np.diff(rates, axis=1, prepend=rates[:, :1] if above is None else above[:, None])
+    def _rod_couples(self, ids: np.ndarray, relative: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Damping couples on the rods [N m], shape (e, L, 3), and the one on the body above, shape (e, 3); of their relative rates."""
         couples = -self.damping[ids][:, None, None] * relative
         couples[:, 0] -= self.mount_damping * relative[:, 0]
         on_above = -couples[:, 0]
@@ -62,7 +61,7 @@ class RopeDynamics:
         self, batch: Batch, ids: np.ndarray, first_rod: int, n: np.ndarray, couples: np.ndarray, force_w: np.ndarray
     ) -> np.ndarray:
         """Wrenches on all bodies: damping couples on the rods and a force at the payload's centre."""
-        applied = np.zeros((len(ids), *batch.xfrc_applied.shape[1:]))
+        applied = np.zeros((len(ids), *self._bound[batch][2].shape[1:]))
         applied[:, first_rod : first_rod + self.segments, 3:] = couples
         applied[:, -1, :3] = force_w
         if self.stretch is None:
@@ -80,7 +79,7 @@ class RopeDynamics:
         return cross(alpha, n) + cross(rates, n_dot)
 
     def _directions(self, n: np.ndarray, n_dot: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        n = n / np.linalg.norm(n, axis=-1, keepdims=True)
+        n = n / length(n)
         return n, cross(n, n_dot), rotation_from_direction(n)
 
     def attached(
@@ -109,11 +108,12 @@ class RopeDynamics:
         """
         n, rates, frames = self._directions(rope[0], rope[1])
         above = turned(rotation, body[:, 10:13])
-        couples, on_vehicle = self._rod_couples(ids, rates, n, above)
+        relative_rates = _from_above(rates, above)
+        couples, on_vehicle = self._rod_couples(ids, relative_rates, n)
         parents = np.concatenate((rotation[:, None], frames[:, :-1]), 1)
-        local = turned_back(frames, np.diff(rates, axis=1, prepend=above[:, None]))
+        local = turned_back(frames, relative_rates)
         joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames).reshape(len(ids), -1)
-        qpos = [body[:, 0:3], body[:, [6, 3, 4, 5]] / np.linalg.norm(body[:, 3:7], axis=1, keepdims=True), joints]
+        qpos = [body[:, 0:3], body[:, [6, 3, 4, 5]] / length(body[:, 3:7]), joints]
         qvel = [body[:, 7:13], local.reshape(len(ids), -1)]
         applied = self._applied(self._attached, ids, 2, n, couples, force_w)
         applied[:, 1, :3] = wrench[0]
@@ -135,10 +135,10 @@ class RopeDynamics:
             force_w: on the payload's centre [N], shape (e, 3).
         """
         n, rates, frames = self._directions(rope[0], rope[1])
-        couples, _ = self._rod_couples(ids, rates, n, None)
+        couples, _ = self._rod_couples(ids, _from_above(rates, rates[:, 0]), n)
         relative_rotation = frames.copy()
         relative_rotation[:, 1:] = np.swapaxes(frames[:, :-1], -1, -2) @ frames[:, 1:]
-        local = turned_back(frames, np.diff(rates, axis=1, prepend=0.0))
+        local = turned_back(frames, _from_above(rates, np.zeros((len(ids), 3))))
         qpos = [root[0], quat_wxyz_from_matrix(relative_rotation).reshape(len(ids), -1)]
         qvel = [root[1], local.reshape(len(ids), -1)]
         applied = self._applied(self._free, ids, 1, n, couples, force_w)
@@ -160,11 +160,10 @@ class RopeDynamics:
     ) -> np.ndarray:
         if self.stretch is not None:
             qpos, qvel = [*qpos, rope[2][:, None]], [*qvel, rope[3][:, None]]
-        batch.qpos[ids] = np.hstack(qpos)
-        batch.qvel[ids] = np.hstack(qvel)
-        batch.xfrc_applied[ids] = applied
-        batch.forward(ids)
-        return batch.qacc[ids]
+        positions, velocities, wrenches, accelerations = self._bound[batch]
+        positions[ids], velocities[ids], wrenches[ids] = np.concatenate(qpos, 1), np.concatenate(qvel, 1), applied
+        batch.forward(ids if len(ids) < self.count else None)
+        return accelerations[ids]
 
     def points(self, root_pos: np.ndarray, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return mount, joints and end of the rope [m], shape (E, L+1, 3), and position and velocity of the payload.
@@ -181,3 +180,11 @@ class RopeDynamics:
         pos = points[:, -1] + reach * n[:, -1]
         vel = root_vel + np.sum(length * n_dot, axis=1) + reach * n_dot[:, -1] + elongation_dot[:, None] * n[:, -1]
         return points, pos, vel
+
+
+def _from_above(rates: np.ndarray, above: np.ndarray) -> np.ndarray:
+    """Rates of the rods less those of what they hang on, shape (e, L, 3)."""
+    relative = rates.copy()
+    relative[:, 0] -= above
+    relative[:, 1:] -= rates[:, :-1]
+    return relative

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim.reference.blocks import TIME_TOLERANCE
+from sim.reference.rotations import length
 
 LARGEST_PHASE = 0.9  # frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83
 LARGEST_TURN = 0.25  # turn of a segment within one step beyond which it is halved [rad]; RK4 then errs by about 0.25^5 / 120 = 8e-6 rad
@@ -41,8 +42,8 @@ def halving_rk4(
     k4 = rates(state + h * k3, step)
     after = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     # k2 and k3 belong to one time and to states 0.5 h (k2 - k1) apart: their ratio is the square of a frequency.
-    apart = 0.5 * step * np.linalg.norm((k2 - k1)[:, direction], axis=1)
-    pull = np.linalg.norm((k3 - k2)[:, velocity], axis=1)
+    apart = 0.5 * step * length(k2[:, direction] - k1[:, direction])[:, 0]
+    pull = length(k3[:, velocity] - k2[:, velocity])[:, 0]
     phase = step * np.sqrt(pull / np.maximum(apart, 1e-12))
     turn = step * np.sqrt(np.max(np.square(after[:, velocity]).reshape(len(state), -1, 3).sum(-1), axis=1))
     fine = (phase <= LARGEST_PHASE) & (turn <= LARGEST_TURN)  # false for NaN too
