@@ -81,19 +81,19 @@ def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Inte
     return _interval(float(_mean(found)), samples, len(found))
 
 
-def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` minus mean of ``b``, independent throws."""
-    return _of_both(np.subtract, a, b, seed, draws)
+    return _of_both(np.subtract, a, b, draws)
 
 
-def _of_both(function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int, draws: int) -> Interval:
+def _of_both(function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int) -> Interval:
     first, second = _checked(a), _checked(b)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     samples = function(_resampled(first, rng, draws), _resampled(second, rng, draws))
     return _interval(function(_mean(first), _mean(second)), samples, max(len(first), len(second)))
 
 
-def paired(a: np.ndarray, b: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+def paired(a: np.ndarray, b: np.ndarray) -> Interval:
     """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a failed throw are left out.
 
     Raises ValueError: arrays of different lengths, or no pair in which both landed.
@@ -101,15 +101,15 @@ def paired(a: np.ndarray, b: np.ndarray, seed: int = 0, draws: int = DRAWS) -> I
     if len(a) != len(b):
         raise ValueError(f"pairs of {len(a)} and {len(b)} throws; expected the same throws of both")
     both = np.asarray(a, dtype=float) - np.asarray(b, dtype=float)
-    return mean(both[np.isfinite(both)], seed, draws)
+    return mean(both[np.isfinite(both)])
 
 
-def ratio(a: Groups | np.ndarray, b: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+def ratio(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` over mean of ``b``, independent throws; both positive."""
-    return _of_both(np.divide, a, b, seed, draws)
+    return _of_both(np.divide, a, b, draws)
 
 
-def correlation(x: np.ndarray, y: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+def correlation(x: np.ndarray, y: np.ndarray) -> Interval:
     """Pearson's correlation of pairs with its interval over pairs.
 
     Raises ValueError: fewer than three pairs, or one side that never varies.
@@ -117,7 +117,7 @@ def correlation(x: np.ndarray, y: np.ndarray, seed: int = 0, draws: int = DRAWS)
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(x) != len(y) or len(x) < 3 or not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
         raise ValueError(f"{len(x)} and {len(y)} numbers; expected three or more pairs, not all alike")
-    index = np.random.default_rng(seed).integers(len(x), size=(draws, len(x)))
+    index = np.random.default_rng(0).integers(len(x), size=(DRAWS, len(x)))
     samples = _pearson(x[index], y[index])
     return _interval(float(_pearson(x[None], y[None])[0]), samples[np.isfinite(samples)], 1)
 
@@ -150,13 +150,13 @@ class Bias:
         return ", ".join(found) or "none that shows"
 
 
-def bias(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Bias:
+def bias(groups: Groups | np.ndarray) -> Bias:
     """Split misses of each run, shape (N, 2) [m], along the throw and to the left, into a common offset and scatter.
 
     Mean square = offset squared + scatter squared.
     """
     found = _checked(groups)
-    samples = _resampled(found, np.random.default_rng(seed), draws)
+    samples = _resampled(found, np.random.default_rng(0), DRAWS)
     center = _mean(found)
     square = float(np.mean([(group**2).sum(1).mean() for group in found]))
     offset = float(np.hypot(*center))

@@ -228,7 +228,6 @@ class Policy:
     @staticmethod
     def from_actor_state(
         state: Mapping[str, Tensor], activation: str, contract: dict[str, Any], made_by: dict[str, Any] | None = None,
-        eps: float = RSL_RL_EPS,
     ) -> "Policy":  # fmt: skip
         """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
 
@@ -240,7 +239,6 @@ class Policy:
             activation: The actor's hidden activation by rsl_rl's name.
             contract: Conditions of the training.
             made_by: Where it comes from.
-            eps: Of the normaliser.
         """
         known = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(known))
@@ -258,7 +256,7 @@ class Policy:
             tuple(take(f"mlp.{i}.weight") for i in index), tuple(take(f"mlp.{i}.bias") for i in index), activation.lower(),
             json.loads(json.dumps(contract)), json.loads(json.dumps(made_by or {})),
             take("obs_normalizer._mean").reshape(-1) if normalized else None,
-            take("obs_normalizer._std").reshape(-1) if normalized else None, eps if normalized else 0.0,
+            take("obs_normalizer._std").reshape(-1) if normalized else None, RSL_RL_EPS if normalized else 0.0,
         )  # fmt: skip
 
 

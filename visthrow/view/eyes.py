@@ -114,15 +114,15 @@ class Eyes:
             self.found[name] += getattr(seen, name) is not None
         return self._followed[e].take(seen, rot_wc, stamp)
 
-    def sheet(self, path: Path, columns: int = 3) -> Path:
+    def sheet(self, path: Path) -> Path:
         """Draw six of the kept frames, spread over the throw, with what was found; returns the path."""
         import cv2
 
         from camera.overlay import draw_overlay
 
-        chosen = [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 2 * columns).round().astype(int)]
+        chosen = [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 6).round().astype(int)]
         drawn = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]
-        sheet = np.vstack([np.hstack(drawn[:columns]), np.hstack(drawn[columns:])])
+        sheet = np.vstack([np.hstack(drawn[:3]), np.hstack(drawn[3:])])
         atomic_write(path, cv2.imencode(".png", sheet)[1].tobytes())
         return path
 

@@ -213,9 +213,9 @@ def trades(panels: Sequence[Trade]) -> bytes:
     return png_of(figure)
 
 
-def curves(panels: Sequence[Panel], ylabel: str, columns: int = 3, log: bool = False) -> bytes:
+def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
     """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own value."""
-    columns = min(columns, len(panels))
+    columns = min(3, len(panels))
     figure, axes = _axes(len(panels), columns, WIDTH if columns > 1 else 0.62 * WIDTH, 2.75, 0.4)
     labels: dict[str, object] = {}
     for axis, panel in zip(axes.flat, panels):

@@ -4,6 +4,8 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+DPI = 150.0  # of pictures
+
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
     """A table as Markdown, columns aligned: the first ``heads`` columns stand left, all of them without it, the others right."""
@@ -68,15 +70,15 @@ def section(name: str, title: str, *parts: Part | None, missing: Sequence[str] =
     return Section(name, title, (*filter(None, parts), *([Text(f"{head}: {said}.", "missing")] if said else [])))
 
 
-def png_of(figure, dpi: float = 150.0) -> bytes:
+def png_of(figure) -> bytes:
     """Bytes of a matplotlib figure, which is closed."""
     import matplotlib.pyplot as plt
 
     buffer = io.BytesIO()
     if layout := figure.get_layout_engine():  # done here: for its sake all would be drawn twice
-        figure.set_dpi(dpi)
+        figure.set_dpi(DPI)
         layout.execute(figure)
         figure.set_layout_engine("none")
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format="png", dpi=DPI)
     plt.close(figure)
     return buffer.getvalue()

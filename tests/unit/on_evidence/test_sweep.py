@@ -236,7 +236,7 @@ def test_what_another_process_has_is_tried_again(path, tmp_path):
 
 def test_the_time_limit_stops_what_runs(path, tmp_path, monkeypatch):
     monkeypatch.setattr(FakeRun, "_finish", lambda self: None)
-    starter, outcome = run(path, tmp_path, minutes=0.001)
+    starter, outcome = run(path, tmp_path, minutes=0.02)
     assert outcome.stopped
     assert not outcome.interrupted, "it was asked to end then: status 0"
     assert [r.stopped for r in starter.alive] == [True, True]
