@@ -280,8 +280,8 @@ def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
 
 
 def test_samples_in_steps_are_not_stale_where_they_repeat_themselves():
-    """Rates of whole degrees a second at 1 kHz: those at which a step was just taken are half a step ahead of the rate."""
-    time = np.arange(0.0, 10.0, 1e-3)
+    """Rates of whole degrees a second at 400 Hz: those at which a step was just taken are half a step ahead of the rate."""
+    time = np.arange(0.0, 25.0, 2.5e-3)
     rate = np.stack([0.3 * np.sin(2.0 * np.pi * f * time) for f in (0.5, 0.7, 0.9)], axis=1)
     step = np.radians(1.0)
     rounded = step * np.round(rate / step)

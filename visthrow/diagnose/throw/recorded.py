@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import savgol_coeffs
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
@@ -17,6 +19,7 @@ LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 
 
 UNIFORM = 12.0**-0.5  # standard deviation of what rounding takes, of its step
 BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
+ENOUGH = 250.0  # samples of the gyro a second: faster ones tell a model of 500 steps a second no more
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
 
 
@@ -84,10 +87,35 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
         time, values = time[fresh], values[fresh]
     if name == "quat_wb":
         values = continuous(values / np.linalg.norm(values, axis=1, keepdims=True))
+    if name == "rate_b":
+        time, values = _thinned(time, values)
+        if len(time) < 5:
+            return None
     noise = np.hypot(highpass_sigma(values), step * UNIFORM)
     # An angle moves three of four numbers of an attitude by its half.
     sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0) if name == "quat_wb" else np.median(noise)
     return Samples(time, values, max(float(sigma), LEAST_SIGMA[name]))
+
+
+def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples that come at twice :data:`ENOUGH` or faster, shape (T,) and (T, N), as fewer that say as much: every n-th of them smoothed.
+
+    A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and leaves the noise as white as it was: neighbours correlate
+    by at most 0.07. None goes across a gap.
+
+    Source: Savitzky and Golay 1964.
+    """
+    steps = np.diff(time)
+    every = int(1.0 / (ENOUGH * np.median(steps)) + 0.1)  # clocks are some per cent off
+    if every < 2:
+        return time, values
+    weights, parts = savgol_coeffs(2 * every + 1, 2), []
+    for stretch in np.split(np.arange(len(time)), np.flatnonzero(steps > 1.5 * np.median(steps)) + 1):
+        if len(stretch) >= len(weights):
+            near = sliding_window_view(np.column_stack((time, values))[stretch], len(weights), axis=0)[::every]
+            parts.append(near @ weights)
+    thinned = np.concatenate(parts) if parts else np.zeros((0, 1 + values.shape[1]))
+    return thinned[:, 0], thinned[:, 1:]
 
 
 def resolution(values: np.ndarray) -> float:

@@ -1,0 +1,51 @@
+"""What a replay takes from a log."""
+
+import numpy as np
+import pytest
+
+from visthrow.diagnose.throw.recorded import record_of
+from visthrow.logs.flightlog import Channel, FlightLog
+
+SWING = [0.1, 0.2, 0.3]
+"""Of the body rates [rad/s]."""
+
+
+def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> FlightLog:
+    """Ten seconds whose body rates swing at 10 Hz, seen at so many samples a second, none in the gap."""
+    at, seen = np.arange(0.0, 10.0, 0.005), np.arange(0.0, 10.0, 1.0 / rate)
+    seen = seen[(seen <= gap[0]) | (seen >= gap[1])]
+    values = np.sin(2.0 * np.pi * 10.0 * seen)[:, None] * SWING
+    values += noise * np.random.default_rng(0).standard_normal(values.shape)
+    still = np.zeros((len(at), 3)) + 1e-4 * np.random.default_rng(1).standard_normal((len(at), 3))
+    quat = np.column_stack((1e-4 * np.random.default_rng(2).standard_normal((len(at), 3)), np.ones(len(at))))
+    return FlightLog({
+        "pos_w": Channel(at, still, "m", "world"), "quat_wb": Channel(at, quat, "1", "world"),
+        "command": Channel(at[::4], np.tile([4.0, 0.0, 0.0, 0.0], (len(at[::4]), 1)), "N, rad/s", "body"),
+        "rate_b": Channel(seen, values, "rad/s", "body"),
+    })  # fmt: skip
+
+
+def test_a_gyro_of_1_kHz_is_as_good_in_a_quarter_of_its_samples():
+    """Its noise is halved and white, and the motion that it saw is all there."""
+    log = flight(1000.0, 0.02)
+    gyro = record_of(log).gyro
+    assert len(gyro.time) == pytest.approx(2500, abs=5)
+    np.testing.assert_allclose(np.diff(gyro.time), 0.004, atol=1e-9)
+    assert gyro.sigma == pytest.approx(0.01, rel=0.1)
+    left = gyro.values - np.sin(2.0 * np.pi * 10.0 * gyro.time)[:, None] * SWING
+    assert np.std(left) == pytest.approx(0.0101, rel=0.05)
+    assert abs(np.corrcoef(left[:-1].ravel(), left[1:].ravel())[0, 1]) < 0.08
+    swing = np.sin(2.0 * np.pi * 10.0 * gyro.time) @ gyro.values / np.sum(np.sin(2.0 * np.pi * 10.0 * gyro.time) ** 2)
+    np.testing.assert_allclose(swing, SWING, rtol=5e-3)
+
+
+def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
+    time = record_of(flight(1000.0, 0.02, (4.0, 5.0))).gyro.time
+    assert not np.any((time > 4.0) & (time < 5.0))
+    assert np.sum(time <= 4.0) == pytest.approx(1000, abs=3)
+
+
+@pytest.mark.parametrize("rate", [200.0, 400.0])
+def test_slower_gyros_stay_as_they_are(rate):
+    log = flight(rate, 0.02)
+    np.testing.assert_array_equal(record_of(log).gyro.values, log["rate_b"].values)
