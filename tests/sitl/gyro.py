@@ -3,8 +3,8 @@
     python tests/sitl/alone.py python -m tests.sitl.gyro --seeds 100 101
 
 The blackbox records each loop of the firmware; the vehicle is the training's with the firmware's settings, as `diagnose apply` makes it.
-What windows leave of the gyro beside their initial states is told as its mean square about x, y and z, in deviations of the recording's
-steps of 1 deg/s: 1 is nothing but those. The first line is as `explain` sees it: the vehicle behind the firmware in steps of 2 ms, the
+What windows leave of the gyro beside their initial states is told as its mean square about x, y and z, in deviations of its noise and of
+the recording's steps of 1 deg/s, at the 250 samples a second that `explain` looks at. The first line is as `explain` sees it: the vehicle behind the firmware in steps of 2 ms, the
 gyro behind the firmware's filters, commands at the runner's stamps.
 """
 
@@ -77,7 +77,7 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
 
 
 def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
-    """Mean square of what windows leave of the gyro, in deviations of the recording's step, shape (3,)."""
+    """Mean square of what windows leave of the gyro, in deviations of its noise, shape (3,)."""
     path, hover = config.find("train", BASE), config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     file = folder / "settings.toml"
     file.write_text(patch.with_firmware(box, str(path), config.load(Experiment, path), hover, DELAY))
