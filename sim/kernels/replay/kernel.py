@@ -260,6 +260,9 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         slack_first = time - real(1.0)
         slack_last = time - real(1.0)
         at = Pointers()
+        at.due = time
+        for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
+            marks[e] = at
         total = coupled.momentum(p, rope, s, u)
         before = s.rate_b
         pay = ball.pos
@@ -388,12 +391,14 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 k.t1 = t0 + h
                 k.h = h
                 last = j == count - 1 and until >= end - tiny
-                at = sample(p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane)
+                if last or at.due <= k.t1:  # most steps show nothing, and to ask costs as much as a tenth of a step
+                    at = sample(p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane)
                 for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
-                    marks[e] = sample(
-                        p, sensings[lanes.plant[e]], data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last,
-                        marks[e], out, e,
-                    )  # fmt: skip
+                    if last or marks[e].due <= k.t1:
+                        marks[e] = sample(
+                            p, sensings[lanes.plant[e]], data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last,
+                            marks[e], out, e,
+                        )  # fmt: skip
                 before = old.rate_b
             time = until
 

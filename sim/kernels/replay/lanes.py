@@ -134,7 +134,7 @@ class Replay:
         moments, vec3 = knots if np.any(resumed) else 0, t.vec3
         ropes = [wp.empty((moments, self.segments), dtype=kind, device=device) for kind in (vec3, vec3, t.real)]
         left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
-        marks = wp.zeros(count, dtype=k.Pointers, device=device)
+        marks = wp.empty(count, dtype=k.Pointers, device=device)
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
         launches = [rows[np.argsort(-costs[rows], kind="stable")] for rows in _in_order(np.asarray(lanes["shared"]), resumed)]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)

@@ -73,7 +73,7 @@ class Sampling:
     sample: wp.Function
     copy_samples: wp.Function
     Steps: type  # a step's two ends and its length [s]
-    Pointers: type  # how many stamps of each sensor were sampled
+    Pointers: type  # how many stamps of each sensor were sampled, and the time of the state that the next one shows [s]
 
 
 def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampling:
@@ -87,7 +87,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
     Vehicle, QuadState = t.Vehicle, t.QuadState
     see_pose, see_point, see_rate = build_sensing(t, Sensing)
     Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
-    Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32})
+    Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32, "due": real})
 
     @wp.func
     def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
@@ -115,6 +115,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
     ):  # fmt: skip
         """Write every measured stamp that falls into a step; the window's last step samples all that is left."""
         next = at
+        next.due = windows.end[w]
         vehicles = windows.vehicle_count[w]
         payloads = windows.payload_count[w]
         span = k.h
@@ -122,6 +123,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
             i = windows.vehicle_first[w] + next.vehicle
             time = late(x, windows, w, data.vehicle_time[i], x.vehicle_delay)
             if time > k.t1 and not last:
+                next.due = wp.min(next.due, time)
                 break
             s = (time - k.t0) / span
             pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
@@ -133,6 +135,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
         while next.payload < payloads:
             time = late(x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.payload_delay)
             if time > k.t1 and not last:
+                next.due = wp.min(next.due, time)
                 break
             s = (time - k.t0) / span
             out[2 * vehicles + next.payload, lane] = see_point(x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span))
@@ -140,6 +143,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
         while next.gyro < windows.gyro_count[w]:
             time = late(x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay)
             if time > k.t1 and not last:
+                next.due = wp.min(next.due, time)
                 break
             s = (time - k.t0) / span
             bend = b.rate_b - a.rate_b - (a.rate_b - before)  # a parabola through three ends of steps

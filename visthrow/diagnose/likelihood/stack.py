@@ -242,7 +242,7 @@ def _solved(at: _Shape, batch: _Batch) -> _Solved:
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Inverse of matrices whose lower Cholesky factors these are; a GPU's own goes through them one by one."""
     if not factor.is_cuda:
-        return torch.cholesky_inverse(factor)
+        return torch.cholesky_inverse(factor).mT  # it comes by columns, beside all else by rows; it is symmetric
     back = torch.linalg.solve_triangular(factor, torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device), upper=False)
     return back.mT @ back
 
