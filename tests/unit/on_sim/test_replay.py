@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sim.cores import _pool
+from sim.effects.setting import Setting, generalised
 from sim.hybrid import HybridSim
 from sim.kernels.replay import kernel as rk
 from sim.kernels.replay.lanes import _BUILDS, Recording, Replay, _shared_out
@@ -66,6 +67,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
     lanes = {"window": 0, "plant": 0, "state": 0, "axis": -1, "knot": 0, "size": 0.0, "substep": 0.002, "keep": -1, "resume": -1,
              "parent": -1, "shared": 0} | lane  # fmt: skip
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
+    plants = [generalised(Setting(p)).plant for p in plants]  # as a diagnosis flies them
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
     flown = engine.run(start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9)
     out = flown.seen
