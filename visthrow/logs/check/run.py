@@ -173,9 +173,11 @@ def _prints(log: FlightLog) -> set[bytes]:
             continue
         rows = np.ascontiguousarray(channel.values.reshape(len(channel.values), -1), dtype=np.float64)
         moving = np.flatnonzero(np.any(rows[1:] != rows[:-1], axis=1))
-        for at in moving[:: max(1, len(moving) // 2000)]:
-            if at + 4 <= len(rows) and len(np.unique(rows[at : at + 4])) > 3:
-                prints.add(hashlib.blake2b(rows[at : at + 4].tobytes(), digest_size=8).digest())
+        first = moving[:: max(1, len(moving) // 2000)]
+        runs = rows[first[first + 4 <= len(rows), None] + np.arange(4)].reshape(-1, 4 * rows.shape[1])
+        ordered = np.sort(runs, axis=1)  # NaN last
+        others = np.sum((ordered[:, 1:] != ordered[:, :-1]) & ~np.isnan(ordered[:, :-1]), axis=1)
+        prints.update(hashlib.blake2b(run.tobytes(), digest_size=8).digest() for run in runs[others > 2])
     return prints
 
 
