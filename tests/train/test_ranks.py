@@ -60,7 +60,8 @@ def folder(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["rsl_rl.env"])  # which takes longest, once for both
     both = [context.Process(target=process, args=(rank, port, folder), daemon=True) for rank in range(2)]
     for one in both:
         one.start()
