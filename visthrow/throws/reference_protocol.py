@@ -27,7 +27,7 @@ from visthrow.training.device import cores
 if TYPE_CHECKING:
     from visthrow.view.eyes import Eyes
 
-BATCH = 100  # throws that share one plant: about 23 s of one core a batch and 1 s a throw
+BATCH = 100  # throws that share one plant: about 12 s of one core a batch and 1 s a throw
 
 HOVER_TIME = 1.6  # before the policy takes over [s]; a whole number of control periods
 
