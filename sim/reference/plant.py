@@ -189,7 +189,7 @@ class ReferencePlant:
         root = self._upper_end(state, rotation)
         lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
         drag_w = blocks.payload_force(
-            self.params.rope, self.extras.payload_drag, self._ropes.points(*root, rope)[2], wind_w, rope[0][:, -1], lift_w,
+            self.params.rope, self.extras.payload_drag, self._ropes.payload_velocity(root[1], rope), wind_w, rope[0][:, -1], lift_w,
             self._attached,
         )  # fmt: skip
         second = np.zeros_like(rope[0])

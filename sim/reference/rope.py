@@ -173,13 +173,17 @@ class RopeDynamics:
             root_vel: its velocity [m/s], shape (E, 3).
             rope: as in ``attached``.
         """
-        n, n_dot, elongation, elongation_dot = rope
+        n, _, elongation, _ = rope
         length = self.length[:, None, None]
         points = np.concatenate((root_pos[:, None], root_pos[:, None] + np.cumsum(length * n, axis=1)), 1)
-        reach = (self.offset + elongation)[:, None]
-        pos = points[:, -1] + reach * n[:, -1]
-        vel = root_vel + np.sum(length * n_dot, axis=1) + reach * n_dot[:, -1] + elongation_dot[:, None] * n[:, -1]
-        return points, pos, vel
+        pos = points[:, -1] + (self.offset + elongation)[:, None] * n[:, -1]
+        return points, pos, self.payload_velocity(root_vel, rope)
+
+    def payload_velocity(self, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Return the velocity of the payload's centre [m/s], world frame, shape (E, 3); arguments as of :meth:`points`."""
+        n, n_dot, elongation, elongation_dot = rope
+        along = self.length[:, None] * n_dot.sum(axis=1) + (self.offset + elongation)[:, None] * n_dot[:, -1]
+        return root_vel + along + elongation_dot[:, None] * n[:, -1]
 
 
 def _from_above(rates: np.ndarray, above: np.ndarray) -> np.ndarray:

@@ -4,8 +4,8 @@
 
 The blackbox records each loop of the firmware; the vehicle is the training's with the firmware's settings, as `diagnose apply` makes it.
 What windows leave of the gyro beside their initial states is told as its mean square about x, y and z, in deviations of its noise and of
-the recording's steps of 1 deg/s, at the 250 samples a second that `explain` looks at. The first line is as `explain` sees it: the vehicle behind the firmware in steps of 2 ms, the
-gyro behind the firmware's filters, commands at the runner's stamps.
+the recording's steps of 1 deg/s, at the 250 samples a second that `explain` looks at. The first line is as `explain` sees it: the
+vehicle behind the firmware in steps of 2 ms, the gyro behind the firmware's filters, commands at the runner's stamps.
 """
 
 import argparse
