@@ -26,7 +26,7 @@ there were none, states took their place: bends of the rope of ten times their p
 CALMER = tuple(0.5**k for k in range(1, 11))  # of that, which windows may turn out to have had
 GROWTH = 1.5, 1.0, 1.5, 0.5  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
 HUBER = 30.0  # deviations, beyond which a sample counts less
-SETTLED = 1.0, 0.003  # fall of the cost, and relative one, below which an initial state is settled
+SETTLED = 1.0, 0.01  # fall of the cost, and relative one, below which an initial state is settled
 SHRINKING = 0.1
 """Of what the next step promises against what the last one did, below which derivatives from elsewhere lead to the goal."""
 TRUE, WHOLE = 0.5, 0.8
