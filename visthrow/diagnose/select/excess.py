@@ -14,7 +14,6 @@ from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.likelihood.grammar import through_latents
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
-from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.models.laws import JOINT, JOINT_NEEDS, Known
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
@@ -58,18 +57,13 @@ def compares_phases(point: Point) -> bool:
 
 def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
     """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING`` within the median window."""
-    named = enumerate(problem.model.channels)
-    positions = [c for c, name in named if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"]
-
-    def farthest(gram: Gram, window: Window) -> dict[tuple[int, str], float]:
+    channels, moves = problem.model.channels, {}
+    positions = [c for c, name in enumerate(channels) if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"]
+    for gram, window in zip(point.grams, point.windows):
         seen = window.latent[np.isin(window.channel, positions)]
-        reach = {b: seen @ gram.factor[:, gram.latent_block == b] for b in np.unique(gram.latent_block).tolist() if len(seen)}
-        return {(b, gram.phase): float(np.sqrt((moved**2).sum(1).max())) for b, moved in reach.items()}
-
-    moves: dict[tuple[int, str], list[float]] = {}
-    for own in each(lambda pair: farthest(*pair), zip(point.grams, point.windows)):
-        for key, distance in own.items():
-            moves.setdefault(key, []).append(distance)
+        for block in np.unique(gram.latent_block) if len(seen) else ():
+            reach = seen @ gram.factor[:, gram.latent_block == block]
+            moves.setdefault((int(block), gram.phase), []).append(float(np.sqrt((reach**2).sum(1).max())))
     return {key: LANDING / median for key, found in moves.items() if (median := float(np.median(found))) > 0.0}
 
 

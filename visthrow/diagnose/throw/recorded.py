@@ -101,7 +101,7 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Samples that come at twice :data:`ENOUGH` or faster, shape (T,) and (T, N), as fewer that say as much: every n-th of them smoothed.
 
     A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and leaves the noise as white as it was: neighbours correlate
-    by at most 0.07. None goes across a gap.
+    by at most 0.07. Times are smoothed alike, so that single samples may lack; none goes across a gap.
 
     Source: Savitzky and Golay 1964.
     """
@@ -110,7 +110,7 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if every < 2:
         return time, values
     weights, parts = savgol_coeffs(2 * every + 1, 2), []
-    for stretch in np.split(np.arange(len(time)), np.flatnonzero(steps > 1.5 * np.median(steps)) + 1):
+    for stretch in np.split(np.arange(len(time)), np.flatnonzero(steps > 1.5 / ENOUGH) + 1):
         if len(stretch) >= len(weights):
             near = sliding_window_view(np.column_stack((time, values))[stretch], len(weights), axis=0)[::every]
             parts.append(near @ weights)

@@ -67,7 +67,7 @@ class CapturedPPO(PPO):
         for group, values in obs.items():  # one by one: copied at once they took four times as long
             seen[group].copy_(values)
         with self._beside():
-            storage.values[storage.step].copy_(self.critic(seen))
+            storage.values[storage.step].copy_(self.critic(seen).detach())
         actions = self.actor(obs, stochastic_output=True).detach()
         storage.actions[storage.step].copy_(actions)
         storage.distribution_params[0][storage.step].copy_(self.actor.output_mean)
