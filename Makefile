@@ -44,8 +44,9 @@ $(FIRMWARE)/.built: pyproject.toml
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
-# Style, and strict types of the public API (pyproject.toml, tool.mypy).
+# Style, format, and strict types of the public API (pyproject.toml, tool.mypy).
 lint: $(STAMP)
+	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 

@@ -1,39 +1,43 @@
-"""Kannala-Brandt fisheye model in torch: valid past 90 deg off the axis, finite and differentiable on the whole sphere.
+"""Kannala-Brandt fisheye model in torch: valid past 90 deg off the axis, finite and differentiable
+on the whole sphere.
 
-The same functions serve a batch of thousands on a GPU inside a CUDA graph and a batch of one on board: no host copies,
-no branches on data, no boolean-mask indexing. Only elementwise operations whose vector and scalar paths agree are used
-(``atan``, not ``atan2``, whose remainder loop rounds otherwise), so that a batch of N equals N singles bit for bit on
-the CPU.
-"""
+The same functions serve a batch of thousands on a GPU inside a CUDA graph and a batch of one on
+board: no host copies, no branches on data, no boolean-mask indexing. Only elementwise operations
+whose vector and scalar paths agree are used (``atan``, not ``atan2``, whose remainder loop rounds
+otherwise), so that a batch of N equals N singles bit for bit on the CPU."""
 
 import torch
 
 from camera.params import FisheyeParams
 
 AXIS_EPSILON = 1e-20
-"""Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the points' unit."""
+"""Added to x^2 + y^2 so that value and gradient are finite on the axis: a radius of 1e-10 in the
+points' unit.
+"""
 
 NEWTON_STEPS = 16
-"""Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket."""
+"""Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket.
+"""
 
 
 class Fisheye:
     """Projection and unprojection of a Kannala-Brandt fisheye.
 
-    Normalised image coordinates are 1 at the edge of the stated field of view, in every direction and for any fx, fy:
-    ``x_n = (u - cx) / (fx R)``, ``y_n = (v - cy) / (fy R)`` with ``R = theta_d(fov / 2)``. They do not depend on fx,
-    fy, cx, cy at all, only on the shape of theta_d and the field of view.
+    Normalised image coordinates are 1 at the edge of the stated field of view, in every direction
+    and for any fx, fy: ``x_n = (u - cx) / (fx R)``, ``y_n = (v - cy) / (fy R)`` with ``R =
+    theta_d(fov / 2)``. They do not depend on fx, fy, cx, cy at all, only on the shape of theta_d
+    and the field of view.
 
-    Past the field of view theta_d goes on along its tangent, so that the map stays one-to-one and smooth on the whole
-    sphere even where the polynomial folds back; such points are never valid. Results have the dtype and device of the
-    input.
+    Past the field of view theta_d goes on along its tangent, so that the map stays one-to-one and
+    smooth on the whole sphere even where the polynomial folds back; such points are never valid.
+    Results have the dtype and device of the input.
 
     Attributes:
         params: The intrinsics.
         half_fov: Largest valid angle off the axis [rad].
         edge_radius: ``R = theta_d(fov / 2)`` [rad].
-        circle_inside_image: Whether the whole field of view falls on the sensor; if not, validity also asks for the
-            image.
+        circle_inside_image: Whether the whole field of view falls on the sensor; if not, validity
+            also asks for the image.
     """
 
     def __init__(self, params: FisheyeParams):
@@ -47,14 +51,26 @@ class Fisheye:
         self._edge_slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
         reach_x, reach_y = params.fx * self.edge_radius, params.fy * self.edge_radius
         slack = 1e-9
-        self._bounds = (-0.5 - slack, params.width - 0.5 + slack, -0.5 - slack, params.height - 0.5 + slack)
+        self._bounds = (
+            -0.5 - slack,
+            params.width - 0.5 + slack,
+            -0.5 - slack,
+            params.height - 0.5 + slack,
+        )
         left, right, top, bottom = self._bounds
         self.circle_inside_image = (
-            params.cx - reach_x >= left and params.cx + reach_x <= right and params.cy - reach_y >= top and params.cy + reach_y <= bottom
+            params.cx - reach_x >= left
+            and params.cx + reach_x <= right
+            and params.cy - reach_y >= top
+            and params.cy + reach_y <= bottom
         )
-        self._constants: dict[tuple[torch.device, torch.dtype], tuple[torch.Tensor, torch.Tensor]] = {}
+        self._constants: dict[
+            tuple[torch.device, torch.dtype], tuple[torch.Tensor, torch.Tensor]
+        ] = {}
 
-    def angle(self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def angle(
+        self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Angle off the optical axis of points.
 
         Args:
@@ -62,16 +78,16 @@ class Fisheye:
             epsilon: Added to x^2 + y^2 [unit of the points, squared].
 
         Returns:
-            theta in [0, pi] [rad], distance from the axis and distance from the lens [unit of the points], each shape
-            (...).
+            theta in [0, pi] [rad], distance from the axis and distance from the lens [unit of the
+            points], each shape (...).
         """
         x, y, z = points_c.unbind(-1)
         radius2 = x * x + y * y + epsilon
         radius = radius2.sqrt()
         distance = (radius2 + z * z).sqrt()
         behind = z < 0.0
-        # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each side of the lens
-        # plane.
+        # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each
+        # side of the lens plane.
         reach = distance + z.abs()
         tangent = torch.where(behind, reach, radius) / torch.where(behind, radius, reach)
         return tangent.atan() * 2.0, radius, distance
@@ -83,7 +99,10 @@ class Fisheye:
         k1, k2, k3, k4 = self.params.coefficients
         inner = theta.clamp(max=self.half_fov)
         t2 = inner * inner
-        return inner * (t2 * (t2 * (t2 * (t2 * k4 + k3) + k2) + k1) + 1.0) + (theta - inner) * self._edge_slope
+        return (
+            inner * (t2 * (t2 * (t2 * (t2 * k4 + k3) + k2) + k1) + 1.0)
+            + (theta - inner) * self._edge_slope
+        )
 
     def slope_from_angle(self, theta: torch.Tensor) -> torch.Tensor:
         """d theta_d / d theta [-], shape of theta; constant past the field of view."""
@@ -94,16 +113,19 @@ class Fisheye:
         t2 = inner * inner
         return t2 * (t2 * (t2 * (t2 * (9 * k4) + 7 * k3) + 5 * k2) + 3 * k1) + 1.0
 
-    def project_normalized(self, points_c: torch.Tensor, clip: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+    def project_normalized(
+        self, points_c: torch.Tensor, clip: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Project points to normalised image coordinates.
 
         Args:
             points_c: Points [any unit], shape (..., 3), camera frame.
-            clip: Pull points outside the field of view to its edge (radius 1), along their own direction in the image.
+            clip: Pull points outside the field of view to its edge (radius 1), along their own
+                direction in the image.
 
         Returns:
-            Normalised coordinates [-], shape (..., 2), and validity (bool), shape (...): inside the field of view and
-            on the sensor.
+            Normalised coordinates [-], shape (..., 2), and validity (bool), shape (...): inside the
+            field of view and on the sensor.
         """
         theta, radius, _ = self.angle(points_c)
         valid = theta <= self.half_fov
@@ -120,8 +142,8 @@ class Fisheye:
             points_c: Points [any unit], shape (..., 3), camera frame.
 
         Returns:
-            Pixels [px], shape (..., 2), finite everywhere, and validity (bool), shape (...): theta <= fov / 2. Whether
-            a valid point also falls on the sensor is `on_sensor`'s to say.
+            Pixels [px], shape (..., 2), finite everywhere, and validity (bool), shape (...): theta
+            <= fov / 2. Whether a valid point also falls on the sensor is `on_sensor`'s to say.
         """
         theta, radius, _ = self.angle(points_c)
         focal, centre = self._pixel_constants(points_c)
@@ -135,8 +157,8 @@ class Fisheye:
             pixels: Pixels [px], shape (..., 2).
 
         Returns:
-            Unit rays [-], shape (..., 3), camera frame, and validity (bool), shape (...): inside the field of view.
-            Pixels beyond it give the ray at the edge.
+            Unit rays [-], shape (..., 3), camera frame, and validity (bool), shape (...): inside
+            the field of view. Pixels beyond it give the ray at the edge.
         """
         focal, centre = self._pixel_constants(pixels)
         plane = (pixels - centre) / focal
@@ -159,13 +181,17 @@ class Fisheye:
         return normalized * (focal * self.edge_radius) + centre
 
     def on_sensor(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included: bool, shape (...)."""
+        """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included:
+        bool, shape (...).
+        """
         left, right, top, bottom = self._bounds
         u, v = pixels.unbind(-1)
         return (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
 
     def _angle_from_radius(self, radius: torch.Tensor) -> torch.Tensor:
-        """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last step."""
+        """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last
+        step.
+        """
         if self._equidistant:
             return radius
         with torch.no_grad():
@@ -180,7 +206,9 @@ class Fisheye:
         return theta - (self.radius_from_angle(theta) - radius) / self.slope_from_angle(theta)
 
     def _pixel_constants(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Focal lengths and principal point on a tensor's device, made once: a CUDA graph can be captured later."""
+        """Focal lengths and principal point on a tensor's device, made once: a CUDA graph can be
+        captured later.
+        """
         key = (like.device, like.dtype)
         if key not in self._constants:
             p = self.params

@@ -1,8 +1,8 @@
 """Fixed-length history of tensors, newest first, as pure functions.
 
-No indexing by masks and no branches on data: the functions run inside a CUDA graph. Filled with the first value on
-reset, so that a history never mixes two episodes and never holds zeros that were no measurement.
-"""
+No indexing by masks and no branches on data: the functions run inside a CUDA graph. Filled with the
+first value on reset, so that a history never mixes two episodes and never holds zeros that were no
+measurement."""
 
 import torch
 
@@ -26,8 +26,8 @@ def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> 
 def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
     """Value that is ``latency`` steps old, linear between the two stored neighbours.
 
-    Written as hat-function weights over the whole (short) history: no gather, latencies may differ by environment.
-    A latency beyond the history reads its oldest value.
+    Written as hat-function weights over the whole (short) history: no gather, latencies may differ
+    by environment. A latency beyond the history reads its oldest value.
 
     Args:
         history: Floating point, shape (E, H, ...), newest first.

@@ -1,8 +1,8 @@
-"""Keypoints that the vision policy sees: corners of the goal square and the bounding box of the ball.
+"""Keypoints that the vision policy sees: corners of the goal square and the bounding box of the
+ball.
 
-`keypoints` is the one function that the training environment calls with a batch of thousands and the HIL runner with a
-batch of one.
-"""
+`keypoints` is the one function that the training environment calls with a batch of thousands and
+the HIL runner with a batch of one."""
 
 import torch
 
@@ -16,15 +16,20 @@ KEYPOINTS = GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS
 """K = 8 keypoints: 0 to 3 the goal corners, 4 to 7 the payload box."""
 
 MAX_SINE = 0.99
-"""Sine of the largest half-angle of the ball: keeps the box finite when the lens touches the ball or sinks into it."""
+"""Sine of the largest half-angle of the ball: keeps the box finite when the lens touches the ball
+or sinks into it.
+"""
 
 
 DIRECTION_EPSILON = 1e-10
-"""Added to the squared sine of the ball's angle: the box's derivative behind the lens then stays inside float32."""
+"""Added to the squared sine of the ball's angle: the box's derivative behind the lens then stays
+inside float32.
+"""
 
 
 class KeypointCamera:
-    """A camera with its constants on one device, made once before the first step (and before a CUDA graph is captured).
+    """A camera with its constants on one device, made once before the first step (and before a CUDA
+    graph is captured).
 
     Attributes:
         params: The configuration.
@@ -36,7 +41,12 @@ class KeypointCamera:
         edge_reads: Whether points outside the field of view read as its edge (else as zero).
     """
 
-    def __init__(self, params: CameraParams, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32):
+    def __init__(
+        self,
+        params: CameraParams,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ):
         """Put the constants on the device."""
         self.params = params
         self.fisheye = Fisheye(params.fisheye)
@@ -48,32 +58,42 @@ class KeypointCamera:
         self._axes = torch.eye(2, 3, device=device, dtype=dtype)
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
-    def extrinsics(self, rotation_error: torch.Tensor, position_error: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Extrinsics with an error per environment: ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
+    def extrinsics(
+        self, rotation_error: torch.Tensor, position_error: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Extrinsics with an error per environment:
+
+        ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
 
         Args:
             rotation_error: Rotation vectors [rad], shape (E, 3), body frame.
             position_error: Offsets [m], shape (E, 3), body frame.
 
         Returns:
-            rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3): the ``extrinsics`` of `keypoints`.
+            rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3): the ``extrinsics`` of
+            `keypoints`.
         """
-        turn = rotation_from_vector(rotation_error)  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
+        turn = rotation_from_vector(
+            rotation_error
+        )  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
         return rotate(turn, self.rot_cb.expand(turn.shape)), self.position_b + position_error
 
 
 def goal_square(side: float) -> torch.Tensor:
     """Corners of the goal square from its centre [m], float64, shape (4, 3), world frame.
 
-    Convention: (+x, +y), (+x, -y), (-x, -y), (-x, +y), so clockwise seen from above and, from a downward camera whose
-    vehicle faces +x, top left, top right, bottom right, bottom left in the image. Sides are parallel to the world's
-    axes.
-    """
+    Convention: (+x, +y), (+x, -y), (-x, -y), (-x, +y), so clockwise seen from above and, from a
+    downward camera whose vehicle faces +x, top left, top right, bottom right, bottom left in the
+    image. Sides are parallel to the world's axes."""
     h = side / 2.0
-    return torch.tensor([[h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0], [-h, h, 0.0]], dtype=torch.float64)
+    return torch.tensor(
+        [[h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0], [-h, h, 0.0]], dtype=torch.float64
+    )
 
 
-def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Tensor | None = None) -> torch.Tensor:
+def goal_corners_w(
+    goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Tensor | None = None
+) -> torch.Tensor:
     """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
 
     Args:
@@ -91,17 +111,22 @@ def goal_corners_w(goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Ten
 
 
 def ball_extremes_c(
-    fisheye: Fisheye, ball_c: torch.Tensor, radius: float | torch.Tensor, axes: torch.Tensor | None = None
+    fisheye: Fisheye,
+    ball_c: torch.Tensor,
+    radius: float | torch.Tensor,
+    axes: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the image.
+    """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the
+    image.
 
-    The outline of a ball of radius r at distance d is the cone of half-angle ``a = asin(r / d)`` about its centre's ray
-    c, exactly and in every direction, past 90 deg too. The image coordinate u grows fastest along its gradient on the
-    sphere, so the extremes of u are the rays ``cos(a) c -+ sin(a) grad u / |grad u|``, and likewise for v. With
-    ``rho = theta_d``, ``s = sin(theta)``, ``g = rho / s``, ``q = (rho' cos(theta) - g) / s^2``:
-    ``grad u = (g + q c_x^2, q c_x c_y, -rho' c_x)``. The gradient is taken at the centre: the ray's place on the
-    outline is right to first order in a, the extreme value itself, being stationary, to second. At a rope's length
-    (0.38 m) the box is off by at most 2.2e-4 in normalised coordinates.
+    The outline of a ball of radius r at distance d is the cone of half-angle ``a = asin(r / d)``
+    about its centre's ray c, exactly and in every direction, past 90 deg too. The image coordinate
+    u grows fastest along its gradient on the sphere, so the extremes of u are the rays ``cos(a) c
+    -+ sin(a) grad u / |grad u|``, and likewise for v. With ``rho = theta_d``, ``s = sin(theta)``,
+    ``g = rho / s``, ``q = (rho' cos(theta) - g) / s^2``: ``grad u = (g + q c_x^2, q c_x c_y, -rho'
+    c_x)``. The gradient is taken at the centre: the ray's place on the outline is right to first
+    order in a, the extreme value itself, being stationary, to second. At a rope's length (0.38 m)
+    the box is off by at most 2.2e-4 in normalised coordinates.
 
     Args:
         fisheye: The lens.
@@ -125,7 +150,9 @@ def ball_extremes_c(
     q = (slope * centre[:, 2] - g) / (s * s)
     across = centre[:, :2]
     along = torch.cat([across * q.unsqueeze(-1), -slope.unsqueeze(-1)], -1)
-    gradient = across.unsqueeze(-1) * along.unsqueeze(-2) + g[:, None, None] * axes  # (E, 2, 3): of u, of v
+    gradient = (
+        across.unsqueeze(-1) * along.unsqueeze(-2) + g[:, None, None] * axes
+    )  # (E, 2, 3): of u, of v
     tx, ty, tz = gradient.unbind(-1)
     size = (tx * tx + ty * ty + tz * tz + AXIS_EPSILON).sqrt()
     step = gradient * (sine.unsqueeze(-1) / size).unsqueeze(-1)
@@ -136,9 +163,9 @@ def ball_extremes_c(
 def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     """Edge midpoints of the axis-aligned box through four extreme points.
 
-    A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a real detector can
-    take the projection's place; unlike its corners they lie on or next to the ball's outline, so that the field of view
-    decides about each of them.
+    A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a
+    real detector can take the projection's place; unlike its corners they lie on or next to the
+    ball's outline, so that the field of view decides about each of them.
 
     Args:
         extremes: Image points left, top, right, bottom, shape (E, 4, 2).
@@ -146,34 +173,52 @@ def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     Returns:
         Midpoints of the left, top, right and bottom edge, shape (E, 4, 2).
     """
-    left, top, right, bottom = extremes[:, 0, 0], extremes[:, 1, 1], extremes[:, 2, 0], extremes[:, 3, 1]
+    left, top, right, bottom = (
+        extremes[:, 0, 0],
+        extremes[:, 1, 1],
+        extremes[:, 2, 0],
+        extremes[:, 3, 1],
+    )
     u, v = (left + right) * 0.5, (top + bottom) * 0.5
-    middles: torch.Tensor = torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
+    middles: torch.Tensor = torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(
+        -1, (4, 2)
+    )
     return middles
 
 
 def corrected_keypoints(
-    camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor, turn_b: torch.Tensor, scale: torch.Tensor
+    camera: KeypointCamera,
+    points: torch.Tensor,
+    valid: torch.Tensor,
+    turn_b: torch.Tensor,
+    scale: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Keypoints of a camera that is turned and whose focal length is another one, as the nominal camera would see them.
+    """Keypoints of a camera that is turned and whose focal length is another one, as the nominal
+    camera would see them.
 
     Args:
         camera: Nominal.
         points: Normalised [-], shape (E, K, 2). valid: shape (E, K), bool.
-        turn_b: Rotation vectors by which the cameras are turned on the body [rad], shape (E, 3), body frame.
+        turn_b: Rotation vectors by which the cameras are turned on the body [rad], shape (E, 3),
+            body frame.
         scale: Relative errors of their focal lengths [-], shape (E,).
 
     Returns:
-        Points [-], shape (E, K, 2), and validity, shape (E, K); what falls outside of the nominal field of view is invalid and reads zero.
+        Points [-], shape (E, K, 2), and validity, shape (E, K); what falls outside of the nominal
+        field of view is invalid and reads zero.
     """
-    rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(points / (1.0 + scale[:, None, None])))
+    rays_c, _ = camera.fisheye.unproject(
+        camera.fisheye.denormalize(points / (1.0 + scale[:, None, None]))
+    )
     turn_c = camera.rot_cb @ rotation_from_vector(turn_b) @ camera.rot_cb.T
     seen, inside = camera.fisheye.project_normalized(rays_c @ turn_c.transpose(-1, -2), clip=True)
     valid = valid & inside
     return seen * valid.unsqueeze(-1), valid
 
 
-def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def payload_keypoints(
+    camera: KeypointCamera, ball_c: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Payload keypoints alone: what a detector's box around the ball would give.
 
     Args:
@@ -181,9 +226,9 @@ def payload_keypoints(camera: KeypointCamera, ball_c: torch.Tensor) -> tuple[tor
         ball_c: Centre of the ball [m], shape (E, 3), camera frame.
 
     Returns:
-        Normalised edge midpoints (left, top, right, bottom) [-], shape (E, 4, 2), and validity, shape (E, 4): the
-        outline's point on that side is inside the field of view and on the sensor. Extremes beyond the field of view
-        are clipped to its edge first.
+        Normalised edge midpoints (left, top, right, bottom) [-], shape (E, 4, 2), and validity,
+        shape (E, 4): the outline's point on that side is inside the field of view and on the
+        sensor. Extremes beyond the field of view are clipped to its edge first.
     """
     rays = ball_extremes_c(camera.fisheye, ball_c, camera.radius, camera._axes)
     extremes, valid = camera.fisheye.project_normalized(rays, clip=True)
@@ -206,25 +251,34 @@ def keypoints(
         rot_wb: Attitude, body to world, shape (E, 3, 3).
         goal_w: Goal [m], shape (E, 2) or (E, 3), world frame; the corners lie on z = 0.
         payload_w: Centre of the ball [m], shape (E, 3), world frame.
-        extrinsics: rot_cb and position_b per environment (`KeypointCamera.extrinsics`); the nominal mount if left out.
+        extrinsics: rot_cb and position_b per environment (`KeypointCamera.extrinsics`); the nominal
+            mount if left out.
 
     Returns:
-        Keypoints [-], shape (E, 8, 2), normalised image coordinates (x right, y down, 1 at the edge of the field of
-        view), goal corners first (order of `goal_square`), then the payload's box (left, top, right, bottom); and
-        validity (bool), shape (E, 8). With ``invalid_reads = "edge"`` an invalid corner reads its direction at the edge
-        and an invalid side of the box is that of the outline clipped to the edge. With ``"zero"`` both read zero, and the
-        middle of a side is valid where that side and the two across it, which give its other coordinate, are seen.
+        Keypoints [-], shape (E, 8, 2), normalised image coordinates (x right, y down, 1 at the edge
+        of the field of view), goal corners first (order of `goal_square`), then the payload's box
+        (left, top, right, bottom); and validity (bool), shape (E, 8). With ``invalid_reads =
+        "edge"`` an invalid corner reads its direction at the edge and an invalid side of the box is
+        that of the outline clipped to the edge. With ``"zero"`` both read zero, and the middle of a
+        side is valid where that side and the two across it, which give its other coordinate, are
+        seen.
     """
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
-    points_c = points_c_from_w(torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b)
+    points_c = points_c_from_w(
+        torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b
+    )
     rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._axes)
-    seen, valid = camera.fisheye.project_normalized(torch.cat([points_c[:, :4], rays_c], -2), clip=True)
+    seen, valid = camera.fisheye.project_normalized(
+        torch.cat([points_c[:, :4], rays_c], -2), clip=True
+    )
     points = torch.cat([seen[:, :4], box_midpoints(seen[:, 4:])], -2)
     return by_rule(camera, points, valid)
 
 
-def by_rule(camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def by_rule(
+    camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Apply ``invalid_reads`` to points that are clipped to the edge.
 
     Args:

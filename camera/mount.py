@@ -1,8 +1,9 @@
-"""Mount of the camera on the vehicle: nominal extrinsics, per-environment extrinsic error, world to camera.
+"""Mount of the camera on the vehicle: nominal extrinsics, per-environment extrinsic error, world to
+camera.
 
-Products are written out elementwise: a batched matrix product would round differently with the batch size (and in TF32
-where the trainer turns that on), and the training environment must equal the onboard batch of one bit for bit.
-"""
+Products are written out elementwise: a batched matrix product would round differently with the
+batch size (and in TF32 where the trainer turns that on), and the training environment must equal
+the onboard batch of one bit for bit."""
 
 import math
 
@@ -11,7 +12,9 @@ import torch
 from camera.params import MountParams
 
 DOWNWARD_ROT_CB = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-"""rot_cb of the downward camera: x_c (image right) = -y_b, y_c (image down) = -x_b, z_c (optical axis) = -z_b."""
+"""rot_cb of the downward camera: x_c (image right) = -y_b, y_c (image down) = -x_b, z_c (optical
+axis) = -z_b.
+"""
 
 
 def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
@@ -29,10 +32,16 @@ def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
     half = (angle * 0.5).sin() / angle
     b = half * half * 2.0
     rows = [
-        1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
-        b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x,
-        b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y),
-    ]  # fmt: skip
+        1.0 - b * (y * y + z * z),
+        b * x * y - a * z,
+        b * x * z + a * y,
+        b * x * y + a * z,
+        1.0 - b * (x * x + z * z),
+        b * y * z - a * x,
+        b * x * z - a * y,
+        b * y * z + a * x,
+        1.0 - b * (x * x + y * y),
+    ]
     rot: torch.Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
     return rot
 
@@ -63,7 +72,11 @@ def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 
 
 def points_c_from_w(
-    points_w: torch.Tensor, pos_w: torch.Tensor, rot_wb: torch.Tensor, rot_cb: torch.Tensor, position_b: torch.Tensor
+    points_w: torch.Tensor,
+    pos_w: torch.Tensor,
+    rot_wb: torch.Tensor,
+    rot_cb: torch.Tensor,
+    position_b: torch.Tensor,
 ) -> torch.Tensor:
     """Bring world points into the camera frame.
 

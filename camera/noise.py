@@ -1,8 +1,8 @@
-"""Imperfections of a keypoint detector: noise, per-episode bias, drop-out, latency, and what an invalid point reads.
+"""Imperfections of a keypoint detector: noise, per-episode bias, drop-out, latency, and what an
+invalid point reads.
 
-The randomness is an argument: the functions that apply it are pure, so that a CUDA graph can replay them on refilled buffers and the
-HIL runner can pass zeros.
-"""
+The randomness is an argument: the functions that apply it are pure, so that a CUDA graph can replay
+them on refilled buffers and the HIL runner can pass zeros."""
 
 from typing import NamedTuple
 
@@ -13,10 +13,11 @@ from camera.params import KeypointNoiseParams
 
 
 class StepDraw(NamedTuple):
-    """Randomness of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape (E, K).
+    """Randomness of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape (E,
+    K).
 
-    ``wrong``: uniforms of wrong points, shape (E, K, 3): whether, and where; None where there are none.
-    """
+    ``wrong``: uniforms of wrong points, shape (E, K, 3): whether, and where; None where there are
+    none."""
 
     normals: torch.Tensor
     uniforms: torch.Tensor
@@ -24,14 +25,18 @@ class StepDraw(NamedTuple):
 
 
 def apply_noise(
-    params: KeypointNoiseParams, keypoints: torch.Tensor, valid: torch.Tensor, bias: torch.Tensor, draw: StepDraw
+    params: KeypointNoiseParams,
+    keypoints: torch.Tensor,
+    valid: torch.Tensor,
+    bias: torch.Tensor,
+    draw: StepDraw,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Add noise and bias, drop points out, and set what invalid points read.
 
     Args:
         params: Spreads and the rule for invalid points.
-        keypoints: Exact keypoints [-], shape (E, K, 2), normalised; with ``invalid_reads = "edge"`` clipped to the
-            edge.
+        keypoints: Exact keypoints [-], shape (E, K, 2), normalised; with ``invalid_reads = "edge"``
+            clipped to the edge.
         valid: Shape (E, K), bool.
         bias: Of this episode [-], shape (E, K, 2).
         draw: Randomness of this step.
@@ -43,15 +48,24 @@ def apply_noise(
     kept = draw.uniforms >= params.drop_probability
     seen = valid & kept
     # Clipped points carry no noise: they are a rule, not a measurement.
-    unseen = keypoints * kept.unsqueeze(-1) if params.invalid_reads == "edge" else torch.zeros_like(keypoints)
+    unseen = (
+        keypoints * kept.unsqueeze(-1)
+        if params.invalid_reads == "edge"
+        else torch.zeros_like(keypoints)
+    )
     points = torch.where(seen.unsqueeze(-1), noisy, unseen)
     if draw.wrong is None:
         return points, seen
     mistaken = draw.wrong[..., 0] < params.wrong_probability
-    return torch.where(mistaken.unsqueeze(-1), 2.0 * draw.wrong[..., 1:] - 1.0, points), seen | mistaken
+    return (
+        torch.where(mistaken.unsqueeze(-1), 2.0 * draw.wrong[..., 1:] - 1.0, points),
+        seen | mistaken,
+    )
 
 
-def apply_latency(history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def apply_latency(
+    history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints as they were ``latency`` steps ago.
 
     Args:
@@ -60,7 +74,8 @@ def apply_latency(history: torch.Tensor, valid_history: torch.Tensor, latency: t
         latency: Age [policy steps], shape (E,) or scalar tensor.
 
     Returns:
-        Keypoints [-], shape (E, K, 2), and validity, shape (E, K): every entry that the interpolation used was valid.
+        Keypoints [-], shape (E, K, 2), and validity, shape (E, K): every entry that the
+        interpolation used was valid.
     """
     used = latency_weights(history.shape[1], latency, history) > 0.0
     valid = (valid_history | ~used.unsqueeze(-1)).all(1)

@@ -1,5 +1,6 @@
-"""Drawing of keypoints on the image plane, as the paper's figure shows them: goal green, payload red, body axes
-white."""
+"""Drawing of keypoints on the image plane, as the paper's figure shows them: goal green, payload
+red, body axes white.
+"""
 
 import math
 
@@ -11,21 +12,29 @@ from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
 
 # BGR, OpenCV's order.
 GREEN, RED, WHITE, GREY = (80, 200, 60), (60, 60, 230), (255, 255, 255), (150, 150, 150)
-SHIFT = 4  # fractional bits of the coordinates that OpenCV draws with: lines lie where the numbers say, to 1/16 px
+# fractional bits of the coordinates that OpenCV draws with: lines lie where the numbers say, to
+# 1/16 px
+SHIFT = 4
 
 
-def draw_overlay(camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.Tensor, image: np.ndarray | None = None) -> np.ndarray:
+def draw_overlay(
+    camera: KeypointCamera,
+    keypoints: torch.Tensor,
+    valid: torch.Tensor,
+    image: np.ndarray | None = None,
+) -> np.ndarray:
     """Draw keypoints, field of view and body axes.
 
-    Goal corners are joined to a green square and the payload's edge midpoints to a red box; where one of a group is
-    invalid only its points are drawn. An invalid point is a grey cross where it reads. Raises ValueError: the image's shape or type is not
-    the camera's.
+    Goal corners are joined to a green square and the payload's edge midpoints to a red box; where
+    one of a group is invalid only its points are drawn. An invalid point is a grey cross where it
+    reads. Raises ValueError: the image's shape or type is not the camera's.
 
     Args:
         camera: The camera that made the keypoints.
         keypoints: Normalised [-], shape (8, 2).
         valid: Validity, shape (8,).
-        image: Frame to draw on, BGR, uint8, shape (H, W, 3) of the camera's size; black if left out.
+        image: Frame to draw on, BGR, uint8, shape (H, W, 3) of the camera's size; black if left
+            out.
 
     Returns:
         A new picture, BGR, uint8, shape (H, W, 3).
@@ -33,7 +42,9 @@ def draw_overlay(camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.T
     lens = camera.fisheye
     shape = (lens.params.height, lens.params.width, 3)
     if image is not None and (image.shape != shape or image.dtype != np.uint8):
-        raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")
+        raise ValueError(
+            f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8"
+        )
     canvas = np.zeros(shape, np.uint8) if image is None else image.copy()
     thick = max(1, round(min(shape[:2]) / 320))
     _draw_field_of_view(canvas, lens, thick)
@@ -49,7 +60,9 @@ def draw_overlay(camera: KeypointCamera, keypoints: torch.Tensor, valid: torch.T
 
 
 def _fixed(points: np.ndarray) -> np.ndarray:
-    """Pixels as OpenCV's fixed-point integers; far outside the image they are cut off before they overflow."""
+    """Pixels as OpenCV's fixed-point integers; far outside the image they are cut off before they
+    overflow.
+    """
     return np.round(np.clip(points, -1e4, 1e4) * 2**SHIFT).astype(np.int32)
 
 
@@ -60,10 +73,22 @@ def _draw_group(canvas, points, seen, outline, colour, thick) -> None:
         cv2.polylines(canvas, [_fixed(outline)[:, None]], True, colour, 1, cv2.LINE_AA, SHIFT)
     for point, ok in zip(points, seen, strict=True):
         if ok:
-            cv2.circle(canvas, tuple(map(int, _fixed(point))), (thick + 1) << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
+            cv2.circle(
+                canvas,
+                tuple(map(int, _fixed(point))),
+                (thick + 1) << SHIFT,
+                colour,
+                -1,
+                cv2.LINE_AA,
+                SHIFT,
+            )
         else:
-            centre = tuple(round(x) for x in np.clip(point, 0, [canvas.shape[1] - 1, canvas.shape[0] - 1]))
-            cv2.drawMarker(canvas, centre, GREY, cv2.MARKER_TILTED_CROSS, 8 * thick, thick, cv2.LINE_AA)
+            centre = tuple(
+                round(x) for x in np.clip(point, 0, [canvas.shape[1] - 1, canvas.shape[0] - 1])
+            )
+            cv2.drawMarker(
+                canvas, centre, GREY, cv2.MARKER_TILTED_CROSS, 8 * thick, thick, cv2.LINE_AA
+            )
             cv2.circle(canvas, centre, 6 * thick, colour, thick, cv2.LINE_AA)
 
 
@@ -77,11 +102,24 @@ def _draw_field_of_view(canvas, lens: Fisheye, thick: int) -> None:
         if radius <= lens.edge_radius:
             axes = (round(p.fx * radius * 2**SHIFT), round(p.fy * radius * 2**SHIFT))
             centre = tuple(map(int, _fixed(np.array([p.cx, p.cy]))))
-            cv2.ellipse(canvas, centre, axes, 0, 0, 360, colour, 1 if colour != GREY else thick, cv2.LINE_AA, SHIFT)
+            cv2.ellipse(
+                canvas,
+                centre,
+                axes,
+                0,
+                0,
+                360,
+                colour,
+                1 if colour != GREY else thick,
+                cv2.LINE_AA,
+                SHIFT,
+            )
 
 
 def _draw_body_axes(canvas, camera: KeypointCamera, thick: int) -> None:
-    """Arrows of the body's x (forward) and y (left) as directions in the image, from the principal point."""
+    """Arrows of the body's x (forward) and y (left) as directions in the image, from the principal
+    point.
+    """
     import cv2
 
     p = camera.fisheye.params
@@ -95,4 +133,13 @@ def _draw_body_axes(canvas, camera: KeypointCamera, thick: int) -> None:
         start, end = (tuple(round(c) for c in q) for q in (centre, tip))
         cv2.arrowedLine(canvas, start, end, WHITE, thick, cv2.LINE_AA, 0, 0.14)
         corner = tuple(round(c) for c in tip + 0.02 * min(canvas.shape[:2]))
-        cv2.putText(canvas, name, corner, cv2.FONT_HERSHEY_SIMPLEX, min(canvas.shape[:2]) / 1100, WHITE, thick, cv2.LINE_AA)
+        cv2.putText(
+            canvas,
+            name,
+            corner,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            min(canvas.shape[:2]) / 1100,
+            WHITE,
+            thick,
+            cv2.LINE_AA,
+        )

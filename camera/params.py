@@ -1,4 +1,7 @@
-"""Configuration of the camera: one frozen dataclass a file of ``configs/camera``. Imports neither torch nor cv2."""
+"""Configuration of the camera: one frozen dataclass a file of ``configs/camera``.
+
+Imports neither torch nor cv2.
+"""
 
 import math
 from dataclasses import dataclass
@@ -23,13 +26,14 @@ def monotonic_limit(coefficients: tuple[float, ...]) -> float:
 class FisheyeParams:
     """Intrinsics of a Kannala-Brandt fisheye camera.
 
-    ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)``,
-    ``u = fx theta_d cos(phi) + cx``, ``v = fy theta_d sin(phi) + cy``. All k zero: the equidistant lens.
+    ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3
+    theta^6 + k4 theta^8)``, ``u = fx theta_d cos(phi) + cx``, ``v = fy theta_d sin(phi) + cy``. All
+    k zero: the equidistant lens.
 
-    Convention: pixel (0, 0) is the *centre* of the top left pixel, u to the right, v down, as in OpenCV, Kalibr, ROS
-    and basalt.
-    Source: Kannala and Brandt, "A generic camera model and calibration method", TPAMI 28(8), 2006, eq. 6.
-    """
+    Convention: pixel (0, 0) is the *centre* of the top left pixel, u to the right, v down, as in
+    OpenCV, Kalibr, ROS and basalt.
+    Source: Kannala and Brandt, "A generic camera model and calibration method", TPAMI 28(8), 2006,
+    eq. 6."""
 
     width: int  # [px]
     height: int  # [px]
@@ -56,24 +60,33 @@ class FisheyeParams:
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
             if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a finite number")
+                raise ValueError(
+                    f"fisheye {name} is {getattr(self, name)}; expected a finite number"
+                )
         for name in ("width", "height", "fx", "fy"):
             if getattr(self, name) <= 0:
-                raise ValueError(f"fisheye {name} is {getattr(self, name)}; expected a number above 0")
+                raise ValueError(
+                    f"fisheye {name} is {getattr(self, name)}; expected a number above 0"
+                )
         if not 0.0 < self.fov_deg <= 360.0:
-            raise ValueError(f"fisheye fov_deg is {self.fov_deg}; expected a full angle above 0 and up to 360 deg")
+            raise ValueError(
+                f"fisheye fov_deg is {self.fov_deg}; expected a full angle above 0 and up to"
+                " 360 deg"
+            )
         t2 = SEEN_AT_LEAST**2
         near = SEEN_AT_LEAST * (1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients)))
         if near * min(self.fx, self.fy) > math.hypot(self.width, self.height):
             raise ValueError(
-                f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg off the axis falls outside an image "
-                f"of {self.width} x {self.height} px; expected a lens that sees more than that"
+                f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg"
+                f" off the axis falls outside an image of {self.width} x {self.height} px; expected"
+                " a lens that sees more than that"
             )
         limit = monotonic_limit(self.coefficients)
         if limit <= self.half_fov:
             raise ValueError(
-                f"theta_d with k = {self.coefficients} stops growing at {math.degrees(limit):.2f} deg off the axis, "
-                f"inside the field of view; expected fov_deg below {2 * math.degrees(limit):.2f}, got {self.fov_deg}"
+                f"theta_d with k = {self.coefficients} stops growing at {math.degrees(limit):.2f}"
+                " deg off the axis, inside the field of view; expected fov_deg below"
+                f" {2 * math.degrees(limit):.2f}, got {self.fov_deg}"
             )
 
 
@@ -81,38 +94,49 @@ class FisheyeParams:
 class MountParams:
     """Where the camera sits on the body and how it is turned.
 
-    Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the vehicle's front:
-    x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c (optical axis) = -z_b. ``rpy_deg``
-    turns the camera about the body axes from there, ``rot_bc = Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative
-    pitch lets it look forward.
-    """
+    Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the
+    vehicle's front: x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c
+    (optical axis) = -z_b. ``rpy_deg`` turns the camera about the body axes from there, ``rot_bc =
+    Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative pitch lets it look forward."""
 
-    position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # lens from the centre of mass [m], body frame
-    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # roll, pitch, yaw from the downward pose [deg], about body axes
+    position_b: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # lens from the centre of mass [m], body frame
+    rpy_deg: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # roll, pitch, yaw from the downward pose [deg], about body axes
     rotation_error_std: float = 0.0  # per episode and axis, unknown to the policy [rad]
     position_error_std: float = 0.0  # per episode and axis, unknown to the policy [m]
 
 
 @dataclass(frozen=True)
 class KeypointNoiseParams:
-    """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field of view).
+    """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field
+    of view).
 
-    ``invalid_reads``, the rule for what is out of view: ``zero``: it reads as the principal point with validity 0 and
-    tells nothing but that it is not seen, as behind a camera. A point that is computed from the ball's box counts as
-    seen where all of the box that it is computed from is. ``edge``: it reads as its exact, noise-free direction at the
-    edge, radius 1, which only poses can tell: for ablations, and the default for policies from before the rule was
-    recorded. A dropped-out point reads zero in both: nothing was measured. A wrong point reads a
-    place anywhere in the image, and as valid.
-    """
+    ``invalid_reads``, the rule for what is out of view: ``zero``: it reads as the principal point
+    with validity 0 and tells nothing but that it is not seen, as behind a camera. A point that is
+    computed from the ball's box counts as seen where all of the box that it is computed from is.
+    ``edge``: it reads as its exact, noise-free direction at the edge, radius 1, which only poses
+    can tell: for ablations, and the default for policies from before the rule was recorded. A
+    dropped-out point reads zero in both: nothing was measured. A wrong point reads a place anywhere
+    in the image, and as valid."""
 
     step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]
     bias_std: float = 0.001  # Gaussian per episode, keypoint and axis [-]
     drop_probability: float = 0.0  # per step and keypoint that it reads as invalid [-]
-    latency: float = 0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
+    latency: float = (
+        0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
+    )
     wrong_probability: float = 0.0  # per step and keypoint that something else is taken for it [-]
     held_probability: float = 0.0  # per step that the last image's keypoints come again [-]
     scale_std: float = 0.0  # Gaussian per episode: relative error of the focal length [-]
-    seen_radius: float = 1.0  # of the image beyond which nothing is seen: a narrower lens, read by its own calibration [-]
+    # of the image beyond which nothing is seen: a narrower lens, read by its own calibration [-]
+    seen_radius: float = 1.0
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property
@@ -123,14 +147,25 @@ class KeypointNoiseParams:
     def __post_init__(self) -> None:
         for name in ("step_std", "bias_std", "latency", "scale_std"):
             if not getattr(self, name) >= 0.0:
-                raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number of at least 0")
+                raise ValueError(
+                    f"keypoint noise {name} is {getattr(self, name)}; expected a number of at"
+                    " least 0"
+                )
         for name in ("drop_probability", "wrong_probability", "held_probability"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"keypoint noise {name} is {getattr(self, name)}; expected a number in [0, 1]")
+                raise ValueError(
+                    f"keypoint noise {name} is {getattr(self, name)}; expected a number in [0, 1]"
+                )
         if not 0.0 < self.seen_radius <= 1.0:
-            raise ValueError(f"keypoint noise seen_radius is {self.seen_radius}; expected a number above 0 and up to 1")
+            raise ValueError(
+                f"keypoint noise seen_radius is {self.seen_radius}; expected a number above 0 and"
+                " up to 1"
+            )
         if self.invalid_reads not in ("edge", "zero"):
-            raise ValueError(f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge', 'zero'")
+            raise ValueError(
+                f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge',"
+                " 'zero'"
+            )
 
 
 @dataclass(frozen=True)
@@ -146,4 +181,6 @@ class CameraParams:
     def __post_init__(self) -> None:
         for name in ("goal_side", "payload_radius"):
             if not getattr(self, name) > 0.0:
-                raise ValueError(f"camera {name} is {getattr(self, name)}; expected a length above 0 m")
+                raise ValueError(
+                    f"camera {name} is {getattr(self, name)}; expected a length above 0 m"
+                )

@@ -15,9 +15,8 @@ from camera.fisheye import Fisheye
 class ViewParams:
     """A pinhole view cut out of a fisheye frame.
 
-    The view looks along the fisheye's axis, turned by ``yaw_deg`` about the image's down axis (positive: to the right),
-    then by ``pitch_deg`` about its own right axis (positive: up).
-    """
+    The view looks along the fisheye's axis, turned by ``yaw_deg`` about the image's down axis
+    (positive: to the right), then by ``pitch_deg`` about its own right axis (positive: up)."""
 
     width: int  # [px]
     height: int  # [px]
@@ -30,21 +29,26 @@ def view_rotation(view: ViewParams) -> torch.Tensor:
     """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    return torch.from_numpy(Rotation.from_euler("YX", [view.yaw_deg, view.pitch_deg], degrees=True).as_matrix())
+    return torch.from_numpy(
+        Rotation.from_euler("YX", [view.yaw_deg, view.pitch_deg], degrees=True).as_matrix()
+    )
 
 
 def view_focal(view: ViewParams) -> float:
     """Focal length of a view [px]. Raises ValueError: the field of view is not one of a pinhole."""
     if not 0.0 < view.fov_deg < 180.0:
-        raise ValueError(f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a pinhole has")
+        raise ValueError(
+            f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a"
+            " pinhole has"
+        )
     return view.width / 2.0 / math.tan(math.radians(view.fov_deg) / 2.0)
 
 
 def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tensor]:
     """Where in the fisheye frame each pixel of a view comes from.
 
-    Returns pixels [px], float64, shape (H, W, 2), and whether they lie in the field of view and on the sensor, shape (H, W).
-    """
+    Returns pixels [px], float64, shape (H, W, 2), and whether they lie in the field of view and on
+    the sensor, shape (H, W)."""
     focal = view_focal(view)
     u = torch.arange(view.width, dtype=torch.float64) - (view.width - 1) / 2.0
     v = torch.arange(view.height, dtype=torch.float64) - (view.height - 1) / 2.0
@@ -69,7 +73,9 @@ def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tens
 
     size = (lens.params.height, lens.params.width)
     if frames.dim() != 4 or tuple(frames.shape[-2:]) != size:
-        raise ValueError(f"frames of shape {tuple(frames.shape)} came; expected (B, C, {size[0]}, {size[1]})")
+        raise ValueError(
+            f"frames of shape {tuple(frames.shape)} came; expected (B, C, {size[0]}, {size[1]})"
+        )
     pixels, valid = view_map(lens, view)
     pixels = pixels.to(frames)
     batch = frames.shape[0]

@@ -9,18 +9,23 @@ import warp as wp
 NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 FLAGS = "-march=native"
-"""Of Warp's compiler for CPUs: LLVM's own thresholds for inlining. Warp's far higher ones take a quarter longer to compile and
-gain our kernels nothing: the same bits, as fast within the noise."""
+"""Of Warp's compiler for CPUs:
+
+LLVM's own thresholds for inlining. Warp's far higher ones take a quarter longer to compile and gain
+our kernels nothing: the same bits, as fast within the noise.
+"""
 
 
 def start() -> None:
-    """Initialise Warp once, and say how kernels are compiled: alike in all processes, so that one finds what another compiled.
+    """Initialise Warp once, and say how kernels are compiled: alike in all processes, so that one
+    finds what another compiled.
 
-    Warp's native library reports a missing CUDA driver on stderr at every start; a CPU run needs no GPU. Everything else that
-    it prints is passed on.
-    """
+    Warp's native library reports a missing CUDA driver on stderr at every start; a CPU run needs no
+    GPU. Everything else that it prints is passed on."""
     wp.config.enable_backward = False
-    wp.config.max_unroll = 4  # longer unrolled loops cost half a minute of compile time and gain nothing
+    wp.config.max_unroll = (
+        4  # longer unrolled loops cost half a minute of compile time and gain nothing
+    )
     wp.config.cpu_compiler_flags = FLAGS
     wp.config.log_level = wp.LOG_WARNING
     sys.stderr.flush()

@@ -1,8 +1,7 @@
 """MkDocs hooks: pages that print themselves, and a site that reads without a network.
 
-``<!-- help: fly -->`` in a page becomes what `visthrow fly --help` prints, ``<!-- fields: sim.params -->`` tables of the keys of
-the module's dataclasses.
-"""
+``<!-- help: fly -->`` in a page becomes what `visthrow fly --help` prints, ``<!-- fields:
+sim.params -->`` tables of the keys of the module's dataclasses."""
 
 import contextlib
 import dataclasses
@@ -50,17 +49,35 @@ def help_of(words: list[str]) -> str:
 
 
 def fields_of(module: str) -> str:
-    """Return a table of keys for each dataclass of a module: name, type and default, and the comment beside it."""
+    """Return a table of keys for each dataclass of a module: name, type and default, and the
+    comment beside it.
+    """
     found = importlib.import_module(module)
-    classes = [c for c in vars(found).values() if dataclasses.is_dataclass(c) and c.__module__ == module]
-    return "\n\n".join(_table(c) for c in sorted(classes, key=lambda c: inspect.getsourcelines(c)[1]))
+    classes = [
+        c for c in vars(found).values() if dataclasses.is_dataclass(c) and c.__module__ == module
+    ]
+    return "\n\n".join(
+        _table(c) for c in sorted(classes, key=lambda c: inspect.getsourcelines(c)[1])
+    )
 
 
 def _table(cls: type) -> str:
     names = {field.name for field in dataclasses.fields(cls)}
     rows = [
-        f"| `{name}` | `{kind.replace('|', chr(0x2223))}` | {(said or '').replace('|', chr(0x2223))} |"
-        for name, kind, said in FIELD.findall(inspect.getsource(cls)) if name in names
-    ]  # fmt: skip
+        f"| `{name}` | `{kind.replace('|', chr(0x2223))}` |"
+        f" {(said or '').replace('|', chr(0x2223))} |"
+        for name, kind, said in FIELD.findall(inspect.getsource(cls))
+        if name in names
+    ]
     said = inspect.getdoc(cls) or ""
-    return "\n".join([f"### {cls.__name__}", "", said, "", "| key | type, default | what |", "|---|---|---|", *rows])
+    return "\n".join(
+        [
+            f"### {cls.__name__}",
+            "",
+            said,
+            "",
+            "| key | type, default | what |",
+            "|---|---|---|",
+            *rows,
+        ]
+    )

@@ -1,1 +1,4 @@
-"""Hardware in the loop: the onboard side. Uses ``camera`` and the onboard-safe modules of ``visthrow``, never ``sim``."""
+"""Hardware in the loop: the onboard side.
+
+Uses ``camera`` and the onboard-safe modules of ``visthrow``, never ``sim``.
+"""

@@ -1,4 +1,6 @@
-"""``visthrow hil check``: the poses that come and the autopilot, a hand-carry, the hover of a run."""
+"""``visthrow hil check``: the poses that come and the autopilot, a hand-carry, the
+hover of a run.
+"""
 
 import argparse
 import dataclasses
@@ -31,7 +33,10 @@ from visthrow.onboard.policy import Policy, find_policy
 CALM = 0.15  # speed below which a hover counts as steady [m/s]
 LIFTED = 0.3  # height above which a vehicle counts as flying [m]
 SETTLING = 50  # ticks at the beginning of a hover that are left out: a second
-LISTEN, CARRY = 5.0, 180.0  # how long poses are looked at, and a vehicle is carried about, where nothing else is said [s]
+LISTEN, CARRY = (
+    5.0,
+    180.0,
+)  # how long poses are looked at, and a vehicle is carried about, where nothing else is said [s]
 
 
 def check(args: argparse.Namespace) -> int:
@@ -49,18 +54,29 @@ def check(args: argparse.Namespace) -> int:
 def _opened(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock, bool]]:
     """Source, the autopilot's link, clock, and whether the poses are recorded ones."""
     with tempfile.TemporaryDirectory() as folder:
-        source, link, recorded = open_source(params, Path(folder), MonotonicClock(args.speed), key_of(args))
+        source, link, recorded = open_source(
+            params, Path(folder), MonotonicClock(args.speed), key_of(args)
+        )
         try:
-            yield source, link, ManualClock(source.start) if recorded else MonotonicClock(args.speed), recorded
+            yield (
+                source,
+                link,
+                ManualClock(source.start) if recorded else MonotonicClock(args.speed),
+                recorded,
+            )
         finally:
             source.close()
 
 
 def _hand_carry(args: argparse.Namespace) -> int:
     params = params_of(args)
-    params = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
+    params = dataclasses.replace(
+        params, source=dataclasses.replace(params.source, check_units=False)
+    )
     with _opened(params, args) as (source, _, clock, recorded):
-        steps = handcarry.collect(source, clock, args.seconds or CARRY, lambda text: print(text, flush=True), recorded)
+        steps = handcarry.collect(
+            source, clock, args.seconds or CARRY, lambda text: print(text, flush=True), recorded
+        )
     finding = handcarry.judge(steps, params.frames[VEHICLE])
     print(handcarry.summary_text(finding, params.frames[VEHICLE]))
     return 0 if finding.passed else 1
@@ -87,25 +103,35 @@ def _listen(args: argparse.Namespace) -> int:
         print(_body_line(name, track, now, now - begin))
     for one in source.links:
         print("\n".join(_link_lines(one.roster, params, now - begin)))
-    problems = runner.problems() + unit_problems(poses, params.frames) + [text for good, text in found if not good]
+    problems = (
+        runner.problems()
+        + unit_problems(poses, params.frames)
+        + [text for good, text in found if not good]
+    )
     print("".join(f"{text}\n" for good, text in found if good), end="")
     print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
     return 1 if problems else 0
 
 
 def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
-    state, refused = track.state(now), json.dumps(track.gate.refused) if track.gate.refused else "none"
+    state, refused = (
+        track.state(now),
+        (json.dumps(track.gate.refused) if track.gate.refused else "none"),
+    )
     if state is None:
         return f"{name}: no pose; refused by the gate: {refused}"
     x, y, z = state.pos
     return (
-        f"{name}: {track.accepted / seconds:.0f} poses/s, age {1e3 * state.age:.0f} ms, at ({x:+.3f}, {y:+.3f}, {z:+.3f}) m, "
-        f"refused: {refused}, velocity late by {max(0.0, 1e3 * track.filter.lag):.0f} ms"
+        f"{name}: {track.accepted / seconds:.0f} poses/s, age {1e3 * state.age:.0f} ms, at"
+        f" ({x:+.3f}, {y:+.3f}, {z:+.3f}) m, refused: {refused}, velocity late by"
+        f" {max(0.0, 1e3 * track.filter.lag):.0f} ms"
     )
 
 
 def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
-    """Return who was heard on a link with which ids; all of it where somebody expected was not, else what was refused."""
+    """Return who was heard on a link with which ids; all of it where somebody expected was not,
+    else what was refused.
+    """
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
     for seen, count in sorted(roster.seen.items(), key=lambda row: -row[1]):
@@ -117,19 +143,30 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
 
 
 class AutopilotCheck:
-    """Listens to an autopilot without commanding it: its parameters, and the share of thrust that it reports while the vehicle hovers."""
+    """Listens to an autopilot without commanding it: its parameters, and the share of thrust that
+    it reports while the vehicle hovers.
+    """
 
     def __init__(self, params: Any, backend: Any) -> None:
         """Begin with nothing heard of the back-end; a dry run has no autopilot."""
         self.backend = backend
-        self.meter = None if params.backend == "dry-run" else HoverMeter(getattr(params, params.backend).thrust)
+        self.meter = (
+            None
+            if params.backend == "dry-run"
+            else HoverMeter(getattr(params, params.backend).thrust)
+        )
 
     def tick(self, now: float, runner: Any) -> None:
         """Listen; the runner knows whether the vehicle hovers."""
         self.backend.service(now)
         track = runner.tracks[VEHICLE]
         state = track.state(now)
-        if self.meter is not None and state is not None and state.pos[2] > LIFTED and track.calm_speed() < CALM:
+        if (
+            self.meter is not None
+            and state is not None
+            and state.pos[2] > LIFTED
+            and track.calm_speed() < CALM
+        ):
             self.meter.add(self.backend.share)
         self.backend.share = None  # each report counts once
 
@@ -142,17 +179,24 @@ class AutopilotCheck:
             print(audit.table())
         out = [] if audit.fault() is None else [(False, audit.fault())]
         if not audit.done:
-            out.append((False, f"parameters were not read: {status.note or 'the time was too short'}"))
+            out.append(
+                (False, f"parameters were not read: {status.note or 'the time was too short'}")
+            )
         return [*out, self.meter.summary_text(mass)]
 
 
 def hover_of_run(folder: str | Path) -> tuple[bool, str]:
-    """Return whether a run's hover took the weight, by what was commanded before its throws, and in words; raises `RunError`."""
+    """Return whether a run's hover took the weight, by what was commanded before its throws, and in
+    words; raises `RunError`.
+    """
     folder = Path(folder)
     require_run(folder)
     params = config.load(HilParams, folder / CONFIG)
     if params.backend == "dry-run":
-        raise RunError(f"{folder} is a dry run: nothing followed its commands; expected a run with an autopilot")
+        raise RunError(
+            f"{folder} is a dry run: nothing followed its commands; expected a run with an"
+            " autopilot"
+        )
     mass = Policy.load(folder / POLICY).total_mass
     thrusts, hovering = [], 0
     for line in lines(folder / TICKS):
@@ -163,14 +207,16 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
             thrusts.append(line["command"][0])
     if len(thrusts) < LEAST_SHARES:
         raise RunError(
-            f"{folder}: {len(thrusts)} ticks of steady hover before throws; expected {LEAST_SHARES} or more, after {SETTLING}: hover "
-            "longer before a throw, as with --set states.armed_least=3.0"
+            f"{folder}: {len(thrusts)} ticks of steady hover before throws; expected {LEAST_SHARES}"
+            f" or more, after {SETTLING}: hover longer before a throw, as with --set"
+            " states.armed_least=3.0"
         )
     thrust = getattr(params, params.backend).thrust
     asked, weight = sum(thrusts) / len(thrusts), mass * GRAVITY
     ratio = asked / weight
     text = (
-        f"hover took {ratio:.3f} times the weight by the config's calibration: the hover share is {thrust.share(asked):.4f}, "
-        f"not {thrust.share(weight):.4f} ({len(thrusts)} ticks, {100 * thrust.tolerance:g} % allowed)"
+        f"hover took {ratio:.3f} times the weight by the config's calibration: the hover share is"
+        f" {thrust.share(asked):.4f}, not {thrust.share(weight):.4f} ({len(thrusts)} ticks,"
+        f" {100 * thrust.tolerance:g} % allowed)"
     )
     return abs(ratio - 1.0) <= thrust.tolerance, text

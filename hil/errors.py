@@ -12,7 +12,9 @@ class LinkError(VisthrowError):
 
 
 class SourceError(VisthrowError):
-    """A source cannot be opened or read: a recording, a mapping of its columns, a client that is missing, a camera without a picture."""
+    """A source cannot be opened or read: a recording, a mapping of its columns, a client that is
+    missing, a camera without a picture.
+    """
 
 
 class RunError(VisthrowError):

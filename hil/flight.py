@@ -41,48 +41,82 @@ def key_of(args: argparse.Namespace) -> bytes | None:
 
 
 def require_fake(params: HilParams) -> None:
-    """Raise `RunError` for ``--auto-arm`` where a real vehicle could be at the other end: no loopback address, or no MAVLink poses."""
+    """Raise `RunError` for ``--auto-arm`` where a real vehicle could be at the other end: no
+    loopback address, or no MAVLink poses.
+    """
     devices = [params.link.device, params.source.device or params.link.device]
-    devices += [getattr(params, params.backend).device] if params.backend in ("betaflight", "crazyflie") else []
+    devices += (
+        [getattr(params, params.backend).device]
+        if params.backend in ("betaflight", "crazyflie")
+        else []
+    )
     loopback = lambda text: check_device(text, remote=True).host.startswith(("127.", "::1"))  # noqa: E731
     far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not loopback(text)]
     if params.source.kind == "mocap":
         far.append(f"source.kind {params.source.kind}")
     if far:
-        raise RunError(f"--auto-arm with {', '.join(far)}; it is for `visthrow hil fake` on this machine alone: type 'arm' instead")
+        raise RunError(
+            f"--auto-arm with {', '.join(far)}; it is for `visthrow hil fake` on this machine"
+            " alone: type 'arm' instead"
+        )
 
 
 def fly(args: argparse.Namespace) -> int:
-    """Fly, or run dry, and write the run's folder; 1 for a run that was aborted or in which something raised, else 0."""
+    """Fly, or run dry, and write the run's folder; 1 for a run that was aborted or in which
+    something raised, else 0.
+    """
     started, recording = time.monotonic(), args.action == "record"
     params = params_of(args)
     if recording:
         params = dataclasses.replace(params, backend="dry-run", observe=True)
     calibrates = args.action == "calibrate"
     if calibrates and params.calibration is None:
-        raise ConfigError(f"config '{args.config}' has no table [calibration]; expected one, as of configs/hil/detector.toml")
+        raise ConfigError(
+            f"config '{args.config}' has no table [calibration]; expected one, as of"
+            " configs/hil/detector.toml"
+        )
     auto_arm = args.action == "run" and args.auto_arm
     if auto_arm:
         require_fake(params)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     policy, console = Policy.load(find_policy(params.policy)), Console()
     with begun(folder):
-        source, link, recorded = open_source(params, folder, MonotonicClock(args.speed), key_of(args), console.say)
+        source, link, recorded = open_source(
+            params, folder, MonotonicClock(args.speed), key_of(args), console.say
+        )
         clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
         require_reach(params, policy.contract)
-        backend = make_backend(params, link, args.action == "run" and args.write_parameters, console.say, folder)
+        backend = make_backend(
+            params, link, args.action == "run" and args.write_parameters, console.say, folder
+        )
         runner = Runner(params, policy, backend, mechanism_lag(params))
         runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
         refused = prepare(params.realtime)
         runner.warm_up()
-        eyes = open_images(params.images, params.camera, clock.now) if params.keypoints == "detector" else None
+        eyes = (
+            open_images(params.images, params.camera, clock.now)
+            if params.keypoints == "detector"
+            else None
+        )
         recorder = Recorder(folder, params)
-    for text in refused or keep(params.realtime):  # the recorder's thread holds what the flying one waits for; others do not
+    for text in refused or keep(
+        params.realtime
+    ):  # the recorder's thread holds what the flying one waits for; others do not
         console.say(f"note: {text}")
-    operator = Terminal(auto_arm, lambda: any(one.roster.simulated for one in source.links), console.say)
-    print(f"ready after {time.monotonic() - started:.2f} s; waiting for poses", file=sys.stderr, flush=True)
+    operator = Terminal(
+        auto_arm, lambda: any(one.roster.simulated for one in source.links), console.say
+    )
+    print(
+        f"ready after {time.monotonic() - started:.2f} s; waiting for poses",
+        file=sys.stderr,
+        flush=True,
+    )
     viewer, stages = start_viewer(folder) if args.view else None, Stages()
-    solver = None if runner.calibrating is None else Solver(params.camera, policy.contract, params.calibration.spreads)
+    solver = (
+        None
+        if runner.calibrating is None
+        else Solver(params.camera, policy.contract, params.calibration.spreads)
+    )
     operator = Lander(operator, runner.calibrating) if calibrates else operator
     loop = Loop(runner, source, clock, operator, recorder, console.decision, stages, eyes, solver)
     summary = loop.fly(args.seconds or float("inf"))
@@ -101,17 +135,26 @@ def fly(args: argparse.Namespace) -> int:
         _show("\n".join(finish(folder, stages, args.speed)))
     if summary["aborted"] or summary["errors"]:
         with contextlib.suppress(RunError):
-            _show(f"{pack(folder)}  the run in one file: `visthrow hil replay` says where it went wrong")
+            _show(
+                f"{pack(folder)}  the run in one file: `visthrow hil replay` says where it went"
+                " wrong"
+            )
         return 1
     return 0
 
 
 def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
-    """Return what a run's summary keeps of its autopilot: parameters, the last release, texts, clocks of the link's peers."""
+    """Return what a run's summary keeps of its autopilot: parameters, the last release, texts,
+    clocks of the link's peers.
+    """
     out: dict[str, Any] = {"backend": backend.name}
     if hasattr(backend, "audit"):
         audit, release = backend.audit, backend.release_record
-        out["parameters"] = {"found": audit.found, "written": audit.written, "problems": audit.problems}
+        out["parameters"] = {
+            "found": audit.found,
+            "written": audit.written,
+            "problems": audit.problems,
+        }
         out["release"] = {"state": release.state, "note": release.note, "sends": release.sends}
         out["texts"] = getattr(backend, "texts", [])[-50:]
     if link is not None and link.sync is not None:

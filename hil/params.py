@@ -1,4 +1,5 @@
-"""Configuration of a run, one file of ``configs/hil``: its tables, whose fields stand beside the code that reads them.
+"""Configuration of a run, one file of ``configs/hil``: its tables, whose fields stand beside the
+code that reads them.
 
 SI units; nothing about frames has a default.
 """
@@ -30,9 +31,14 @@ from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
-MOST_HOLD = 0.05  # for which a command may wait [s]: beyond it the policy was trained for another link altogether
+# for which a command may wait [s]: beyond it the policy was trained for another link altogether
+MOST_HOLD = 0.05
 LIVE = ("mavlink", "mocap")  # kinds of source that are no recording
-ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}  # order of quaternions of the sources that know only one
+ORDERS = {
+    "bin": "wxyz",
+    "ulg": "wxyz",
+    "mocap": "xyzw",
+}  # order of quaternions of the sources that know only one
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,9 @@ class LinkParams(Bounded):
     remote: bool  # whether the device may leave this machine
     system: MavlinkId  # our own
     component: MavlinkId  # likewise
-    allow: tuple[str, ...] = ()  # senders of datagrams that are heard, ADDRESS or ADDRESS:PORT; none: any
+    allow: tuple[
+        str, ...
+    ] = ()  # senders of datagrams that are heard, ADDRESS or ADDRESS:PORT; none: any
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,13 +65,20 @@ class SourceParams:
     kind: Literal["mavlink", "tlog", "csv", "bin", "ulg", "mocap"]
     file: str | None  # of a recording: tlog, csv, bin or ulg
     senders: tuple[BodyIds, ...]  # of mavlink and tlog
-    columns: tuple[ChannelMap, ...] = ()  # of csv: of hil.poses.sources.player.CHANNELS; none where the file names its channels
+    columns: tuple[
+        ChannelMap, ...
+    ] = ()  # of csv: of hil.poses.sources.player.CHANNELS; none where the file names its channels
     time: TimeColumn | None = None  # of csv: its clock
     logs: tuple[LogBody, ...] = ()  # of bin and ulg
     bodies: tuple[RigidBody, ...] = ()  # of mocap
     mocap: MocapParams | None = None
-    device: str | None = None  # of mavlink poses that come on a port of their own, see hil.links.device; none: link.device
-    check_units: bool = True  # refuse recordings whose numbers no vehicle makes: a unit of the mapping is wrong
+    device: str | None = (
+        # of mavlink poses that come on a port of their own, see hil.links.device; none: link.device
+        None
+    )
+    check_units: bool = (
+        True  # refuse recordings whose numbers no vehicle makes: a unit of the mapping is wrong
+    )
 
     def __post_init__(self) -> None:
         if bool(self.columns) != (self.time is not None):
@@ -79,30 +94,39 @@ class SourceParams:
 class DelayParams(Bounded):
     """Ages of poses, and their compensation."""
 
-    source: Annotated[float, Bound(0.0, 0.5)]  # of a pose when it arrives [s], where its sender's clock is not known
-    synchronise: bool  # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
+    source: Annotated[
+        float, Bound(0.0, 0.5)
+    ]  # of a pose when it arrives [s], where its sender's clock is not known
+    # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
+    synchronise: bool
     compensate: bool  # carry poses forward to the age that the policy was trained with
-    # By which commands and releases act later than in the policy's training; poses are carried as much further [s].
+    # By which commands and releases act later than in the policy's training; poses are carried as
+    # much further [s].
     command: Annotated[float, Bound(0.0, MOST_PREDICTION)] = 0.0
-    # For which each command waits: by so much the vehicle acts sooner than the policy was trained for [s].
+    # For which each command waits: by so much the vehicle acts sooner than the policy was trained
+    # for [s].
     hold: Annotated[float, Bound(0.0, MOST_HOLD)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.hold and self.command:
-            raise ConfigError(f"hold {self.hold} s, command {self.command} s; expected one of them 0: a vehicle acts sooner than the "
-                              "policy was trained for, or later")  # fmt: skip
+            raise ConfigError(
+                f"hold {self.hold} s, command {self.command} s; expected one of them 0: a vehicle"
+                " acts sooner than the policy was trained for, or later"
+            )
 
 
 @dataclass(frozen=True)
 class HilParams(Bounded):
-    """A run; raises `ConfigError` for a body without frames and for parts that contradict each other."""
+    """A run; raises `ConfigError` for a body without frames and for parts that contradict each
+    other.
+    """
 
     policy: str  # name of a shipped policy, or a file
     camera: CameraParams
     backend: Literal["dry-run", "ardupilot", "px4", "betaflight", "crazyflie"]
-    # Show the policy every tick, not only those of a throw; what it says then is recorded, never sent. Such a run waits
-    # for poses and checks for ever.
+    # Show the policy every tick, not only those of a throw; what it says then is recorded, never
+    # sent. Such a run waits for poses and checks for ever.
     observe: bool
     throws: Annotated[int, Bound(1)]  # after which the run lands
     goal_w: tuple[float, float, float]  # target where no body is the goal [m]
@@ -122,37 +146,83 @@ class HilParams(Bounded):
     px4: Px4Params
     betaflight: BetaflightParams
     crazyflie: CrazyflieParams | None = None  # where it is the back-end
-    keypoints: Literal["projection", "detector"] = "projection"  # of the poses, or of what a camera sees
+    keypoints: Literal["projection", "detector"] = (
+        "projection"  # of the poses, or of what a camera sees
+    )
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
     aim: AimParams | None = None  # which releases are held back; None: none
-    calibration: CalibrationParams | None = None  # of a camera, in the hover before the first throw; None: none
+    calibration: CalibrationParams | None = (
+        None  # of a camera, in the hover before the first throw; None: none
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         kind, fence = self.source.kind, self.fence
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
-            raise ConfigError(f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it moves")
+            raise ConfigError(
+                f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it"
+                " moves"
+            )
         home = outside(self.home_w, fence.vehicle_low, fence.vehicle_high)
-        goal = None if GOAL in self.frames else outside(self.goal_w, fence.payload_low, fence.payload_high)
+        goal = (
+            None
+            if GOAL in self.frames
+            else outside(self.goal_w, fence.payload_low, fence.payload_high)
+        )
         for wrong, text in (
-            (self.keypoints == "detector" and self.images is None,
-             "keypoints of a detector, but no table [images]; expected its kind and path or device"),
-            (self.calibration is not None and self.keypoints != "detector",
-             "calibration of a camera, but keypoints of poses; expected keypoints = \"detector\""),
-            (self.backend == "crazyflie" and self.crazyflie is None,
-             "backend crazyflie without a table [crazyflie]; expected its device and thrust, as in crazyflie.toml"),
-            (kind not in LIVE and self.source.file is None, f"source.file is none; expected the file of the {kind} source"),
-            (self.backend != "dry-run" and kind not in LIVE, f"backend {self.backend} with recorded poses ({kind}); a recording flies dry"),
-            (kind == "mocap" and self.source.mocap is None, "source.mocap is missing; expected its system and host"),
-            (home is not None,
-             f"home_w {self.home_w} m; expected within the vehicle's fence, {fence.vehicle_low} to {fence.vehicle_high} m"),
-            (not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
-             f"landing_height {self.landing_height} m; expected within the payload's fence, {fence.payload_low[2]} to "
-             f"{fence.payload_high[2]} m of height"),
-            (goal is not None,
-             f"goal_w {self.goal_w} m; expected within the payload's fence, {fence.payload_low} to {fence.payload_high} m"),
-        ):  # fmt: skip
+            (
+                self.keypoints == "detector" and self.images is None,
+                (
+                    "keypoints of a detector, but no table [images]; expected its kind and path or"
+                    " device"
+                ),
+            ),
+            (
+                self.calibration is not None and self.keypoints != "detector",
+                'calibration of a camera, but keypoints of poses; expected keypoints = "detector"',
+            ),
+            (
+                self.backend == "crazyflie" and self.crazyflie is None,
+                (
+                    "backend crazyflie without a table [crazyflie]; expected its device and thrust,"
+                    " as in crazyflie.toml"
+                ),
+            ),
+            (
+                kind not in LIVE and self.source.file is None,
+                f"source.file is none; expected the file of the {kind} source",
+            ),
+            (
+                self.backend != "dry-run" and kind not in LIVE,
+                f"backend {self.backend} with recorded poses ({kind}); a recording flies dry",
+            ),
+            (
+                kind == "mocap" and self.source.mocap is None,
+                "source.mocap is missing; expected its system and host",
+            ),
+            (
+                home is not None,
+                (
+                    f"home_w {self.home_w} m; expected within the vehicle's fence,"
+                    f" {fence.vehicle_low} to {fence.vehicle_high} m"
+                ),
+            ),
+            (
+                not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
+                (
+                    f"landing_height {self.landing_height} m; expected within the payload's fence,"
+                    f" {fence.payload_low[2]} to {fence.payload_high[2]} m of height"
+                ),
+            ),
+            (
+                goal is not None,
+                (
+                    f"goal_w {self.goal_w} m; expected within the payload's fence,"
+                    f" {fence.payload_low} to {fence.payload_high} m"
+                ),
+            ),
+        ):
             if wrong:
                 raise ConfigError(text)
         angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
@@ -160,5 +230,6 @@ class HilParams(Bounded):
             written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)
             if written is not None and frames.quaternion != written:
                 raise ConfigError(
-                    f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind {self.source.kind} writes '{written}'"
+                    f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind"
+                    f" {self.source.kind} writes '{written}'"
                 )

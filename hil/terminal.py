@@ -1,4 +1,6 @@
-"""The operator at the terminal: words typed, signals that ask the process to end, and what is said; none of it ever waits."""
+"""The operator at the terminal: words typed, signals that ask the process to end, and what is said;
+none of it ever waits.
+"""
 
 import contextlib
 import os
@@ -15,15 +17,35 @@ from visthrow.onboard.calibration import Calibration
 
 ENDING = tuple(
     getattr(signal, name)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
-                 "SIGPWR", "SIGIO")
+    for name in (
+        "SIGINT",
+        "SIGTERM",
+        "SIGHUP",
+        "SIGQUIT",
+        "SIGUSR1",
+        "SIGUSR2",
+        "SIGALRM",
+        "SIGVTALRM",
+        "SIGPROF",
+        "SIGXCPU",
+        "SIGPWR",
+        "SIGIO",
+    )
     if hasattr(signal, name)
-)  # fmt: skip
-"""Signals that would end the process and can be caught: Ctrl-C; systemd, ``timeout`` and a shutdown; a dropped ssh or a closed
-terminal; and those that nobody means."""
+)
+"""Signals that would end the process and can be caught:
 
-PAUSING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
-"""Signals that would stop the process in mid flight: Ctrl-Z, and a terminal that belongs to another job."""
+Ctrl-C; systemd, ``timeout`` and a shutdown; a dropped ssh or a closed terminal; and those that
+nobody means.
+"""
+
+PAUSING = tuple(
+    getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name)
+)
+"""Signals that would stop the process in mid flight:
+
+Ctrl-Z, and a terminal that belongs to another job.
+"""
 
 MOST_UNSAID = 1000  # lines that wait for a terminal that takes none; those beyond are lost
 LAST_WORDS = 2.0  # that the end of a run waits for its lines to be taken [s]
@@ -31,7 +53,9 @@ MOST_TYPED = 4096  # bytes of a line without an end
 
 
 class Console:
-    """Says lines on standard error by a thread of its own: a terminal that is gone or stands still holds up no tick."""
+    """Says lines on standard error by a thread of its own: a terminal that is gone or stands still
+    holds up no tick.
+    """
 
     def __init__(self) -> None:
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_UNSAID)
@@ -45,14 +69,18 @@ class Console:
             self._lines.put_nowait(text)
 
     def decision(self, decision: Decision) -> None:
-        """Say a change of state with its reason, or what a state waits for; a reason that was just said is not said again."""
+        """Say a change of state with its reason, or what a state waits for; a reason that was just
+        said is not said again.
+        """
         head = f"{decision.time:12.3f} s  {decision.state:8} "
         if decision.state != self._before[0]:
             self.say(head + (decision.reason if decision.reason != self._before[1] else ""))
             self._before = decision.state, decision.reason
         if decision.calibration is not None:
             found = decision.calibration
-            self.say(f"{head}calibration: {found if isinstance(found, str) else Calibration.of(found)}")
+            self.say(
+                f"{head}calibration: {found if isinstance(found, str) else Calibration.of(found)}"
+            )
         if decision.waits:
             self.say(f"{head}waits: {decision.waits}")
 
@@ -71,9 +99,15 @@ class Console:
 class Terminal:
     """See `hil.control.loop.Operator`."""
 
-    def __init__(self, auto_arm: bool = False, simulated: Callable[[], bool] = lambda: False, say: Callable[[str], None] = print) -> None:
-        """Take over the signals; ``say`` never waits. ``auto_arm``: the word is given whenever the run is ready, to a vehicle that has said
-        that it is simulated and to no other."""
+    def __init__(
+        self,
+        auto_arm: bool = False,
+        simulated: Callable[[], bool] = lambda: False,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        """Take over the signals; ``say`` never waits. ``auto_arm``: the word is given whenever the
+        run is ready, to a vehicle that has said that it is simulated and to no other.
+        """
         self._auto, self._simulated, self._say = auto_arm, simulated, say
         self._why = ""
         self._typed, self._warned = b"", False
@@ -91,7 +125,11 @@ class Terminal:
             raise KeyboardInterrupt
         if not self._why or number == signal.SIGINT:
             name = signal.Signals(number).name
-            self._why = "the operator said abort (Ctrl-C)" if number == signal.SIGINT else f"the process was told to end ({name})"
+            self._why = (
+                "the operator said abort (Ctrl-C)"
+                if number == signal.SIGINT
+                else f"the process was told to end ({name})"
+            )
 
     def words(self, state: str) -> OperatorInput:
         said = self._lines()
@@ -100,7 +138,10 @@ class Terminal:
             arm = self._simulated()
             if not arm and not self._warned:
                 self._warned = True
-                self._say("--auto-arm: this vehicle does not say that it is simulated (`visthrow hil fake` does); type arm")
+                self._say(
+                    "--auto-arm: this vehicle does not say that it is simulated (`visthrow hil"
+                    " fake` does); type arm"
+                )
         return OperatorInput(arm, "land" in said, "abort" in said or bool(self._why), self._why)
 
     def _lines(self) -> set[str]:

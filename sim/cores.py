@@ -1,4 +1,6 @@
-"""CPU cores, and kernels spread over them: a launch runs on one thread, and leaves the interpreter free meanwhile."""
+"""CPU cores, and kernels spread over them: a launch runs on one thread, and leaves the interpreter
+free meanwhile.
+"""
 
 import os
 from collections.abc import Callable, Sequence
@@ -12,10 +14,12 @@ def cores() -> int:
 
 
 def in_pieces(launch: Callable[[int, int], None], marks: Sequence[int], threads: int) -> None:
-    """Call ``launch(first, last)`` for each stretch between two marks, so many at a time, this thread's among them; wait for all.
+    """Call ``launch(first, last)`` for each stretch between two marks, so many at a time, this
+    thread's among them; wait for all.
 
     Args:
-        launch: of rows that depend on no others; together they leave the bits that one call for all would.
+        launch: of rows that depend on no others; together they leave the bits that one call for all
+            would.
         marks: ascending, from 0 to the number of rows.
         threads: at most.
     """
@@ -35,9 +39,13 @@ def in_pieces(launch: Callable[[int, int], None], marks: Sequence[int], threads:
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that launch pieces beside the caller's; kept, since there are thousands of launches."""
+    """Threads that launch pieces beside the caller's; kept, since there are thousands
+    of launches.
+    """
     return ThreadPoolExecutor(threads, "launch")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has none of these threads
+    os.register_at_fork(
+        after_in_child=_pool.cache_clear
+    )  # a child process has none of these threads

@@ -1,9 +1,10 @@
-"""A class of vehicles: one that is known, made larger or smaller as real ones are, and changed at random about that.
+"""A class of vehicles: one that is known, made larger or smaller as real ones are, and changed at
+random about that.
 
-Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the cube root of the mass, thrust as
-the mass, inertia as mass times arm squared, and times as the square root of the arm: this is :class:`sim.units.Units`
-applied to the known vehicle. Every factor multiplies what that gives. What does not follow size, links and sensors, stays in seconds.
-"""
+Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the
+cube root of the mass, thrust as the mass, inertia as mass times arm squared, and times as the
+square root of the arm: this is :class:`sim.units.Units` applied to the known vehicle. Every factor
+multiplies what that gives. What does not follow size, links and sensors, stays in seconds."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -18,18 +19,19 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class FleetParams:
-    """Ranges that vehicle, rope and release are drawn from, log-uniform; factors are relative to the known vehicle made to size.
+    """Ranges that vehicle, rope and release are drawn from, log-uniform; factors are relative to
+    the known vehicle made to size.
 
-    The task and the numerics of an experiment with a fleet are stated in units of ``rope_length`` and ``total_mass``: what is
-    0.33 m there is a rope's length for each.
-    """
+    The task and the numerics of an experiment with a fleet are stated in units of ``rope_length``
+    and ``total_mass``: what is 0.33 m there is a rope's length for each."""
 
     count: int  # vehicles drawn; 0: the experiment's own, which is stated in SI units
     first: int  # number of the first one: vehicle k is the same in every draw
     seed: int
     rope_length: float  # [m]
     total_mass: float  # vehicle and all that hangs on it [kg]
-    least_thrust: float  # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
+    # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
+    least_thrust: float
     mass: Range  # of the vehicle [kg]
     thrust: Range  # factor of the full thrust
     arm: Range  # factor
@@ -54,16 +56,25 @@ class FleetParams:
     rope_mass: Range  # factor of the mass for a length
     mount: Range  # factor of the mount's distance from the centre of mass
     lag: Range  # of the release [s]
-    yaw_loop: float | None = None  # with it, yaw gains are turned down until :func:`yaw_rate` is this times the known vehicle's at most
+    yaw_loop: float | None = (
+        # with it, yaw gains are turned down until :func:`yaw_rate` is this times the known
+        # vehicle's at most
+        None
+    )
 
     def __post_init__(self) -> None:
         """Raise ValueError for ranges that nothing can be drawn from."""
         require("fleet", self, positive="rope_length total_mass least_thrust yaw_loop")
         if self.count < 0 or self.first < 0 or self.seed < 0:
-            raise ValueError(f"fleet.count is {self.count}, first {self.first}, seed {self.seed}; expected 0 or more of each")
+            raise ValueError(
+                f"fleet.count is {self.count}, first {self.first}, seed {self.seed}; expected 0 or"
+                " more of each"
+            )
         for name, (low, high) in self.ranges.items():
             if not 0.0 < low <= high < math.inf:
-                raise ValueError(f"fleet.{name} is {low} to {high}; expected an ascending range above 0")
+                raise ValueError(
+                    f"fleet.{name} is {low} to {high}; expected an ascending range above 0"
+                )
 
     @property
     def ranges(self) -> dict[str, Range]:
@@ -76,12 +87,16 @@ class FleetParams:
 
 
 def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
-    """Vehicle of that number with its rope and release, SI units; numerics and air are those of the known plant."""
+    """Vehicle of that number with its rope and release, SI units; numerics and air are those of the
+    known plant.
+    """
     low, high = np.log(list(fleet.ranges.values())).T
     drawn = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
     x = dict(zip(fleet.ranges, drawn.tolist()))
     ratio = known.vehicle.body.mass / x["mass"]
-    alike = Units(ratio ** (1 / 3), ratio)  # in these units the known vehicle has the mass that was drawn
+    alike = Units(
+        ratio ** (1 / 3), ratio
+    )  # in these units the known vehicle has the mass that was drawn
     usual, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
     vehicle = _vehicle(usual, x)
     if fleet.yaw_loop is not None:
@@ -89,17 +104,21 @@ def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
     own = vehicle.body.mass + rope.rope_mass * x["rope"] * x["rope_mass"]
     most = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - own
     x["payload"] = min(x["payload"], most / rope.payload_mass)
-    return replace(known, vehicle=vehicle, rope=_rope(rope, x), release=replace(known.release, lag=x["lag"]))
+    return replace(
+        known, vehicle=vehicle, rope=_rope(rope, x), release=replace(known.release, lag=x["lag"])
+    )
 
 
 def yaw_rate(v: VehicleParams) -> float:
     """Bandwidth of the yaw loop by its rotors' inertia alone [1/s], in hover.
 
-    A rotor that is made to turn faster pushes the body at once, by ``J_r`` over the motor's lag: on many vehicles more than by
-    its drag. Where that is faster than a flight controller's clock, yaw swings up.
-    """
+    A rotor that is made to turn faster pushes the body at once, by ``J_r`` over the motor's lag: on
+    many vehicles more than by its drag. Where that is faster than a flight controller's clock, yaw
+    swings up."""
     speed = math.sqrt(v.body.mass * GRAVITY / (4.0 * v.thrust.k_f))
-    push = v.rotors.inertia / (2.0 * v.thrust.k_f * speed * v.motor.time_constant * v.thrust.torque_ratio)
+    push = v.rotors.inertia / (
+        2.0 * v.thrust.k_f * speed * v.motor.time_constant * v.thrust.torque_ratio
+    )
     return push * v.controller.p_gain[2] / v.body.inertia[2]
 
 
@@ -123,33 +142,60 @@ def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
     c, aero = v.controller, v.aero
     fast = x["p_gain"] / lag  # a rate loop is tuned to what its motors follow
     controller = replace(
-        c, p_gain=scaled(c.p_gain, fast), i_gain=scaled(c.i_gain, fast * x["i_gain"]), d_gain=scaled(c.d_gain, x["d_gain"]),
-        feedforward_gain=scaled(c.feedforward_gain, x["feedforward"]), integral_limit=scaled(c.integral_limit, 1.0),
-        setpoint_time_constant=c.setpoint_time_constant * x["filters"], gyro_time_constant=c.gyro_time_constant * x["filters"],
-        min_thrust=c.min_thrust * x["thrust"], max_thrust=c.max_thrust * x["thrust"], voltage_compensation=x["compensation"],
-    )  # fmt: skip
+        c,
+        p_gain=scaled(c.p_gain, fast),
+        i_gain=scaled(c.i_gain, fast * x["i_gain"]),
+        d_gain=scaled(c.d_gain, x["d_gain"]),
+        feedforward_gain=scaled(c.feedforward_gain, x["feedforward"]),
+        integral_limit=scaled(c.integral_limit, 1.0),
+        setpoint_time_constant=c.setpoint_time_constant * x["filters"],
+        gyro_time_constant=c.gyro_time_constant * x["filters"],
+        min_thrust=c.min_thrust * x["thrust"],
+        max_thrust=c.max_thrust * x["thrust"],
+        voltage_compensation=x["compensation"],
+    )
     return replace(
         v,
         body=replace(v.body, inertia=scaled(v.body.inertia, 1.0)),
         rotors=replace(
-            v.rotors, x=tuple(arm * a for a in v.rotors.x), y=tuple(arm * a for a in v.rotors.y), z=arm * v.rotors.z,
-            radius=blade * v.rotors.radius, inertia=blade**2 * x["rotor_inertia"] * v.rotors.inertia,
+            v.rotors,
+            x=tuple(arm * a for a in v.rotors.x),
+            y=tuple(arm * a for a in v.rotors.y),
+            z=arm * v.rotors.z,
+            radius=blade * v.rotors.radius,
+            inertia=blade**2 * x["rotor_inertia"] * v.rotors.inertia,
         ),
         queue=replace(v.queue, delay=x["delay"]),
         controller=controller,
-        motor=replace(v.motor, time_constant=lag * v.motor.time_constant, time_constant_down=lag * v.motor.time_constant_down),
+        motor=replace(
+            v.motor,
+            time_constant=lag * v.motor.time_constant,
+            time_constant_down=lag * v.motor.time_constant_down,
+        ),
         battery=replace(v.battery, resistance=x["resistance"] * v.battery.resistance),
-        thrust=replace(v.thrust, k_f=x["thrust"] * v.thrust.k_f, torque_ratio=blade * x["torque_ratio"] * v.thrust.torque_ratio),
-        aero=replace(aero, **{f.name: getattr(aero, f.name) * x["drag"] for f in fields(aero) if f.name != "kind"}),
+        thrust=replace(
+            v.thrust,
+            k_f=x["thrust"] * v.thrust.k_f,
+            torque_ratio=blade * x["torque_ratio"] * v.thrust.torque_ratio,
+        ),
+        aero=replace(
+            aero,
+            **{f.name: getattr(aero, f.name) * x["drag"] for f in fields(aero) if f.name != "kind"},
+        ),
         collision_radius=arm * v.collision_radius,
-    )  # fmt: skip
+    )
 
 
 def _rope(r: RopeParams, x: dict[str, float]) -> RopeParams:
     """A rope and its payload with the factors drawn."""
     length, size, mass = r.length * x["rope"], x["payload_size"], x["payload"]
     return replace(
-        r, length=length, rope_mass=r.rope_mass * x["rope"] * x["rope_mass"], payload_mass=r.payload_mass * mass,
-        payload_inertia=r.payload_inertia * mass * size**2, payload_offset=r.payload_offset * size,
-        payload_radius=r.payload_radius * size, mount=tuple(x["mount"] * a for a in r.mount),
-    )  # fmt: skip
+        r,
+        length=length,
+        rope_mass=r.rope_mass * x["rope"] * x["rope_mass"],
+        payload_mass=r.payload_mass * mass,
+        payload_inertia=r.payload_inertia * mass * size**2,
+        payload_offset=r.payload_offset * size,
+        payload_radius=r.payload_radius * size,
+        mount=tuple(x["mount"] * a for a in r.mount),
+    )

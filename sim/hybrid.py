@@ -1,4 +1,6 @@
-"""HybridSim: a batch of quadrotors with a rope and a payload each, stepped one control period at a time."""
+"""HybridSim: a batch of quadrotors with a rope and a payload each, stepped one control period at a
+time.
+"""
 
 import dataclasses
 from typing import Any
@@ -13,11 +15,30 @@ from sim.kernels.laws import check_laws, structure
 from sim.kernels.quadrotor.queue import queue_depth
 from sim.kernels.randomize import build_reset
 from sim.kernels.step import build_step
-from sim.kernels.structs import extensions_of, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
-from sim.params import GRAVITY, AirParams, PlantParams, RandomizationParams, ReleaseParams, RopeParams, VehicleParams
+from sim.kernels.structs import (
+    extensions_of,
+    kinds_of,
+    pack,
+    pack_air,
+    pack_rope,
+    pack_vehicle,
+    ropes_on,
+    types,
+)
+from sim.params import (
+    GRAVITY,
+    AirParams,
+    PlantParams,
+    RandomizationParams,
+    ReleaseParams,
+    RopeParams,
+    VehicleParams,
+)
 
 PIECES = 8
-"""Number of pieces of a batch for each core of a CPU: a core that has other work for a while leaves its pieces to the rest."""
+"""Number of pieces of a batch for each core of a CPU: a core that has other work for a while leaves
+its pieces to the rest.
+"""
 
 FEWEST = 32
 """Environments of a piece of a step, at least: they take half a millisecond, the launch a tenth."""
@@ -27,7 +48,9 @@ LOOK = 0.01
 _BUILDS: dict[tuple[Any, ...], tuple[Any, Any, Any]] = {}
 
 
-def _kernels(params: PlantParams, direct: bool, motors: bool, extensions: frozenset[str]) -> tuple[Any, Any, Any]:
+def _kernels(
+    params: PlantParams, direct: bool, motors: bool, extensions: frozenset[str]
+) -> tuple[Any, Any, Any]:
     """Kernels of one choice of blocks; built once a process."""
     blocks = (kinds_of(params.vehicle), direct, motors, extensions)
     key = (params.sim.precision, params.rope.segments, blocks, structure(params.laws))
@@ -39,32 +62,53 @@ def _kernels(params: PlantParams, direct: bool, motors: bool, extensions: frozen
 
 
 def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
-    """The rope in ``tether_variants`` lengths that span +-``tether_spread``; its mass per metre is kept.
+    """The rope in ``tether_variants`` lengths that span +-``tether_spread``; its mass per metre is
+    kept.
 
     Environment e gets entry ``e % tether_variants`` (the paper, Sec. III-C).
     """
     if z.tether_variants < 1:
         raise ValueError(f"tether_variants {z.tether_variants}; expected 1 or more")
-    factors = [1.0] if z.tether_variants == 1 else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
-    return [dataclasses.replace(rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)) for f in factors]
+    factors = (
+        [1.0]
+        if z.tether_variants == 1
+        else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
+    )
+    return [
+        dataclasses.replace(
+            rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)
+        )
+        for f in factors
+    ]
 
 
 def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
-    """:func:`tether_lengths` with every combination of ``payload_variants`` masses and as many drags of the payload.
+    """:func:`tether_lengths` with every combination of ``payload_variants`` masses and as many
+    drags of the payload.
 
-    They span +-``payload_spread`` and +-``drag_spread``; a spread of 0 leaves one. The payload keeps its size, so its
-    inertia goes with its mass. Environment e gets entry ``e % len(...)``, whose cable is ``e % tether_variants``.
-    """
+    They span +-``payload_spread`` and +-``drag_spread``; a spread of 0 leaves one. The payload
+    keeps its size, so its inertia goes with its mass. Environment e gets entry ``e % len(...)``,
+    whose cable is ``e % tether_variants``."""
     spreads = {"payload_spread": z.payload_spread, "drag_spread": z.drag_spread}
     if z.payload_variants < 1 or not all(0.0 <= spread < 1.0 for spread in spreads.values()):
-        raise ValueError(f"payload_variants {z.payload_variants}, {spreads}; expected 1 or more, and 0 to below 1")
+        raise ValueError(
+            f"payload_variants {z.payload_variants}, {spreads}; expected 1 or more, and 0 to"
+            " below 1"
+        )
     masses, drags = (
-        [1.0] if spread == 0.0 or z.payload_variants == 1 else np.linspace(1 - spread, 1 + spread, z.payload_variants)
+        (
+            [1.0]
+            if spread == 0.0 or z.payload_variants == 1
+            else np.linspace(1 - spread, 1 + spread, z.payload_variants)
+        )
         for spread in spreads.values()
     )
     return [
         dataclasses.replace(
-            r, payload_mass=r.payload_mass * float(m), payload_inertia=r.payload_inertia * float(m), payload_drag=r.payload_drag * float(d)
+            r,
+            payload_mass=r.payload_mass * float(m),
+            payload_inertia=r.payload_inertia * float(m),
+            payload_drag=r.payload_drag * float(d),
         )
         for d in drags
         for m in masses
@@ -78,13 +122,18 @@ def _check(params: PlantParams, count: int, ropes: list[RopeParams]) -> None:
         raise ValueError(f"HybridSim of {count} environments; expected 1 or more")
     check_laws(params.laws)
     if {r.segments for r in ropes} != {params.rope.segments}:
-        raise ValueError(f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of {params.rope.segments}")
+        raise ValueError(
+            f"ropes of {sorted({r.segments for r in ropes})} segments in one batch of"
+            f" {params.rope.segments}"
+        )
 
 
 class HybridSim:
-    """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload, release.
+    """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload,
+    release.
 
-    All arrays live on the device and keep their addresses for life, so a captured graph of ``step`` stays valid.
+    All arrays live on the device and keep their addresses for life, so a captured graph of ``step``
+    stays valid.
 
     Attributes:
         command: [N, rad/s], shape (E,) of vec4: collective thrust and body rates of the next step.
@@ -114,34 +163,50 @@ class HybridSim:
     ):
         """Allocate ``count`` plants.
 
-        Raises ValueError: no environment, ropes of different segment counts, or a law that no block can be made of.
+        Raises ValueError: no environment, ropes of different segment counts, or a law that no block
+        can be made of.
 
         Args:
             params: the plant; its kinds and numerics hold for all.
             count: number of environments E.
             device: Warp device, "cpu" or "cuda:0".
             seed: of :meth:`randomize`.
-            vehicles: parameters of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
+            vehicles: parameters of environment e at ``e % len(vehicles)``; default
+                ``[params.vehicle]``.
             ropes: likewise; all with the same number of segments.
             airs: likewise; default ``[params.air]``.
             releases: likewise; default ``[params.release]``.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
-            motors: by-pass the rate controller: commands are motor-speed set-points [rad/s]; a firmware flies the vehicle.
-            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, to build in besides those that the parameters need.
+            motors: by-pass the rate controller: commands are motor-speed set-points [rad/s]; a
+                firmware flies the vehicle.
+            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, to build in besides those that
+                the parameters need.
             gravity: acceleration of free fall, along -z [m/s^2].
             threads: at most, of a CPU; default all its cores. The bits do not depend on it.
         """
         vehicles, ropes = vehicles or [params.vehicle], ropes or [params.rope]
         airs, releases = airs or [params.air], releases or [params.release]
         _check(params, count, ropes)
-        self.params, self.count, self.device, self.seed, self.vehicles = params, count, device, seed, vehicles
+        self.params, self.count, self.device, self.seed, self.vehicles = (
+            params,
+            count,
+            device,
+            seed,
+            vehicles,
+        )
         self.gravity, self.threads = gravity, threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, motors, self.extensions)
         t = self.types
-        self._vehicles: Any = wp.array(pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device)
-        self._ropes: Any = wp.array(pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device)
-        self._airs: Any = wp.array(pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device)
+        self._vehicles: Any = wp.array(
+            pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device
+        )
+        self._ropes: Any = wp.array(
+            pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device
+        )
+        self._airs: Any = wp.array(
+            pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device
+        )
         self._release: Any = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
         self.place(pos_w=np.zeros((count, 3)))
@@ -149,36 +214,76 @@ class HybridSim:
     def _allocate(self, depth: int) -> None:
         """Make the arrays of state and output, with a command queue so deep."""
         t, count, device, segments = self.types, self.count, self.device, self.params.rope.segments
-        rows = {"cable_dir_w": segments, "cable_vel_w": segments, "stiffness": segments, "queue": depth}
+        rows = {
+            "cable_dir_w": segments,
+            "cable_vel_w": segments,
+            "stiffness": segments,
+            "queue": depth,
+        }
         self.state = st.allocate(t, self._step.State, st.STATE_FIELDS, count, rows, device)
         outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
-        self.out, self.foreseen = (st.allocate(t, self._step.Output, outputs, count, {}, device) for _ in range(2))
+        self.out, self.foreseen = (
+            st.allocate(t, self._step.Output, outputs, count, {}, device) for _ in range(2)
+        )
         self.command = wp.zeros(count, dtype=t.vec4, device=device)
-        self.release, self.episode = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
+        self.release, self.episode = (
+            wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2)
+        )
         self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
         self._all = wp.full(count, 1, dtype=wp.int32, device=device)
         self._used = wp.zeros(count, dtype=t.real, device=device)
         self._spreads: tuple[RandomizationParams, wp.array[Any]] | None = None
 
     def step(self, mask: "wp.array[Any] | None" = None) -> None:
-        """Advance every plant by one control period under ``command`` and ``release``; with a ``mask``, shape (E,), where it is not 0."""
+        """Advance every plant by one control period under ``command`` and ``release``; with a
+        ``mask``, shape (E,), where it is not 0.
+        """
         s, parts = self.params.sim, [self._vehicles, self._ropes, self._release, self._airs]
         numerics = [s.control_period, s.substep, s.gamma, s.max_turn, self.gravity]
         mask = self._all if mask is None else mask
-        self._launch(self._step.step, [*parts, *numerics, self.state, self.command, self.release, mask, self.out], block_dim=64)
+        self._launch(
+            self._step.step,
+            [*parts, *numerics, self.state, self.command, self.release, mask, self.out],
+            block_dim=64,
+        )
 
     def foresee(self) -> None:
-        """Write into ``foreseen`` what follows if every payload separates now; the plants stay as they are."""
-        inputs = [self._vehicles, self._ropes, self._release, self._airs, self.gravity, self.state, self.foreseen]
+        """Write into ``foreseen`` what follows if every payload separates now; the plants stay as
+        they are.
+        """
+        inputs = [
+            self._vehicles,
+            self._ropes,
+            self._release,
+            self._airs,
+            self.gravity,
+            self.state,
+            self.foreseen,
+        ]
         self._launch(self._step.foresee, inputs, block_dim=64, work=LOOK)
 
     def randomize(self, spreads: RandomizationParams, mask: "wp.array[Any] | None" = None) -> None:
-        """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere without one."""
+        """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere
+        without one.
+        """
         if self._spreads is None or self._spreads[0] != spreads:
             packed = pack(self.types.Randomization, spreads)
-            self._spreads = (spreads, wp.array(packed, dtype=self.types.Randomization, device=self.device))
+            self._spreads = (
+                spreads,
+                wp.array(packed, dtype=self.types.Randomization, device=self.device),
+            )
         mask = self._all if mask is None else mask
-        inputs = [self._vehicles, self._ropes, self._spreads[1], self.gravity, self.seed, self.state, self.episode, mask, self.goal_w]
+        inputs = [
+            self._vehicles,
+            self._ropes,
+            self._spreads[1],
+            self.gravity,
+            self.seed,
+            self.state,
+            self.episode,
+            mask,
+            self.goal_w,
+        ]
         self._launch(self._reset.randomize, inputs)
         self._update_payload()
 
@@ -206,9 +311,13 @@ class HybridSim:
         """
         zero, rows = np.zeros(3), np.zeros((self.params.rope.segments, 3))
         given = {
-            "pos_w": (pos_w, zero), "quat_wb": (quat_wb, st.LEVEL), "vel_w": (vel_w, zero), "rate_b": (rate_b, zero),
-            "cable_dir_w": (cable_dir_w, rows - [0.0, 0.0, 1.0]), "cable_vel_w": (cable_vel_w, rows),
-        }  # fmt: skip
+            "pos_w": (pos_w, zero),
+            "quat_wb": (quat_wb, st.LEVEL),
+            "vel_w": (vel_w, zero),
+            "rate_b": (rate_b, zero),
+            "cable_dir_w": (cable_dir_w, rows - [0.0, 0.0, 1.0]),
+            "cable_vel_w": (cable_vel_w, rows),
+        }
         st.put(self.types, self.state, given, self.count)
         self.state.mass_scale.fill_(1.0)
         self._used.fill_(battery_used)
@@ -219,10 +328,16 @@ class HybridSim:
     def _update_payload(self) -> None:
         self._launch(self._step.payload, [self._ropes, self.state, self.out], work=LOOK)
 
-    def _launch(self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0) -> None:
+    def _launch(
+        self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0
+    ) -> None:
         """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
         count, device = self.count, self.device
-        pieces = min(PIECES * self.threads, int(count * work) // FEWEST) if device == "cpu" and self.threads > 1 else 1
+        pieces = (
+            min(PIECES * self.threads, int(count * work) // FEWEST)
+            if device == "cpu" and self.threads > 1
+            else 1
+        )
         if pieces <= 1:
             wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
             return
@@ -234,13 +349,18 @@ class HybridSim:
         in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
 
     def plants(self) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters of vehicle and rope of every environment as the kernels read them: structured arrays, shape (E,)."""
+        """Parameters of vehicle and rope of every environment as the kernels read them: structured
+        arrays, shape (E,).
+        """
         vehicles, ropes = self._vehicles.numpy(), self._ropes.numpy()
         rows = np.arange(self.count)
         return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
     def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
-        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device. Raises ValueError: another shape."""
+        """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.
+
+        Raises ValueError: another shape.
+        """
         asked = np.zeros(self.count) if release is None else np.asarray(release)
         if asked.shape != (self.count,):
             raise ValueError(f"release of shape {asked.shape}; expected {(self.count,)}")
@@ -248,15 +368,21 @@ class HybridSim:
         self.release.assign(asked.astype(np.int32))
 
     def get(self, name: str) -> np.ndarray:
-        """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L, ...)."""
+        """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L,
+        ...).
+        """
         if name in st.STATE_FIELDS:
             return st.fetched(getattr(self.state, name), st.STATE_FIELDS[name][1])
         if name in st.OUTPUT_FIELDS:
             return st.fetched(getattr(self.out, name), False)
-        raise ValueError(f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}")
+        raise ValueError(
+            f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}"
+        )
 
     def cable_points_w(self) -> np.ndarray:
-        """Joints of the rope from the mount to its lower end [m], shape (E, L + 1, 3), world frame."""
+        """Joints of the rope from the mount to its lower end [m], shape (E, L + 1, 3),
+        world frame.
+        """
         ropes = self._ropes.numpy()
         rows = np.arange(self.count) % len(ropes)
         q, r = self.get("quat_wb").astype(float), ropes["mount"][rows].astype(float)

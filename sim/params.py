@@ -1,10 +1,10 @@
 """Physical parameters of the vehicle, the rope and the release: frozen dataclasses, SI units.
 
-Each dataclass mirrors one TOML file of ``configs/``. The equations that the fields enter stand in the docstring of the
-class; the blocks of ``sim/kernels/quadrotor`` and ``sim/kernels/rope`` implement them in Warp, ``sim/reference`` implements them again,
-independently, in float64. Every value below is documented as ``[unit]``; vectors are in the body frame (x forward,
-y left, z up) with the origin at the vehicle's centre of mass unless said otherwise.
-"""
+Each dataclass mirrors one TOML file of ``configs/``. The equations that the fields enter stand in
+the docstring of the class; the blocks of ``sim/kernels/quadrotor`` and ``sim/kernels/rope``
+implement them in Warp, ``sim/reference`` implements them again, independently, in float64. Every
+value below is documented as ``[unit]``; vectors are in the body frame (x forward, y left, z up)
+with the origin at the vehicle's centre of mass unless said otherwise."""
 
 import math
 import sys
@@ -15,9 +15,17 @@ GRAVITY = 9.81
 """Standard acceleration of free fall used by every plant of the project [m/s^2]."""
 
 
-def require(owner: str, of: Any, *, positive: str = "", not_negative: str = "", finite: str = "") -> None:
-    """Raise ValueError for the first of an owner's fields, by their names, that is not so; of a tuple every number counts, None passes."""
-    kinds = ((positive, "above 0", math.ulp(0.0)), (not_negative, "0 or more", 0.0), (finite, "a finite value", -sys.float_info.max))
+def require(
+    owner: str, of: Any, *, positive: str = "", not_negative: str = "", finite: str = ""
+) -> None:
+    """Raise ValueError for the first of an owner's fields, by their names, that is not so; of a
+    tuple every number counts, None passes.
+    """
+    kinds = (
+        (positive, "above 0", math.ulp(0.0)),
+        (not_negative, "0 or more", 0.0),
+        (finite, "a finite value", -sys.float_info.max),
+    )
     for names, expected, least in kinds:
         for name in names.split():
             value = getattr(of, name)
@@ -42,9 +50,8 @@ class BodyParams:
 class RotorParams:
     """Geometry of the four rotors.
 
-    Rotor i sits at ``r_i = (x_i, y_i, z)`` and turns with sense ``s_i``: +1 turns clockwise seen from above, so that its
-    drag torque on the body points along +z.
-    """
+    Rotor i sits at ``r_i = (x_i, y_i, z)`` and turns with sense ``s_i``: +1 turns clockwise seen
+    from above, so that its drag torque on the body points along +z."""
 
     x: tuple[float, float, float, float]  # [m]
     y: tuple[float, float, float, float]  # [m]
@@ -56,7 +63,9 @@ class RotorParams:
 
 @dataclass(frozen=True)
 class QueueParams:
-    """Command queue: the command given at t acts from t + delay on, held until the next one (zero-order hold)."""
+    """Command queue: the command given at t acts from t + delay on, held until the next one
+    (zero-order hold).
+    """
 
     delay: float  # tau_d, transmission and actuation [s]
 
@@ -65,37 +74,43 @@ class QueueParams:
 class ControllerParams:
     """Body-rate controller.
 
-    ``betaflight``: with the delayed command (c, w_cmd), measured rate w, filtered set-point r, filtered gyro g,
-    integral i (a torque):
+    ``betaflight``: with the delayed command (c, w_cmd), measured rate w, filtered set-point r,
+    filtered gyro g, integral i (a torque):
 
     - ``r' = (w_cmd - r) / setpoint_time_constant``
     - ``g' = (w - g) / gyro_time_constant``
     - ``tau = p_gain (r - w) + i - d_gain g' + feedforward_gain r'``  (per axis, [N m])
-    - ``i' = i_gain (r - w)``; where it would grow an integral (``i' i > 0``) it is 0 at ``|i| >= integral_limit`` and
-      otherwise scaled by the share of the demanded torque that the mixer delivers: roll and pitch by their common scale,
-      yaw by clipped over wanted. (Continuous in the state: a hard hold while saturated makes trajectories depend on the step.)
+    - ``i' = i_gain (r - w)``; where it would grow an integral (``i' i > 0``) it is 0 at ``|i| >=
+      integral_limit`` and
+      otherwise scaled by the share of the demanded torque that the mixer delivers: roll and pitch
+          by their common scale,
+      yaw by clipped over wanted. (Continuous in the state: a hard hold while saturated makes
+      trajectories depend on the step.)
 
-    Mixer: per-motor thrusts ``f_i = c/4 + roll_i + pitch_i + yaw_i`` with ``roll_i = tau_x y_i / (4 ybar^2)``,
-    ``pitch_i = -tau_y x_i / (4 xbar^2)``, ``yaw_i = tau_z s_i / (4 kappa)`` (``ybar^2`` mean of y_i^2, ``xbar^2`` of x_i^2,
-    kappa the nominal torque-to-thrust ratio). With D = f_max - f_min: roll+pitch are scaled by D / range where their range
-    exceeds D; then yaw is clipped to what range D leaves; then the collective is shifted so that every f_i lies in
-    [f_min, f_max]. ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point:
+    Mixer: per-motor thrusts ``f_i = c/4 + roll_i + pitch_i + yaw_i`` with ``roll_i = tau_x y_i / (4
+    ybar^2)``, ``pitch_i = -tau_y x_i / (4 xbar^2)``, ``yaw_i = tau_z s_i / (4 kappa)`` (``ybar^2``
+    mean of y_i^2, ``xbar^2`` of x_i^2, kappa the nominal torque-to-thrust ratio). With D = f_max -
+    f_min: roll+pitch are scaled by D / range where their range exceeds D; then yaw is clipped to
+    what range D leaves; then the collective is shifted so that every f_i lies in [f_min, f_max].
+    ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point:
     ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
 
-    ``motor_mixing`` (Betaflight's firmware, without set-point smoothing): g has the lag of D, which has filters of its own; P and I
-    see a share of it, ``e = w_cmd - w - gyro_share (g - w)``. r is the low-pass of ``iterm_relax`` alone, which holds the integral
-    of roll and pitch while the command moves:
-    ``i' = i_gain e max(0, 1 - |w_cmd - r| / relax_threshold)``, 0 at the limit where it would grow. The mixer
-    adds to motor commands: with ``u_c = sqrt(c / (4 max_thrust))`` and m_i the thrust that the mixer above gives a motor for
-    tau, ``u_i = u_c + m_i / (2 sqrt(mix_thrust max_thrust))``; all m_i are scaled where their range exceeds that from idle
-    ``sqrt(min_thrust / max_thrust)`` to 1, then u_c is shifted so that every u_i lies in it. The gains hold at ``mix_thrust`` a
-    motor; elsewhere the loop's gain goes with the square root of thrust. ``Omega* = u_i sqrt(max_thrust / k_f)``, times the
-    voltage's factor above with ``calibration_voltage`` for u_ref. Source: betaflight 4.6, src/main/flight/pid.c
-    (applyItermRelax), mixer.c (applyMixerAdjustment).
+    ``motor_mixing`` (Betaflight's firmware, without set-point smoothing): g has the lag of D, which
+    has filters of its own; P and I see a share of it, ``e = w_cmd - w - gyro_share (g - w)``. r is
+    the low-pass of ``iterm_relax`` alone, which holds the integral of roll and pitch while the
+    command moves: ``i' = i_gain e max(0, 1 - |w_cmd - r| / relax_threshold)``, 0 at the limit where
+    it would grow. The mixer adds to motor commands: with ``u_c = sqrt(c / (4 max_thrust))`` and m_i
+    the thrust that the mixer above gives a motor for tau, ``u_i = u_c + m_i / (2 sqrt(mix_thrust
+    max_thrust))``; all m_i are scaled where their range exceeds that from idle ``sqrt(min_thrust /
+    max_thrust)`` to 1, then u_c is shifted so that every u_i lies in it. The gains hold at
+    ``mix_thrust`` a motor; elsewhere the loop's gain goes with the square root of thrust. ``Omega*
+    = u_i sqrt(max_thrust / k_f)``, times the voltage's factor above with ``calibration_voltage``
+    for u_ref. Source: betaflight 4.6, src/main/flight/pid.c (applyItermRelax), mixer.c
+    (applyMixerAdjustment).
 
-    ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters, integral or
-    voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i / k_f)``.
-    """
+    ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters,
+    integral or voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i /
+    k_f)``."""
 
     kind: Literal["betaflight", "motor_mixing", "geometric"]
     p_gain: tuple[float, float, float]  # [N m s/rad]
@@ -109,18 +124,31 @@ class ControllerParams:
     max_thrust: float  # f_max a motor at u_ref [N]
     voltage_compensation: float  # 0: none, 1: full [-]
     geometric_gain: float  # [1/s]
-    mix_thrust: float = 0.667  # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
-    calibration_voltage: float = 15.2  # at which a command of ``motor_mixing`` gives the thrust that it names [V]
-    relax_threshold: float = 0.698  # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
-    gyro_share: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the lag of g that P and I of ``motor_mixing`` see [-]
+    mix_thrust: float = (
+        0.667  # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
+    )
+    calibration_voltage: float = (
+        15.2  # at which a command of ``motor_mixing`` gives the thrust that it names [V]
+    )
+    relax_threshold: float = (
+        0.698  # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
+    )
+    gyro_share: tuple[float, float, float] = (
+        1.0,
+        1.0,
+        1.0,
+    )  # of the lag of g that P and I of ``motor_mixing`` see [-]
 
 
 @dataclass(frozen=True)
 class MotorParams:
-    """Motor speed: ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*`` (``instant``).
+    """Motor speed:
 
-    ``asymmetric``: first order with ``time_constant_down`` where the set-point lies below the speed.
-    """
+    ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*``
+    (``instant``).
+
+    ``asymmetric``: first order with ``time_constant_down`` where the set-point lies below the
+    speed."""
 
     kind: Literal["first_order", "instant", "asymmetric"]
     time_constant: float  # [s]
@@ -131,11 +159,11 @@ class MotorParams:
 class BatteryParams:
     """Battery of one pack.
 
-    State: fraction used q, terminal voltage u. Electrical power ``P = P_0 + sum_i |tau_i| Omega_i / efficiency``
-    with ``tau_i`` the aerodynamic rotor torque ``kappa f_i``; current ``I = P / u``; ``q' = I / (3600 capacity)``;
-    open-circuit voltage ``u_oc = ocv[0] + ocv[1] q + ocv[2] q^2 + ocv[3] q^3``;
-    ``u' = (u_oc - resistance I - u) / time_constant`` (``sag``). ``ideal``: u = u_ref, q = 0 always.
-    """
+    State: fraction used q, terminal voltage u. Electrical power ``P = P_0 + sum_i |tau_i| Omega_i /
+    efficiency`` with ``tau_i`` the aerodynamic rotor torque ``kappa f_i``; current ``I = P / u``;
+    ``q' = I / (3600 capacity)``; open-circuit voltage ``u_oc = ocv[0] + ocv[1] q + ocv[2] q^2 +
+    ocv[3] q^3``; ``u' = (u_oc - resistance I - u) / time_constant`` (``sag``). ``ideal``: u =
+    u_ref, q = 0 always."""
 
     kind: Literal["sag", "ideal"]
     capacity: float  # [A h]
@@ -159,19 +187,26 @@ class ThrustParams:
     k_1: float  # linear term [N s/rad]
     voltage_coefficient: float  # [1/V]
     torque_ratio: float  # kappa [m]
-    gain: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)  # of each rotor against the controller's map [-]
+    gain: tuple[float, float, float, float] = (
+        1.0,
+        1.0,
+        1.0,
+        1.0,
+    )  # of each rotor against the controller's map [-]
     torque_gain: float = 1.0  # of the drag torque likewise [-]
 
 
 @dataclass(frozen=True)
 class AeroParams:
-    """Aerodynamics of the vehicle, from the velocity v_b of the centre of mass through the air and the rate w.
+    """Aerodynamics of the vehicle, from the velocity v_b of the centre of mass through the air and
+    the rate w.
 
     - rotor drag: ``dF = -(drag_x v_x, drag_y v_y, drag_z v_z)``
     - body drag: ``dF += -parasitic |v| v``
     - inflow on rotor i, with its hub velocity ``v_i = v_b + w x r_i``:
-      ``df_i = f_i (-inflow v_iz + translational_lift (v_ix^2 + v_iy^2))``, added to the thrust with its arm, and to the
-      rotor's drag torque by ``-torque_inflow`` in place of ``-inflow``: ``dtau_i = kappa f_i (-torque_inflow v_iz)``
+      ``df_i = f_i (-inflow v_iz + translational_lift (v_ix^2 + v_iy^2))``, added to the thrust with
+      its arm, and to the rotor's drag torque by ``-torque_inflow`` in place of ``-inflow``:
+      ``dtau_i = kappa f_i (-torque_inflow v_iz)``
     - blade flapping: ``dtau = flapping T (e_z x v_b)`` with T the sum of f_i.
 
     ``none``: all of it zero (the ablation).
@@ -193,13 +228,14 @@ class VehicleParams:
     """A quadrotor: the seven blocks of Table I of the paper and the rigid body.
 
     The composer adds them up: ``F_b = (0, 0, sum f_i) + dF``,
-    ``tau_b = sum_i r_i x (0, 0, f_i + df_i) + e_z sum_i s_i (tau_i + dtau_i + J_r Omega_i') - w x e_z h + dtau``
-    with the rotors' momentum ``h = -J_r sum_i s_i Omega_i`` (the gyroscopic torque does no work). A rotor that turns
-    clockwise from above (s_i = +1) has angular momentum along -z and pushes the body towards +z.
+    ``tau_b = sum_i r_i x (0, 0, f_i + df_i) + e_z sum_i s_i (tau_i + dtau_i + J_r Omega_i') - w x
+    e_z h + dtau`` with the rotors' momentum ``h = -J_r sum_i s_i Omega_i`` (the gyroscopic torque
+    does no work). A rotor that turns clockwise from above (s_i = +1) has angular momentum along -z
+    and pushes the body towards +z.
 
-    Rotors and mount are stated from the frame's origin, where the centre of mass is meant to be. Where ``body.com`` says
-    that it is elsewhere, they act with their arms about it, while the controller's mixer keeps to the frame.
-    """
+    Rotors and mount are stated from the frame's origin, where the centre of mass is meant to be.
+    Where ``body.com`` says that it is elsewhere, they act with their arms about it, while the
+    controller's mixer keeps to the frame."""
 
     body: BodyParams
     rotors: RotorParams
@@ -215,19 +251,31 @@ class VehicleParams:
         """Raise ValueError for a vehicle that the equations do not describe."""
         body, rotors, c, cell = self.body, self.rotors, self.controller, self.battery
         require("vehicle.body", body, positive="mass inertia")
-        require("vehicle.thrust", self.thrust, positive="k_f gain torque_gain", not_negative="torque_ratio")
+        require(
+            "vehicle.thrust",
+            self.thrust,
+            positive="k_f gain torque_gain",
+            not_negative="torque_ratio",
+        )
         asymmetric = self.motor.kind == "asymmetric"
-        require("vehicle.motor", self.motor, positive="time_constant time_constant_down" if asymmetric else "time_constant")
+        require(
+            "vehicle.motor",
+            self.motor,
+            positive="time_constant time_constant_down" if asymmetric else "time_constant",
+        )
         above = "setpoint_time_constant gyro_time_constant max_thrust"
         require("vehicle.controller", c, positive=above, not_negative="min_thrust")
         above = "capacity time_constant efficiency reference_voltage"
         require("vehicle.battery", cell, positive=above, not_negative="resistance idle_power")
         if not c.min_thrust < c.max_thrust:
-            raise ValueError(f"vehicle.controller.min_thrust is {c.min_thrust} N; expected less than max_thrust {c.max_thrust} N")
+            raise ValueError(
+                f"vehicle.controller.min_thrust is {c.min_thrust} N; expected less than max_thrust"
+                f" {c.max_thrust} N"
+            )
         if not (any(rotors.x) and any(rotors.y)) or abs(sum(rotors.spin)) > 0:
             raise ValueError(
-                f"rotors at x={rotors.x}, y={rotors.y} with spin {rotors.spin}; expected four rotors spread along x and y, "
-                "two turning each way"
+                f"rotors at x={rotors.x}, y={rotors.y} with spin {rotors.spin}; expected four"
+                " rotors spread along x and y, two turning each way"
             )
 
 
@@ -235,21 +283,22 @@ class VehicleParams:
 class RopeParams:
     """Rope of rigid slender segments on universal joints, and the payload rigidly on the last one.
 
-    Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass in the middle,
-    transverse inertia ``m l^2 / 12`` about it, none about its axis. The payload's centre lies ``payload_offset`` past
-    the end of the last segment, on its axis. Viscous joint torque ``-joint_damping (w_i - w_(i-1))`` in every joint, the
-    one on the vehicle included; in the uppermost one ``mount_damping`` besides.
+    Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass
+    in the middle, transverse inertia ``m l^2 / 12`` about it, none about its axis. The payload's
+    centre lies ``payload_offset`` past the end of the last segment, on its axis. Viscous joint
+    torque ``-joint_damping (w_i - w_(i-1))`` in every joint, the one on the vehicle included; in
+    the uppermost one ``mount_damping`` besides.
 
-    Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``. While it hangs, the rotors' jet
-    pushes it with the share ``downwash`` of their force, against that force, and friction holds it back by
-    ``-swing_damping`` times its velocity v across the rope's last segment. In free flight a spinning or seamed ball is pushed
-    besides by ``|v_p| (payload_side e_z x v_p + payload_lift v_p x e_a)`` with ``e_a`` the horizontal direction across its
-    path, ``e_z x v_p`` normalised.
+    Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``. While it
+    hangs, the rotors' jet pushes it with the share ``downwash`` of their force, against that force,
+    and friction holds it back by ``-swing_damping`` times its velocity v across the rope's last
+    segment. In free flight a spinning or seamed ball is pushed besides by ``|v_p| (payload_side e_z
+    x v_p + payload_lift v_p x e_a)`` with ``e_a`` the horizontal direction across its path, ``e_z x
+    v_p`` normalised.
 
     A rope that gives lengthens by ``compliance`` times its pull T at the mount, evenly along it:
-    ``l = l_0 (1 + compliance T / length)``. It does so at once: what swings is slow against the bounce of the payload on the
-    rope (20 Hz at 1 mm/N), whose own inertia is left out.
-    """
+    ``l = l_0 (1 + compliance T / length)``. It does so at once: what swings is slow against the
+    bounce of the payload on the rope (20 Hz at 1 mm/N), whose own inertia is left out."""
 
     segments: int  # L, 1 to 64
     length: float  # of the rope, without the payload [m]
@@ -272,9 +321,15 @@ class RopeParams:
         if not 1 <= self.segments <= 64:
             raise ValueError(f"rope of {self.segments} segments; expected 1 to 64")
         require(
-            "rope", self, positive="length rope_mass payload_mass", finite="payload_side payload_lift",
-            not_negative="payload_inertia payload_offset joint_damping payload_drag mount_damping swing_damping downwash compliance",
-        )  # fmt: skip
+            "rope",
+            self,
+            positive="length rope_mass payload_mass",
+            finite="payload_side payload_lift",
+            not_negative=(
+                "payload_inertia payload_offset joint_damping payload_drag mount_damping"
+                " swing_damping downwash compliance"
+            ),
+        )
 
     @property
     def segment_length(self) -> float:
@@ -294,12 +349,13 @@ class RopeParams:
 
 @dataclass(frozen=True)
 class AirParams:
-    """The air that vehicle and payload move in: ``v_air = v - wind_w``, in the place of v in every force of the air.
+    """The air that vehicle and payload move in:
 
-    Near the ground every rotor gains thrust: ``f_i`` times ``1 + ground_effect (1 / (1 - (R / 4 z)^2) - 1)`` with R the
-    propeller's radius and z the height of the vehicle's centre of mass, not below R / 2 (Cheeseman and Bennett 1955 for
-    ``ground_effect`` 1).
-    """
+    ``v_air = v - wind_w``, in the place of v in every force of the air.
+
+    Near the ground every rotor gains thrust: ``f_i`` times ``1 + ground_effect (1 / (1 - (R / 4
+    z)^2) - 1)`` with R the propeller's radius and z the height of the vehicle's centre of mass, not
+    below R / 2 (Cheeseman and Bennett 1955 for ``ground_effect`` 1)."""
 
     wind_w: tuple[float, float, float] = (0.0, 0.0, 0.0)  # constant wind, world frame [m/s]
     ground_effect: float = 0.0  # [-]
@@ -312,31 +368,41 @@ class AirParams:
 class ReleaseParams:
     """Release mechanism and the flight that follows.
 
-    The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload separates ``lag``
-    later; with ``lag_tension``, ``lag + lag_tension (pull - m_p g)`` later, not below 0, with the rope's pull at the latch.
-    From the payload's position p and velocity v at separation:
-    ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``; under drag the flight is integrated by RK4.
+    The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload
+    separates ``lag`` later; with ``lag_tension``, ``lag + lag_tension (pull - m_p g)`` later, not
+    below 0, with the rope's pull at the latch. From the payload's position p and velocity v at
+    separation: ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``; under drag the
+    flight is integrated by RK4.
 
     A rope that leaves with the payload shares its momentum: in the mean the payload flies on with
-    ``v + rope_tail (v_c - v)``, v_c the velocity of the common centre of mass. The replay flies the loose rope itself.
-    """
+    ``v + rope_tail (v_c - v)``, v_c the velocity of the common centre of mass. The replay flies the
+    loose rope itself."""
 
     threshold: float  # [-]
     lag: float  # [s]
     landing_height: float  # z of the payload's centre at impact [m]
     clearance_samples: int  # K points of the flight at which the distance to the vehicle is taken
     clearance_margin: float  # d_m [m]
-    lag_tension: float = 0.0  # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
-    kick_w: tuple[float, float, float] = (0.0, 0.0, 0.0)  # speed that the mechanism gives the payload, world frame [m/s]
+    # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
+    lag_tension: float = 0.0
+    kick_w: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # speed that the mechanism gives the payload, world frame [m/s]
     kick_along: float = 0.0  # the same along the rope's last segment, away from the vehicle [m/s]
     rope_tail: float = 0.0  # share of the rope that leaves with the payload [-]
 
     def __post_init__(self) -> None:
-        require("release", self, not_negative="lag rope_tail", finite="lag_tension kick_w kick_along")
+        require(
+            "release", self, not_negative="lag rope_tail", finite="lag_tension kick_w kick_along"
+        )
         if self.rope_tail > 1.0:
             raise ValueError(f"release.rope_tail is {self.rope_tail}; expected a share from 0 to 1")
         if self.clearance_samples < 2:
-            raise ValueError(f"release.clearance_samples is {self.clearance_samples}; expected 2 or more")
+            raise ValueError(
+                f"release.clearance_samples is {self.clearance_samples}; expected 2 or more"
+            )
 
 
 @dataclass(frozen=True)
@@ -355,11 +421,12 @@ class SimParams:
 
 @dataclass(frozen=True)
 class LawParams:
-    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the names of :mod:`sim.kernels.laws`.
+    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the
+    names of :mod:`sim.kernels.laws`.
 
-    It acts on the vehicle (force in the world frame, torque in the body's), on the payload, while it hangs and after, or in the
-    rope's joint at the mount: a torque on the vehicle in the body frame, and the opposite one on the rope.
-    """
+    It acts on the vehicle (force in the world frame, torque in the body's), on the payload, while
+    it hangs and after, or in the rope's joint at the mount: a torque on the vehicle in the body
+    frame, and the opposite one on the rope."""
 
     block: Literal["vehicle force", "vehicle torque", "payload force", "rope joint"]
     factors: tuple[str, ...]  # up to two scalars
@@ -368,7 +435,9 @@ class LawParams:
 
 
 LOWEST = 0.05  # height below which a law's 1/z is held [m]
-SLOWEST = 0.1  # rate of the rope against the vehicle below which a law's dry friction falls to 0 [1/s]
+SLOWEST = (
+    0.1  # rate of the rope against the vehicle below which a law's dry friction falls to 0 [1/s]
+)
 
 
 @dataclass(frozen=True)
@@ -392,15 +461,16 @@ class PlantParams:
 class SensingParams:
     """Motion capture and gyro, as a log holds them. Zero everywhere is an ideal sensor.
 
-    With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of ``marker_rotation`` and the
-    body's attitude R, a sample that carries the stamp t shows the state at
-    ``t - delay - clock_rate (t - start of the flight)``, with the delay of its channel:
+    With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of
+    ``marker_rotation`` and the body's attitude R, a sample that carries the stamp t shows the state
+    at ``t - delay - clock_rate (t - start of the flight)``, with the delay of its channel:
 
-    - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; the origin is that of the frame
-      the vehicle's parameters are stated in, not the centre of mass
+    - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; the
+      origin is that of the frame the vehicle's parameters are stated in, not the centre of mass
     - payload: ``p = (1 + scale) F (p_payload + payload_offset)``
     - gyro: ``w = w_b + gyro_bias``
-    - camera: keypoints with the stamp t show the scene at ``t - camera_delay + camera_line_time * row``
+    - camera: keypoints with the stamp t show the scene at ``t - camera_delay + camera_line_time *
+      row``
     """
 
     vehicle_delay: float = 0.0  # of the vehicle's stamps [s]
@@ -408,7 +478,11 @@ class SensingParams:
     gyro_delay: float = 0.0  # [s]
     clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
     scale: float = 0.0  # of measured lengths [-]
-    frame_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world against the measured frame [rad]
+    frame_tilt: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # world against the measured frame [rad]
     marker_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad]
     marker_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # body frame [m]
     payload_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world frame [m]
@@ -421,9 +495,9 @@ class SensingParams:
 class RandomizationParams:
     """Uniform distributions of an episode's start (the paper, Sec. III-C, "Domain randomization").
 
-    The vehicle starts at ``(0, 0, spawn_height)`` plus offsets; the cable hangs straight from the mount in the direction
-    ``Rz(yaw) Rx(roll) (-z)`` of the body frame, with the two angles' rates on top of the body's.
-    """
+    The vehicle starts at ``(0, 0, spawn_height)`` plus offsets; the cable hangs straight from the
+    mount in the direction ``Rz(yaw) Rx(roll) (-z)`` of the body frame, with the two angles' rates
+    on top of the body's."""
 
     spawn_height: float  # of the vehicle's centre of mass [m]
     position: tuple[float, float, float]  # +- [m]
@@ -436,7 +510,11 @@ class RandomizationParams:
     tether_variants: int  # number of cable lengths, one for each environment for good
     tether_spread: float  # the lengths span +- this fraction
     battery_used: float  # fraction of charge used is drawn from 0 to this
-    goal_radius: float  # goals are uniform on a ground disk of this radius about the spawn point [m]
-    payload_variants: int = 1  # number of payload masses, and of drags, in every combination with the cable lengths
+    goal_radius: (
+        float  # goals are uniform on a ground disk of this radius about the spawn point [m]
+    )
+    payload_variants: int = (
+        1  # number of payload masses, and of drags, in every combination with the cable lengths
+    )
     payload_spread: float = 0.0  # the masses span +- this fraction
     drag_spread: float = 0.0  # the payload's drags span +- this fraction

@@ -1,7 +1,8 @@
-"""QuadSim: a batch of quadrotors without a rope, from the same blocks as the hybrid simulator, by Euler or RK4.
+"""QuadSim: a batch of quadrotors without a rope, from the same blocks as the hybrid simulator, by
+Euler or RK4.
 
-For racing, navigation and system identification, and the small sibling in which a block can be studied alone.
-"""
+For racing, navigation and system identification, and the small sibling in which a block can be
+studied alone."""
 
 import math
 
@@ -18,32 +19,71 @@ from sim.params import GRAVITY, AirParams, VehicleParams
 
 INTEGRATORS = ("euler", "rk4")
 FIELDS = st.QUAD_FIELDS | {"queue": ("vec4", True), "status": ("int", False)}
-START_FIELDS = {k: st.QUAD_FIELDS[k] for k in ("pos_w", "quat_wb", "vel_w", "rate_b", "charge_used")}
+START_FIELDS = {
+    k: st.QUAD_FIELDS[k] for k in ("pos_w", "quat_wb", "vel_w", "rate_b", "charge_used")
+}
 _BUILDS: dict = {}
 
 
 def build_quad_step(t: Types, flow, rate, motor_advance, integrator: str):
-    """Return ``step(p, air, s, command, force_w, torque_b, gravity, h) -> state`` of one integrator.
+    """Return ``step(p, air, s, command, force_w, torque_b, gravity, h) -> state`` of one
+    integrator.
 
-    Source: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, II.1 (the classical method of order 4).
-    """
-    Vehicle, Air, QuadState, vec3, vec4, real = t.Vehicle, t.Air, t.QuadState, t.vec3, t.vec4, t.real
+    Source: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, II.1 (the
+    classical method of order 4)."""
+    Vehicle, Air, QuadState, vec3, vec4, real = (
+        t.Vehicle,
+        t.Air,
+        t.QuadState,
+        t.vec3,
+        t.vec4,
+        t.real,
+    )
 
     @wp.func
-    def slope(p: Vehicle, air: Air, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3):
+    def slope(
+        p: Vehicle,
+        air: Air,
+        s: QuadState,
+        command: vec4,
+        force_w: vec3,
+        torque_b: vec3,
+        gravity: vec3,
+    ):
         f = flow(p, air, s, command)
         acc = (wp.quat_rotate(s.quat_wb, f.force_b) + force_w) / p.body.mass + gravity
-        return rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b + torque_b)), f.motor_speed
+        return (
+            rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b + torque_b)),
+            f.motor_speed,
+        )
 
     @wp.func
-    def euler(p: Vehicle, air: Air, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3, h: real):
+    def euler(
+        p: Vehicle,
+        air: Air,
+        s: QuadState,
+        command: vec4,
+        force_w: vec3,
+        torque_b: vec3,
+        gravity: vec3,
+        h: real,
+    ):
         r, acting = slope(p, air, s, command, force_w, torque_b, gravity)
         out = advance(s, r, h)
         out.motor_speed = motor_advance(out.motor_speed, acting)
         return out
 
     @wp.func
-    def rk4(p: Vehicle, air: Air, s: QuadState, command: vec4, force_w: vec3, torque_b: vec3, gravity: vec3, h: real):
+    def rk4(
+        p: Vehicle,
+        air: Air,
+        s: QuadState,
+        command: vec4,
+        force_w: vec3,
+        torque_b: vec3,
+        gravity: vec3,
+        h: real,
+    ):
         half = real(0.5)
         one = real(1.0)
         r1, _a1 = slope(p, air, s, command, force_w, torque_b, gravity)
@@ -60,7 +100,9 @@ def build_quad_step(t: Types, flow, rate, motor_advance, integrator: str):
 
 
 def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions: frozenset[str]):
-    """Step and reset kernels for one choice of blocks, and their structs of state and start arrays."""
+    """Step and reset kernels for one choice of blocks, and their structs of state and
+    start arrays.
+    """
     real, vec3, vec4, Vehicle, Air = t.real, t.vec3, t.vec4, t.Vehicle, t.Air
     State = st.array_struct(t, "QuadArrays", FIELDS)
     Start = st.array_struct(t, "QuadStart", START_FIELDS)
@@ -133,7 +175,9 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions:
     return quad_step_kernel, quad_reset_kernel, State, Start
 
 
-def _built(precision: str, vehicle: VehicleParams, integrator: str, extensions: frozenset[str]) -> tuple:
+def _built(
+    precision: str, vehicle: VehicleParams, integrator: str, extensions: frozenset[str]
+) -> tuple:
     """Return kernels and structs of a choice of blocks, built once."""
     key = (precision, integrator, kinds_of(vehicle), extensions)
     if key not in _BUILDS:
@@ -142,18 +186,22 @@ def _built(precision: str, vehicle: VehicleParams, integrator: str, extensions: 
 
 
 class QuadSim:
-    """Batched quadrotor: command queue, rate controller, motors, battery, aerodynamics, external wrench.
+    """Batched quadrotor: command queue, rate controller, motors, battery, aerodynamics, external
+    wrench.
 
-    All arrays live on the device and keep their addresses for life, so a captured graph of ``step`` or ``reset`` stays
-    valid. Bit :data:`sim.kernels.state.NONFINITE` of ``state.status`` tells that a step led to a bad state and was undone, or
-    that its command was not finite and the last one was held.
+    All arrays live on the device and keep their addresses for life, so a captured graph of ``step``
+    or ``reset`` stays valid. Bit :data:`sim.kernels.state.NONFINITE` of ``state.status`` tells that
+    a step led to a bad state and was undone, or that its command was not finite and the last one
+    was held.
 
     Attributes:
         command: collective thrust [N] and body rates [rad/s] of the next step, shape (E,) of vec4.
-        force_w: external force at the centre of mass [N], shape (E,) of vec3, world frame; held over a step.
+        force_w: external force at the centre of mass [N], shape (E,) of vec3, world frame; held
+            over a step.
         torque_b: external torque about it [N m], shape (E,) of vec3, body frame.
         state: arrays of :data:`FIELDS`.
-        start: arrays of :data:`START_FIELDS`, to which ``reset`` puts an environment back; may be written to.
+        start: arrays of :data:`START_FIELDS`, to which ``reset`` puts an environment back; may be
+            written to.
     """
 
     def __init__(
@@ -172,14 +220,15 @@ class QuadSim:
     ):
         """Allocate ``count`` quadrotors at the origin, in hover.
 
-        Raises ValueError: no environment, an unknown integrator or precision, a step or period that is not positive, vehicles of other
-        kinds of blocks, or an unphysical parameter.
+        Raises ValueError: no environment, an unknown integrator or precision, a step or period that
+        is not positive, vehicles of other kinds of blocks, or an unphysical parameter.
 
         Args:
             vehicle: its kinds of blocks hold for all.
             count: number of environments E.
             integrator: "euler" or "rk4".
-            step: largest integration step [s]; steps end on command switches. Full-range commands keep the mixer at its
+            step: largest integration step [s]; steps end on command switches. Full-range commands
+                keep the mixer at its
                 limits: after a second of them RK4 is 0.6 mm off at 2 ms, 0.04 mm at 0.5 ms.
             control_period: time that :meth:`step` advances [s].
             device: Warp device, "cpu" or "cuda:0".
@@ -214,15 +263,30 @@ class QuadSim:
         self.place(np.zeros((count, 3)))
 
     def step(self) -> None:
-        """Advance every quadrotor by one control period under ``command``, ``force_w`` and ``torque_b``."""
-        given = [self._vehicles, self._airs, self.control_period, self.integration_step, self.gravity]
+        """Advance every quadrotor by one control period under ``command``, ``force_w`` and
+        ``torque_b``.
+        """
+        given = [
+            self._vehicles,
+            self._airs,
+            self.control_period,
+            self.integration_step,
+            self.gravity,
+        ]
         given += [self.state, self.command, self.force_w, self.torque_b]
         wp.launch(self._step, self.count, given, device=self.device)
 
     def reset(self, mask: wp.array | None = None) -> None:
-        """Put environments back to ``start``, in hover, where ``mask`` (shape (E,), int) is non-zero; all without one."""
+        """Put environments back to ``start``, in hover, where ``mask`` (shape (E,), int) is
+        non-zero; all without one.
+        """
         mask = self._all if mask is None else mask
-        wp.launch(self._reset, self.count, [self._vehicles, self.gravity, self.state, self.start, mask], device=self.device)
+        wp.launch(
+            self._reset,
+            self.count,
+            [self._vehicles, self.gravity, self.state, self.start, mask],
+            device=self.device,
+        )
 
     def place(
         self,
@@ -232,7 +296,9 @@ class QuadSim:
         rate_b: np.ndarray | None = None,
         battery_used: float = 0.0,
     ) -> None:
-        """Set ``start`` for every environment and reset all. Raises ValueError: a shape that does not fit.
+        """Set ``start`` for every environment and reset all.
+
+        Raises ValueError: a shape that does not fit.
 
         Args:
             pos_w: [m], shape (E, 3).
@@ -242,21 +308,40 @@ class QuadSim:
             battery_used: fraction of charge used.
         """
         zero = np.zeros(3)
-        given = {"pos_w": (pos_w, zero), "quat_wb": (quat_wb, st.LEVEL), "vel_w": (vel_w, zero), "rate_b": (rate_b, zero)}
+        given = {
+            "pos_w": (pos_w, zero),
+            "quat_wb": (quat_wb, st.LEVEL),
+            "vel_w": (vel_w, zero),
+            "rate_b": (rate_b, zero),
+        }
         st.put(self.types, self.start, given, self.count)
         self.start.charge_used.fill_(battery_used)
         self.reset()
 
     def set_command(self, command: np.ndarray) -> None:
-        """Copy commands [N, rad/s], shape (E, 4), to the device. Raises ValueError for another shape."""
+        """Copy commands [N, rad/s], shape (E, 4), to the device.
+
+        Raises ValueError for another shape.
+        """
         st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
 
     def set_wrench(self, force_w: np.ndarray, torque_b: np.ndarray) -> None:
-        """Copy the external wrench [N], [N m], shapes (E, 3), to the device. Raises ValueError for another shape."""
-        st.put(self.types, self, {"force_w": (force_w, np.zeros(3)), "torque_b": (torque_b, np.zeros(3))}, self.count)
+        """Copy the external wrench [N], [N m], shapes (E, 3), to the device.
+
+        Raises ValueError for another shape.
+        """
+        st.put(
+            self.types,
+            self,
+            {"force_w": (force_w, np.zeros(3)), "torque_b": (torque_b, np.zeros(3))},
+            self.count,
+        )
 
     def get(self, name: str) -> np.ndarray:
-        """Copy of a state array by name, shape (E, ...); the queue (E, D, 4). Raises ValueError for an unknown name."""
+        """Copy of a state array by name, shape (E, ...); the queue (E, D, 4).
+
+        Raises ValueError for an unknown name.
+        """
         if name not in FIELDS:
             raise ValueError(f"no array {name!r}; there are {sorted(FIELDS)}")
         return st.fetched(getattr(self.state, name), FIELDS[name][1])

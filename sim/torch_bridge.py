@@ -1,4 +1,6 @@
-"""The one bridge between the simulator's Warp arrays and torch tensors: views of the same memory, no copies."""
+"""The one bridge between the simulator's Warp arrays and torch tensors: views of the same memory,
+no copies.
+"""
 
 import gc
 from collections.abc import Callable
@@ -16,25 +18,39 @@ class TorchViews:
 
     Attributes:
         command: shape (E, 4), writable. release: shape (E,), int32, writable. goal_w: shape (E, 3).
-        state, out, foreseen: dictionaries of the state and output arrays: (E, 3), (E,), (L, E, 3), ...
+        state, out, foreseen: dictionaries of the state and output arrays: (E, 3), (E,), (L, E, 3),
+            ...
     """
 
     def __init__(self, sim: HybridSim):
         self.command = wp.to_torch(sim.command, requires_grad=False)
         self.release = wp.to_torch(sim.release, requires_grad=False)
         self.goal_w = wp.to_torch(sim.goal_w, requires_grad=False)
-        self.state = {name: wp.to_torch(getattr(sim.state, name), requires_grad=False) for name in st.STATE_FIELDS}
+        self.state = {
+            name: wp.to_torch(getattr(sim.state, name), requires_grad=False)
+            for name in st.STATE_FIELDS
+        }
         self.out, self.foreseen = (
-            {name: wp.to_torch(getattr(out, name), requires_grad=False) for name in st.OUTPUT_FIELDS} for out in (sim.out, sim.foreseen)
+            {
+                name: wp.to_torch(getattr(out, name), requires_grad=False)
+                for name in st.OUTPUT_FIELDS
+            }
+            for out in (sim.out, sim.foreseen)
         )
 
 
 def on_torch_stream(device: str):
-    """Context in which Warp launches on torch's current stream, so that both can be captured in one CUDA graph."""
+    """Context in which Warp launches on torch's current stream, so that both can be captured in one
+    CUDA graph.
+    """
     if not device.startswith("cuda"):
         return wp.ScopedDevice(device)
-    capturing = torch.cuda.is_current_stream_capturing()  # a capture may not wait for another stream
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing)
+    capturing = (
+        torch.cuda.is_current_stream_capturing()
+    )  # a capture may not wait for another stream
+    return wp.ScopedStream(
+        wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing
+    )
 
 
 def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
@@ -57,7 +73,8 @@ def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
 
 
 class Replayed:
-    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and replayed, on a stream of its own.
+    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and
+    replayed, on a stream of its own.
 
     For work without autograd: capturing that failed on an H200 (cudaErrorStreamCaptureUnsupported).
     """

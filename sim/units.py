@@ -1,8 +1,8 @@
-"""Other units of length, mass and time for the same plant: what makes vehicles of any size comparable.
+"""Other units of length, mass and time for the same plant: what makes vehicles of any size
+comparable.
 
-With a unit of time that is the square root of the unit of length, gravity keeps its number, so that a plant in other units
-is flown by the same equations with the same gravity. Volts stay volts.
-"""
+With a unit of time that is the square root of the unit of length, gravity keeps its number, so that
+a plant in other units is flown by the same equations with the same gravity. Volts stay volts."""
 
 import dataclasses
 import math
@@ -25,35 +25,60 @@ PLANT: dict[str, dict[Dimension, str]] = {
     "RotorParams": {LENGTH: "x y z radius", NONE: "spin", INERTIA: "inertia"},
     "QueueParams": {TIME: "delay"},
     "ControllerParams": {
-        NONE: "kind voltage_compensation calibration_voltage gyro_share", ANGULAR_DAMPING: "p_gain", TORQUE: "i_gain integral_limit",
-        INERTIA: "d_gain feedforward_gain", TIME: "setpoint_time_constant gyro_time_constant",
-        FORCE: "min_thrust max_thrust mix_thrust", RATE: "geometric_gain relax_threshold",
+        NONE: "kind voltage_compensation calibration_voltage gyro_share",
+        ANGULAR_DAMPING: "p_gain",
+        TORQUE: "i_gain integral_limit",
+        INERTIA: "d_gain feedforward_gain",
+        TIME: "setpoint_time_constant gyro_time_constant",
+        FORCE: "min_thrust max_thrust mix_thrust",
+        RATE: "geometric_gain relax_threshold",
     },
     "MotorParams": {NONE: "kind", TIME: "time_constant time_constant_down"},
     "BatteryParams": {
-        NONE: "kind ocv efficiency reference_voltage", (2, 1, -2): "capacity", (-2, -1, 3): "resistance", TIME: "time_constant",
+        NONE: "kind ocv efficiency reference_voltage",
+        (2, 1, -2): "capacity",
+        (-2, -1, 3): "resistance",
+        TIME: "time_constant",
         POWER: "idle_power",
     },
-    "ThrustParams": {(1, 1, 0): "k_f", (1, 1, -1): "k_1", NONE: "voltage_coefficient gain torque_gain", LENGTH: "torque_ratio"},
+    "ThrustParams": {
+        (1, 1, 0): "k_f",
+        (1, 1, -1): "k_1",
+        NONE: "voltage_coefficient gain torque_gain",
+        LENGTH: "torque_ratio",
+    },
     "AeroParams": {
-        NONE: "kind", DAMPING: "drag_x drag_y drag_z", AREA_DRAG: "parasitic", PER_SPEED: "inflow torque_inflow",
-        (-2, 0, 2): "translational_lift", TIME: "flapping",
+        NONE: "kind",
+        DAMPING: "drag_x drag_y drag_z",
+        AREA_DRAG: "parasitic",
+        PER_SPEED: "inflow torque_inflow",
+        (-2, 0, 2): "translational_lift",
+        TIME: "flapping",
     },
     "VehicleParams": {LENGTH: "collision_radius"},
     "RopeParams": {
-        NONE: "segments downwash", LENGTH: "length payload_offset payload_radius mount", MASS: "rope_mass payload_mass",
-        INERTIA: "payload_inertia", ANGULAR_DAMPING: "joint_damping mount_damping", DAMPING: "swing_damping",
-        AREA_DRAG: "payload_drag payload_side payload_lift", (0, -1, 2): "compliance",
+        NONE: "segments downwash",
+        LENGTH: "length payload_offset payload_radius mount",
+        MASS: "rope_mass payload_mass",
+        INERTIA: "payload_inertia",
+        ANGULAR_DAMPING: "joint_damping mount_damping",
+        DAMPING: "swing_damping",
+        AREA_DRAG: "payload_drag payload_side payload_lift",
+        (0, -1, 2): "compliance",
     },
     "ReleaseParams": {
-        NONE: "threshold clearance_samples rope_tail", TIME: "lag", LENGTH: "landing_height clearance_margin",
-        (-1, -1, 3): "lag_tension", SPEED: "kick_w kick_along",
+        NONE: "threshold clearance_samples rope_tail",
+        TIME: "lag",
+        LENGTH: "landing_height clearance_margin",
+        (-1, -1, 3): "lag_tension",
+        SPEED: "kick_w kick_along",
     },
     "SimParams": {TIME: "control_period substep", NONE: "gamma max_turn precision"},
     "AirParams": {SPEED: "wind_w", NONE: "ground_effect"},
     "PlantParams": {},
-}  # fmt: skip
-"""Dimensions of all fields of a plant that are no table themselves, a table of `sim.params` each."""
+}
+"""Dimensions of all fields of a plant that are no table themselves, a table of `sim.params` each.
+"""
 
 
 @dataclass(frozen=True)
@@ -79,13 +104,18 @@ class Units:
         return Units(1.0 / self.length, 1.0 / self.mass)
 
 
-def in_units(value: Value, units: Units, dimensions: Mapping[str, Mapping[Dimension, str]] = PLANT) -> Value:
+def in_units(
+    value: Value, units: Units, dimensions: Mapping[str, Mapping[Dimension, str]] = PLANT
+) -> Value:
     """Dataclass of SI values with its numbers stated in other units, tables in it too.
 
-    Raises ValueError: a field whose dimension is not told, or a plant with laws, whose coefficients have none of their own.
-    """
+    Raises ValueError: a field whose dimension is not told, or a plant with laws, whose coefficients
+    have none of their own."""
     if isinstance(value, PlantParams) and value.laws:
-        raise ValueError(f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients have no dimension")
+        raise ValueError(
+            f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients"
+            " have no dimension"
+        )
     own = dimensions.get(type(value).__name__, {})
     known = {name: dimension for dimension, names in own.items() for name in names.split()}
 
@@ -95,7 +125,9 @@ def in_units(value: Value, units: Units, dimensions: Mapping[str, Mapping[Dimens
         if item == ():
             return item
         if name not in known:
-            raise ValueError(f"{type(value).__name__}.{name}: no dimension told; there are {sorted(known)}")
+            raise ValueError(
+                f"{type(value).__name__}.{name}: no dimension told; there are {sorted(known)}"
+            )
         if known[name] == NONE:
             return item
         size = units.size(known[name])

@@ -1,4 +1,5 @@
-"""A small renderer of fisheye frames in torch, written before `camera.detectors.scenes` and without it: one ray a pixel, no noise.
+"""A small renderer of fisheye frames in torch, written before `camera.detectors.scenes` and without
+it: one ray a pixel, no noise.
 
 Ground plane z = 0 with a chequered texture, goal square, ball.
 """
@@ -42,15 +43,17 @@ def pixel_rays(lens: Fisheye, supersample: int = 1) -> tuple[torch.Tensor, torch
         supersample: Samples a pixel along each axis.
 
     Returns:
-        Unit rays, float64, shape (H s, W s, 3), camera frame, and whether the sample is inside the field of view, shape
-        (H s, W s).
+        Unit rays, float64, shape (H s, W s, 3), camera frame, and whether the sample is inside the
+        field of view, shape (H s, W s).
     """
     return _pixel_rays(lens.params, supersample)
 
 
 @lru_cache(maxsize=2)
 def _pixel_rays(params: FisheyeParams, s: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """`pixel_rays`, kept from frame to frame: the inverse of the lens costs more than the rest of a frame."""
+    """`pixel_rays`, kept from frame to frame: the inverse of the lens costs more than the rest of a
+    frame.
+    """
     u = (torch.arange(params.width * s, dtype=torch.float64) + 0.5) / s - 0.5
     v = (torch.arange(params.height * s, dtype=torch.float64) + 0.5) / s - 0.5
     grid = torch.stack([u[None, :].expand(len(v), -1), v[:, None].expand(-1, len(u))], -1)
@@ -93,7 +96,11 @@ def render_scene(
     ground_w = eye_w + rays_w * depth.unsqueeze(-1)
     ground = _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, clutter)
     colour = torch.where((down & (depth > 0.0)).unsqueeze(-1), ground, colour)
-    balls = [(torch.tensor(c.centre_w, dtype=torch.float64), c.size[0], _rgb(*c.colour)) for c in clutter if c.shape == "ball"]
+    balls = [
+        (torch.tensor(c.centre_w, dtype=torch.float64), c.size[0], _rgb(*c.colour))
+        for c in clutter
+        if c.shape == "ball"
+    ]
     balls.sort(key=lambda found: -float((found[0] - eye_w).norm()))  # the nearest is drawn last
     for centre_w, radius, felt in balls:
         hit, normal_w = _sphere(eye_w, rays_w, centre_w, radius)
@@ -121,8 +128,9 @@ def _sky(rays_w: torch.Tensor) -> torch.Tensor:
 
 
 def _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, clutter) -> torch.Tensor:
-    """Tiles that fade with the distance (no aliasing near the horizon), clutter, the goal square with its rim, the
-    ball's shadow."""
+    """Tiles that fade with the distance (no aliasing near the horizon), clutter, the goal square
+    with its rim, the ball's shadow.
+    """
     tile = (ground_w[..., :2] / TILE).floor().sum(-1) % 2
     fade = (-depth / 6.0).exp()
     shade = GROUND_DARK + (GROUND_LIGHT - GROUND_DARK) * (0.5 + (tile - 0.5) * fade)
@@ -130,14 +138,22 @@ def _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, clutter) ->
     for thing in clutter:
         if thing.shape == "ball":
             continue
-        x, y = (ground_w[..., :2] - torch.tensor(thing.centre_w[:2], dtype=torch.float64)).unbind(-1)
+        x, y = (ground_w[..., :2] - torch.tensor(thing.centre_w[:2], dtype=torch.float64)).unbind(
+            -1
+        )
         c, s = math.cos(thing.yaw), math.sin(thing.yaw)
         across, along = (c * x + s * y) / thing.size[0], (c * y - s * x) / thing.size[1]
-        covered = across**2 + along**2 < 1.0 if thing.shape == "disc" else torch.maximum(across.abs(), along.abs()) < 1.0
+        covered = (
+            across**2 + along**2 < 1.0
+            if thing.shape == "disc"
+            else torch.maximum(across.abs(), along.abs()) < 1.0
+        )
         colour = torch.where(covered.unsqueeze(-1), _rgb(*thing.colour), colour)
     reach = (ground_w[..., :2] - goal_w[:2].double()).abs().amax(-1)
     colour = torch.where((reach < goal_side / 2).unsqueeze(-1), _rgb(0.93, 0.93, 0.90), colour)
-    colour = torch.where((reach < goal_side / 2 - 0.02).unsqueeze(-1), _rgb(0.16, 0.55, 0.26), colour)
+    colour = torch.where(
+        (reach < goal_side / 2 - 0.02).unsqueeze(-1), _rgb(0.16, 0.55, 0.26), colour
+    )
     away = (ground_w[..., :2] - ball_w[:2].double()).norm(dim=-1)
     shadow = 1.0 - 0.45 * (-((away / (1.5 * ball_radius)) ** 2)).exp()
     return colour * shadow.unsqueeze(-1)

@@ -1,4 +1,6 @@
-"""Logs of flights in the project's own simulator, for tests of what replays them: free flights and throws, 200 Hz."""
+"""Logs of flights in the project's own simulator, for tests of what replays them: free flights and
+throws, 200 Hz.
+"""
 
 import dataclasses
 
@@ -26,29 +28,43 @@ def setting_with(theta: dict[str, float], plant: PlantParams | None = None) -> S
 
 
 def fly(
-    setting: Setting, seed: int = 0, free: int = 2, throws: int = 2, seconds: float = 4.0, noise: float = 1.0, lost: float = 0.0
+    setting: Setting,
+    seed: int = 0,
+    free: int = 2,
+    throws: int = 2,
+    seconds: float = 4.0,
+    noise: float = 1.0,
+    lost: float = 0.0,
 ) -> list[FlightLog]:
     """Fly a plant and record it as motion capture would.
 
     Args:
-        setting: plant and sensors; delays of sensors are not simulated here, frames and markers are not either.
+        setting: plant and sensors; delays of sensors are not simulated here, frames and markers are
+            not either.
         seed: of references and noise.
         free: number of free flights.
         throws: of throws.
         seconds: of a free flight [s].
         noise: times :data:`NOISE`.
-        lost: share of the commands that never arrive, where the last one stays; the log holds what was sent.
+        lost: share of the commands that never arrive, where the last one stays; the log holds what
+            was sent.
     """
     rng = np.random.default_rng(seed)
     references = [FreeFlight(rng) for _ in range(free)]
-    references += [Throw(rng, speed, rng.uniform(-np.pi, np.pi)) for speed in np.linspace(6.0, 10.0, throws)]
+    references += [
+        Throw(rng, speed, rng.uniform(-np.pi, np.pi)) for speed in np.linspace(6.0, 10.0, throws)
+    ]
     plant = setting.plant
     steps = dataclasses.replace(plant.sim, control_period=TICK, substep=FINE, precision="float64")
     sim = HybridSim(dataclasses.replace(plant, sim=steps), len(references), extensions=EVERYTHING)
     known = paper_plant()
-    pilot = Tracker(references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng)
+    pilot = Tracker(
+        references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng
+    )
     sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=0.2)
-    tracks: dict[str, list] = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")}
+    tracks: dict[str, list] = {
+        name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")
+    }
     separated = np.full(len(references), np.inf)
     left, link, arrived = [None] * len(references), np.random.default_rng([seed, 1]), None
     ticks = round(max(seconds, 2.6) / TICK)
@@ -56,7 +72,9 @@ def fly(
         t = k * TICK
         if k % RATIO == 0:
             quat = sim.get("quat_wb")[:, [3, 0, 1, 2]]
-            command = pilot.command(t, sim.get("pos_w"), sim.get("vel_w"), quat, sim.get("attached") != 0)
+            command = pilot.command(
+                t, sim.get("pos_w"), sim.get("vel_w"), quat, sim.get("attached") != 0
+            )
             tracks["command"].append(command)
             tracks["voltage"].append(sim.get("voltage"))
             gone = link.random((len(references), 1)) < lost
@@ -70,20 +88,37 @@ def fly(
         for e in np.flatnonzero(np.isfinite(separated)):
             gone = np.array([t + TICK - separated[e]])
             ball[e] = flown(plant.rope, plant.air, *(x[None] for x in left[e]), gone)[0][0]
-        for name, value in (("pos_w", sim.get("pos_w")), ("quat_wb", sim.get("quat_wb")), ("payload_pos_w", ball)):
+        for name, value in (
+            ("pos_w", sim.get("pos_w")),
+            ("quat_wb", sim.get("quat_wb")),
+            ("payload_pos_w", ball),
+        ):
             tracks[name].append(value.copy())
     times = TICK * np.arange(1, ticks + 1)
-    return [_log(setting, references[e], {n: np.array(v)[:, e] for n, v in tracks.items()}, times, noise, rng)
-            for e in range(len(references))]  # fmt: skip
+    return [
+        _log(
+            setting,
+            references[e],
+            {n: np.array(v)[:, e] for n, v in tracks.items()},
+            times,
+            noise,
+            rng,
+        )
+        for e in range(len(references))
+    ]
 
 
-def _log(setting: Setting, reference, track: dict, times: np.ndarray, noise: float, rng) -> FlightLog:
+def _log(
+    setting: Setting, reference, track: dict, times: np.ndarray, noise: float, rng
+) -> FlightLog:
     from scipy.spatial.transform import Rotation
 
     x, com = setting.sensing, np.array(setting.plant.vehicle.body.com)
     turned = Rotation.from_quat(track["quat_wb"])
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
-    pos = frame.apply(track["pos_w"] + turned.apply(np.array(x.marker_offset) - com)) * (1 + x.scale)
+    pos = frame.apply(track["pos_w"] + turned.apply(np.array(x.marker_offset) - com)) * (
+        1 + x.scale
+    )
     ball = frame.apply(track["payload_pos_w"] + np.array(x.payload_offset)) * (1 + x.scale)
     seen = frame * turned * marker
     count = len(times)

@@ -1,4 +1,6 @@
-"""Byte strings and messages that nobody meant: what the links' tests throw at them, each drawn from a seed that is kept."""
+"""Byte strings and messages that nobody meant: what the links' tests throw at them, each drawn from
+a seed that is kept.
+"""
 
 import numpy as np
 from pymavlink.generator.mavcrc import x25crc
@@ -6,7 +8,10 @@ from pymavlink.generator.mavcrc import x25crc
 from hil.links.pymav import mav
 
 SEEDS, EACH = tuple(range(1, 11)), 100_000
-"""Of the long tests: ten seeds of a hundred thousand each make the million, and run side by side. Seed 0 is the short tests'."""
+"""Of the long tests: ten seeds of a hundred thousand each make the million, and run side by side.
+
+Seed 0 is the short tests'.
+"""
 
 
 KINDS = tuple(sorted(mav.mavlink_map))
@@ -14,7 +19,9 @@ KINDS = tuple(sorted(mav.mavlink_map))
 
 
 def framed(kind, body: bytes, ids: tuple[int, int] = (1, 1)) -> bytes:
-    """A message, of the vehicle by its ids, with a right checksum over any content, so that its fields reach whoever listens."""
+    """A message, of the vehicle by its ids, with a right checksum over any content, so that its
+    fields reach whoever listens.
+    """
     number = kind.id
     head = bytes([len(body), 0, 0, 0, *ids])
     head += bytes([number & 255, number >> 8 & 255, number >> 16 & 255])
@@ -22,7 +29,9 @@ def framed(kind, body: bytes, ids: tuple[int, int] = (1, 1)) -> bytes:
     return bytes([mav.PROTOCOL_MARKER_V2]) + head + body + crc.crc.to_bytes(2, "little")
 
 
-def any_message(rng: np.random.Generator, kinds: tuple[int, ...] = KINDS, ids: tuple[int, int] = (1, 1)) -> bytes:
+def any_message(
+    rng: np.random.Generator, kinds: tuple[int, ...] = KINDS, ids: tuple[int, int] = (1, 1)
+) -> bytes:
     """A message of one of the kinds with any bits in its fields."""
     kind = mav.mavlink_map[kinds[rng.integers(len(kinds))]]
     return framed(kind, rng.bytes(kind.unpacker.size), ids)
@@ -34,7 +43,9 @@ def noise(rng: np.random.Generator) -> bytes:
 
 
 def mutated(rng: np.random.Generator, good: list[bytes]) -> bytes:
-    """Return one of some messages with up to five bytes changed, cut, or run together with another."""
+    """Return one of some messages with up to five bytes changed, cut, or run together
+    with another.
+    """
     data = bytearray(good[rng.integers(len(good))])
     for _ in range(int(rng.integers(0, 6))):
         data[rng.integers(len(data))] = rng.integers(256)

@@ -1,4 +1,6 @@
-"""A vehicle of a few lines for tests of the runner: rates and thrust are followed at once, the payload hangs straight."""
+"""A vehicle of a few lines for tests of the runner: rates and thrust are followed at once, the
+payload hangs straight.
+"""
 
 import math
 from collections.abc import Callable
@@ -26,14 +28,23 @@ OURS = tuple(
 
 def params(*overrides: str) -> HilParams:
     """The shipped dry run, in our frames and without a delay."""
-    given = (*OURS, "policy=state", "observe=false", "delay.source=0.0", "aim.bound=9.0", *overrides)  # releases in hover
+    given = (
+        *OURS,
+        "policy=state",
+        "observe=false",
+        "delay.source=0.0",
+        "aim.bound=9.0",
+        *overrides,
+    )  # releases in hover
     return config.load(HilParams, config.find("hil", "dry_run"), given)
 
 
 def simple_policy(action=(0.0, 0.0, 0.0, 0.0, 1.0), layout="state") -> Policy:
     """A network that always says the same; hover needs a first number of about -0.13."""
     shipped = Policy.load(find_policy(layout))
-    return Policy((torch.zeros(5, shipped.obs_dim),), (torch.tensor(action),), "relu", shipped.contract)
+    return Policy(
+        (torch.zeros(5, shipped.obs_dim),), (torch.tensor(action),), "relu", shipped.contract
+    )
 
 
 class Vehicle:
@@ -63,7 +74,9 @@ class Vehicle:
             self.payload_vel = self.payload_vel - [0.0, 0.0, 9.81 * dt]
 
     def poses(self, hang: float) -> list[Pose]:
-        """Return poses of both bodies; a tenth of a millimetre of noise keeps their content fresh."""
+        """Return poses of both bodies; a tenth of a millimetre of noise keeps their
+        content fresh.
+        """
         noise = 1e-4 * self.rng.standard_normal((2, 3))
         ball = self.pos - [0.0, 0.0, hang] if self.payload is None else self.payload
         return [
@@ -105,22 +118,32 @@ def fly(
     seconds: float,
     poses: Callable[[float, list[Pose]], list[Pose]] = lambda time, poses: poses,
     status: Callable[[float], Status] = lambda time: Status(True),
-    words: Callable[[float, str], OperatorInput] = lambda time, state: OperatorInput(arm=state == "ready"),
+    words: Callable[[float, str], OperatorInput] = lambda time, state: OperatorInput(
+        arm=state == "ready"
+    ),
     late: Callable[[float], float] = lambda time: 0.0,
     watch: Callable[[float, Decision], None] | None = None,
     recording: Callable[[float], bool] = lambda time: True,
 ) -> list[Decision]:
-    """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` spoil what the runner is told."""
+    """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` spoil what the
+    runner is told.
+    """
     vehicle, decisions, command = Vehicle(), [], None
     waiting: list[Pose] = []
     mass = (runner.mass, runner.alone)
     while vehicle.time < seconds and runner.machine.state != "done":
         now = vehicle.time + late(vehicle.time)
-        decision = runner.tick(now, waiting, status(now), words(now, runner.machine.state), recording(now))
+        decision = runner.tick(
+            now, waiting, status(now), words(now, runner.machine.state), recording(now)
+        )
         decisions.append(decision)
         if watch is not None:
             watch(now, decision)
-        command = decision.command or (command if decision.state == "abort" else None) or (mass[0] * 9.81, 0, 0, 0)
+        command = (
+            decision.command
+            or (command if decision.state == "abort" else None)
+            or (mass[0] * 9.81, 0, 0, 0)
+        )
         released = bool(runner.backend.release_times) and now >= runner.backend.release_times[0]
         waiting = []
         for _ in range(SUBSTEPS):

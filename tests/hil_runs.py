@@ -1,4 +1,6 @@
-"""Folders of runs for tests: the vehicle of `tests.hil_flight`, recorded tick by tick as the command records them."""
+"""Folders of runs for tests: the vehicle of `tests.hil_flight`, recorded tick by tick as the
+command records them.
+"""
 
 from pathlib import Path
 
@@ -20,8 +22,13 @@ def saved_policy(folder: Path, action=AT_ONCE, layout="vision") -> str:
     return f'policy="{path}"'
 
 
-def record_run(folder: Path, *overrides: str, seconds: float = 8.0, close: bool = True, **spoiled) -> list[Decision]:
-    """Fly and record; see `tests.hil_flight.fly` for what can be spoiled. Without ``close`` the run ends as if killed."""
+def record_run(
+    folder: Path, *overrides: str, seconds: float = 8.0, close: bool = True, **spoiled
+) -> list[Decision]:
+    """Fly and record; see `tests.hil_flight.fly` for what can be spoiled.
+
+    Without ``close`` the run ends as if killed.
+    """
     wanted = params(*overrides)
     runner = Runner(wanted, Policy.load(find_policy(wanted.policy)), Spy())
     recorder, decisions = Recorder(folder, wanted), []

@@ -1,4 +1,6 @@
-"""Calibration files of other tools, as they write them, with a field of view beside; for tests of `camera.calibrate.files`."""
+"""Calibration files of other tools, as they write them, with a field of view beside; for tests of
+`camera.calibrate.files`.
+"""
 
 import json
 from pathlib import Path
@@ -50,16 +52,28 @@ def write_ros(path: str | Path, fisheye: FisheyeParams) -> None:
         "camera_matrix": {"rows": 3, "cols": 3, "data": _matrix(fisheye)},
         "distortion_model": "equidistant",
         "distortion_coefficients": {"rows": 1, "cols": 4, "data": list(fisheye.coefficients)},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]},
+        "rectification_matrix": {
+            "rows": 3,
+            "cols": 3,
+            "data": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        },
+        "projection_matrix": {
+            "rows": 3,
+            "cols": 4,
+            "data": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        },
     }
     _dump_yaml(path, tree)
 
 
 def write_basalt(path: str | Path, fisheye: FisheyeParams) -> None:
-    """Write a basalt JSON of one ``kb4`` camera at the IMU; sensor noise is left zero for its owner to fill in."""
+    """Write a basalt JSON of one ``kb4`` camera at the IMU; sensor noise is left zero for its owner
+    to fill in.
+    """
     pose = {"px": 0.0, "py": 0.0, "pz": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "qw": 1.0}
-    values = {name: getattr(fisheye, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")}
+    values = {
+        name: getattr(fisheye, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+    }
     tree = {
         "T_imu_cam": [pose],
         "intrinsics": [{"camera_type": "kb4", "intrinsics": values, "fov_deg": fisheye.fov_deg}],
@@ -67,7 +81,11 @@ def write_basalt(path: str | Path, fisheye: FisheyeParams) -> None:
         "calib_accel_bias": [0.0] * 9,
         "calib_gyro_bias": [0.0] * 12,
         "imu_update_rate": 200.0,
-        **{f"{sensor}_{kind}_std": [0.0] * 3 for sensor in ("accel", "gyro") for kind in ("noise", "bias")},
+        **{
+            f"{sensor}_{kind}_std": [0.0] * 3
+            for sensor in ("accel", "gyro")
+            for kind in ("noise", "bias")
+        },
         "cam_time_offset_ns": 0,
         "vignette": [],
     }

@@ -1,4 +1,5 @@
-"""A plant of a few lines: it stands in the air whatever it is told, and drops the payload at its feet.
+"""A plant of a few lines: it stands in the air whatever it is told, and drops the payload at its
+feet.
 
 For what concerns protocol, faults and time alone: no simulator is needed for it.
 """
@@ -18,7 +19,8 @@ class LevelPlant:
     """See `hil.fakes.base.WirePlant`.
 
     Attributes:
-        released: when the release came [s]. commands: all that it was told, the last ones of a long flight.
+        released: when the release came [s]. commands: all that it was told, the last ones of a long
+            flight.
     """
 
     period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
@@ -48,9 +50,13 @@ class LevelPlant:
         ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
         level = np.array([0.0, 0.0, 0.0, 1.0])
         return {
-            "pos_w": self.home_w, "quat_wb": level, "vel_w": np.zeros(3), "rate_b": np.zeros(3), "payload_pos_w": ball,
+            "pos_w": self.home_w,
+            "quat_wb": level,
+            "vel_w": np.zeros(3),
+            "rate_b": np.zeros(3),
+            "payload_pos_w": ball,
             "attached": np.array(hangs),
-        }  # fmt: skip
+        }
 
     @property
     def landing(self) -> dict[str, Any]:

@@ -1,9 +1,22 @@
-"""Writers of small autopilot logs, byte by byte after their formats' descriptions, for tests of the readers."""
+"""Writers of small autopilot logs, byte by byte after their formats' descriptions, for tests of the
+readers.
+"""
 
 import struct
 from pathlib import Path
 
-DATAFLASH = {"Q": "Q", "I": "I", "L": "i", "f": "f", "c": "h", "C": "H", "e": "i", "B": "B", "b": "b", "h": "h"}
+DATAFLASH = {
+    "Q": "Q",
+    "I": "I",
+    "L": "i",
+    "f": "f",
+    "c": "h",
+    "C": "H",
+    "e": "i",
+    "B": "B",
+    "b": "b",
+    "h": "h",
+}
 SCALED = {"c": 100, "C": 100, "e": 100, "L": 10_000_000}
 FMT = 128
 
@@ -15,8 +28,12 @@ ATT = ("Qffffff", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw")
 ORGN = ("QBLLe", "TimeUS,Type,Lat,Lng,Alt")
 
 
-def write_bin(path: Path, formats: dict[str, tuple[str, str]], rows: list[tuple[str, tuple]]) -> None:
-    """A dataflash log: an FMT record a message, then the messages, values in the units of their names."""
+def write_bin(
+    path: Path, formats: dict[str, tuple[str, str]], rows: list[tuple[str, tuple]]
+) -> None:
+    """A dataflash log: an FMT record a message, then the messages, values in the units of their
+    names.
+    """
     types = {name: 130 + i for i, name in enumerate(formats)}
     out = [_fmt(FMT, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89)]
     for name, (kinds, columns) in formats.items():
@@ -24,7 +41,9 @@ def write_bin(path: Path, formats: dict[str, tuple[str, str]], rows: list[tuple[
         out.append(_fmt(types[name], name, kinds, columns, size))
     for name, values in rows:
         kinds = formats[name][0]
-        numbers = [round(v * SCALED[k]) if k in SCALED else v for k, v in zip(kinds, values, strict=True)]
+        numbers = [
+            round(v * SCALED[k]) if k in SCALED else v for k, v in zip(kinds, values, strict=True)
+        ]
         body = struct.pack("<" + "".join(DATAFLASH[k] for k in kinds), *numbers)
         out.append(bytes((0xA3, 0x95, types[name])) + body)
     path.write_bytes(b"".join(out))
@@ -39,7 +58,9 @@ ULOG = {"uint64_t": "Q", "uint8_t": "B", "float": "f", "double": "d", "int8_t": 
 
 
 def write_ulg(path: Path, topics: dict[tuple[str, int], tuple[list[str], list[tuple]]]) -> None:
-    """A ULog: topic and instance -> its fields ("float[3] position") and its rows, flat, the time stamp first [us]."""
+    """A ULog: topic and instance -> its fields ("float[3] position") and its rows, flat, the time
+    stamp first [us].
+    """
     out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)]
     names = {name: fields for (name, _), (fields, _) in topics.items()}
     for name, fields in names.items():
@@ -48,8 +69,13 @@ def write_ulg(path: Path, topics: dict[tuple[str, int], tuple[list[str], list[tu
     for number, ((name, instance), (fields, rows)) in enumerate(topics.items()):
         out.append(_message("A", struct.pack("<BH", instance, number) + name.encode()))
         layout = "<" + "".join(_layout(field) for field in fields)
-        samples += [(row[0], _message("D", struct.pack("<H", number) + struct.pack(layout, *row))) for row in rows]
-    path.write_bytes(b"".join(out + [data for _, data in sorted(samples, key=lambda sample: sample[0])]))
+        samples += [
+            (row[0], _message("D", struct.pack("<H", number) + struct.pack(layout, *row)))
+            for row in rows
+        ]
+    path.write_bytes(
+        b"".join(out + [data for _, data in sorted(samples, key=lambda sample: sample[0])])
+    )
 
 
 def _layout(field: str) -> str:

@@ -1,7 +1,8 @@
-"""What goes wrong with a motion capture: from a time on, drawn from a seed, put into poses as the source writes them.
+"""What goes wrong with a motion capture: from a time on, drawn from a seed, put into poses as the
+source writes them.
 
-    python -m tests.mocap_faults NAME TIME hil fake ...    # a fake whose motion capture has the fault from that time on [s]
-"""
+python -m tests.mocap_faults NAME TIME hil fake ...    # a fake whose motion capture has the fault
+from that time on [s]"""
 
 import math
 import sys
@@ -46,18 +47,39 @@ FAULTS: dict[str, tuple[str, Spoil]] = {
     "none": ("nothing goes wrong", lambda poses, fault: poses),
     "stop": ("motion capture stops", lambda poses, fault: []),
     "repeat": ("the last pose is repeated", _repeat),
-    "payload-lost": ("the payload is lost, the vehicle is not", lambda poses, fault: [p for p in poses if p.body != PAYLOAD]),
-    "swap": ("vehicle and payload are exchanged", _each(lambda p: {"body": {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}[p.body]})),
+    "payload-lost": (
+        "the payload is lost, the vehicle is not",
+        lambda poses, fault: [p for p in poses if p.body != PAYLOAD],
+    ),
+    "swap": (
+        "vehicle and payload are exchanged",
+        _each(lambda p: {"body": {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}[p.body]}),
+    ),
     "jump": ("both bodies jump by 0.5 m", _each(lambda p: {"pos": (p.pos[0] + JUMP, *p.pos[1:])})),
-    "order": ("quaternions written x, y, z, w for w, x, y, z", _each(lambda p: {"quat": (*p.quat[1:], p.quat[0])})),
+    "order": (
+        "quaternions written x, y, z, w for w, x, y, z",
+        _each(lambda p: {"quat": (*p.quat[1:], p.quat[0])}),
+    ),
     "zero-quaternion": ("quaternions of four zeros", _each(lambda p: {"quat": (0.0,) * 4})),
-    "nan-quaternion": ("quaternions that are no numbers", _each(lambda p: {"quat": (math.nan,) * 4})),
-    "clock-forth": ("the source's clock jumps a second ahead", _each(lambda p: {"stamp": p.stamp + STEP})),
-    "clock-back": ("the source's clock jumps a second back", _each(lambda p: {"stamp": p.stamp - STEP})),
+    "nan-quaternion": (
+        "quaternions that are no numbers",
+        _each(lambda p: {"quat": (math.nan,) * 4}),
+    ),
+    "clock-forth": (
+        "the source's clock jumps a second ahead",
+        _each(lambda p: {"stamp": p.stamp + STEP}),
+    ),
+    "clock-back": (
+        "the source's clock jumps a second back",
+        _each(lambda p: {"stamp": p.stamp - STEP}),
+    ),
     "reset": ("the source's reset counter counts on", _each(lambda p: {"reset": p.reset + 1})),
     "rare": ("poses at 5 Hz", _rare),
     "shuffle": ("packets overtake each other, by up to 30 ms", _shuffle),
-    "double": ("every packet comes twice", lambda poses, fault: [p for p in poses for _ in range(2)]),
+    "double": (
+        "every packet comes twice",
+        lambda poses, fault: [p for p in poses for _ in range(2)],
+    ),
 }
 """Name -> what happens, and what makes it happen."""
 
@@ -78,7 +100,9 @@ class MocapFault:
         self.kept: dict[str, float] = {}  # stamps of those let through, by body
 
     def spoil(self, poses: list[Pose], time: float) -> list[Pose]:
-        """Return what becomes of the poses that were measured at a time [s], as the source writes them."""
+        """Return what becomes of the poses that were measured at a time [s], as the source writes
+        them.
+        """
         if time < self.start:
             self.last.update({p.body: p for p in poses})
             return poses

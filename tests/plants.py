@@ -1,4 +1,6 @@
-"""Plants that the tests of the reference share: the paper's, and ones reduced to what a closed form knows."""
+"""Plants that the tests of the reference share: the paper's, and ones reduced to what a closed form
+knows.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -14,14 +16,29 @@ EVERYTHING = frozenset(EXTENSIONS)
 
 def paper_plant() -> PlantParams:
     """Return the paper's vehicle, rope, release and numerics."""
-    schemas = {"vehicle": VehicleParams, "rope": RopeParams, "release": ReleaseParams, "sim": SimParams}
-    return PlantParams(**{name: config.load(schema, config.find(name, "paper")) for name, schema in schemas.items()})
+    schemas = {
+        "vehicle": VehicleParams,
+        "rope": RopeParams,
+        "release": ReleaseParams,
+        "sim": SimParams,
+    }
+    return PlantParams(
+        **{
+            name: config.load(schema, config.find(name, "paper"))
+            for name, schema in schemas.items()
+        }
+    )
 
 
 def plain_vehicle(vehicle: VehicleParams, **kinds: str) -> VehicleParams:
-    """Return a vehicle without aerodynamics and with an ideal battery, unless ``kinds`` says otherwise."""
+    """Return a vehicle without aerodynamics and with an ideal battery, unless ``kinds`` says
+    otherwise.
+    """
     chosen = {"aero": "none", "battery": "ideal", **kinds}
-    parts = {name: dataclasses.replace(getattr(vehicle, name), kind=kind) for name, kind in chosen.items()}
+    parts = {
+        name: dataclasses.replace(getattr(vehicle, name), kind=kind)
+        for name, kind in chosen.items()
+    }
     return dataclasses.replace(vehicle, **parts)
 
 

@@ -1,4 +1,6 @@
-"""The training simulator set up as the tests need it, and mechanics of its states in plain NumPy."""
+"""The training simulator set up as the tests need it, and mechanics of its states in
+plain NumPy.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -19,34 +21,51 @@ def random_commands(seed: int, steps: int, count: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(LOW, HIGH, (steps, count, 4))
 
 
-def numerics(substep: float = 0.002, precision: str = "float32", control_period: float = 0.02) -> SimParams:
+def numerics(
+    substep: float = 0.002, precision: str = "float32", control_period: float = 0.02
+) -> SimParams:
     """The paper's numerics with another substep, precision or period."""
     return dataclasses.replace(
         paper_plant().sim, substep=substep, precision=precision, control_period=control_period
     )
 
 
-def scene_plant(scene: Scene, substep: float, precision: str, control_period: float = 0.01) -> PlantParams:
+def scene_plant(
+    scene: Scene, substep: float, precision: str, control_period: float = 0.01
+) -> PlantParams:
     """Plant of a bare scene; flown with ``direct=True`` only body, rope and numerics count."""
     plant = paper_plant()
     vehicle = dataclasses.replace(
         plant.vehicle, body=BodyParams(scene.mass, scene.inertia), queue=QueueParams(delay=0.0)
     )
     rope = RopeParams(
-        segments=scene.segments, length=scene.segments * scene.segment_length,
-        rope_mass=scene.segments * scene.segment_mass, payload_mass=scene.ball_mass,
-        payload_inertia=scene.ball_inertia, payload_offset=scene.ball_offset, payload_radius=0.033,
-        joint_damping=scene.joint_damping, mount=scene.mount,
+        segments=scene.segments,
+        length=scene.segments * scene.segment_length,
+        rope_mass=scene.segments * scene.segment_mass,
+        payload_mass=scene.ball_mass,
+        payload_inertia=scene.ball_inertia,
+        payload_offset=scene.ball_offset,
+        payload_radius=0.033,
+        joint_damping=scene.joint_damping,
+        mount=scene.mount,
     )
     return PlantParams(vehicle, rope, plant.release, numerics(substep, precision, control_period))
 
 
-def scene_sim(scene: Scene, substep: float, precision: str, control_period: float = 0.01, **options) -> HybridSim:
+def scene_sim(
+    scene: Scene, substep: float, precision: str, control_period: float = 0.01, **options
+) -> HybridSim:
     """Simulator of one vehicle at the start of a scene."""
-    sim = HybridSim(scene_plant(scene, substep, precision, control_period), 1, direct=True, **options)
+    sim = HybridSim(
+        scene_plant(scene, substep, precision, control_period), 1, direct=True, **options
+    )
     sim.place(
-        np.array([scene.pos_w]), np.array([scene.quat_wb]), np.array([scene.vel_w]), np.array([scene.rate_b]),
-        scene.cable_dir_w()[None], scene.cable_vel_w()[None],
+        np.array([scene.pos_w]),
+        np.array([scene.quat_wb]),
+        np.array([scene.vel_w]),
+        np.array([scene.rate_b]),
+        scene.cable_dir_w()[None],
+        scene.cable_vel_w()[None],
     )
     return sim
 
@@ -70,7 +89,9 @@ def fly(scene: Scene, substep: float, precision: str, control_period: float = 0.
         sim.set_command([[wrench.force_b[2], *wrench.torque_b]])
         sim.step()
         status |= int(sim.get("status")[0])
-    pos, ball, vel = (sim.get(k)[0].astype(float) for k in ("pos_w", "payload_pos_w", "payload_vel_w"))
+    pos, ball, vel = (
+        sim.get(k)[0].astype(float) for k in ("pos_w", "payload_pos_w", "payload_vel_w")
+    )
     return Flight(pos, ball, vel, status)
 
 
@@ -81,13 +102,17 @@ def rotate(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def rods(sim: HybridSim) -> tuple[np.ndarray, ...]:
-    """Masses, transverse inertias about the centre, centres and their velocities of every body of the rope.
+    """Masses, transverse inertias about the centre, centres and their velocities of every body of
+    the rope.
 
-    The ball counts as a body of its own: shapes (L+1,), (L+1,), (E, L+1, 3), (E, L+1, 3), and the directions' rates
-    (E, L+1, 3). Computed from the parameters of the rope, not from what the simulator packs.
-    """
+    The ball counts as a body of its own: shapes (L+1,), (L+1,), (E, L+1, 3), (E, L+1, 3), and the
+    directions' rates (E, L+1, 3). Computed from the parameters of the rope, not from what the
+    simulator packs."""
     rope = sim.params.rope
-    get = {k: sim.get(k).astype(float) for k in ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")}
+    get = {
+        k: sim.get(k).astype(float)
+        for k in ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
+    }
     mount = np.tile(rope.mount, (sim.count, 1))
     top = get["pos_w"] + rotate(get["quat_wb"], mount)
     top_vel = get["vel_w"] + rotate(get["quat_wb"], np.cross(get["rate_b"], mount))
@@ -96,7 +121,10 @@ def rods(sim: HybridSim) -> tuple[np.ndarray, ...]:
     ends = top[:, None] + length * np.cumsum(n, axis=1)
     end_vel = top_vel[:, None] + length * np.cumsum(u, axis=1)
     centres, vels = ends - 0.5 * length * n, end_vel - 0.5 * length * u
-    ball, ball_vel = ends[:, -1:] + rope.payload_offset * n[:, -1:], end_vel[:, -1:] + rope.payload_offset * u[:, -1:]
+    ball, ball_vel = (
+        ends[:, -1:] + rope.payload_offset * n[:, -1:],
+        end_vel[:, -1:] + rope.payload_offset * u[:, -1:],
+    )
     masses = np.append(np.full(count, mass), rope.payload_mass)
     inertias = np.append(np.full(count, mass * length**2 / 12.0), rope.payload_inertia)
     join = lambda a, b: np.concatenate((a, b), axis=1)  # noqa: E731
@@ -107,7 +135,11 @@ def energy(sim: HybridSim) -> np.ndarray:
     """Kinetic and potential energy [J] of vehicle, rope and ball, shape (E,)."""
     masses, inertias, pos, vel, u = rods(sim)
     body = sim.params.vehicle.body
-    v, w, z = sim.get("vel_w").astype(float), sim.get("rate_b").astype(float), sim.get("pos_w")[:, 2].astype(float)
+    v, w, z = (
+        sim.get("vel_w").astype(float),
+        sim.get("rate_b").astype(float),
+        sim.get("pos_w")[:, 2].astype(float),
+    )
     kinetic = 0.5 * body.mass * (v**2).sum(-1) + 0.5 * (np.array(body.inertia) * w**2).sum(-1)
     kinetic += 0.5 * ((vel**2).sum(-1) @ masses + (u**2).sum(-1) @ inertias)
     return kinetic + sim.gravity * (body.mass * z + pos[..., 2] @ masses)
@@ -116,4 +148,6 @@ def energy(sim: HybridSim) -> np.ndarray:
 def momentum(sim: HybridSim) -> np.ndarray:
     """Linear momentum [kg m/s] of vehicle, rope and ball, shape (E, 3), world frame."""
     masses, _, _, vel, _ = rods(sim)
-    return sim.params.vehicle.body.mass * sim.get("vel_w").astype(float) + np.einsum("elx,l->ex", vel, masses)
+    return sim.params.vehicle.body.mass * sim.get("vel_w").astype(float) + np.einsum(
+        "elx,l->ex", vel, masses
+    )

@@ -1,9 +1,9 @@
-"""Flights of two point masses with effects whose truth is known: a model to be diagnosed without any simulator.
+"""Flights of two point masses with effects whose truth is known: a model to be diagnosed without
+any simulator.
 
-Vehicle and payload are moved by smooth random forces; positions of both are measured. Effects are force shapes on either mass or
-shifts of a measured position, so the linearisation is exact unless ``curvature`` says otherwise. A hidden law acts at all times,
-not at the knots alone.
-"""
+Vehicle and payload are moved by smooth random forces; positions of both are measured. Effects are
+force shapes on either mass or shifts of a measured position, so the linearisation is exact unless
+``curvature`` says otherwise. A hidden law acts at all times, not at the knots alone."""
 
 from dataclasses import dataclass, field, replace
 
@@ -43,12 +43,21 @@ def catalogue(count: int = 20) -> tuple[Effect, ...]:
     effects = []
     for i in range(count):
         sensing = i % 3 == 2
-        effects.append(Effect(
-            name=f"effect_{i:02d}", cause=f"cause {i}", equation=f"F += theta phi_{i}", unit="m" if sensing else "N",
-            block="sensing" if sensing else blocks[i % len(blocks)], bounds=(-2e-2, 2e-2) if sensing else (-1.0, 1.0),
-            prior_sd=5e-3 if sensing else 0.2 if i % 2 else 0.05, floor=1e-4 if sensing else 4e-3 if i % 2 else 1e-3,
-            channels=("payload_pos_w",) if i % 2 == 0 else ("pos_w",), source="made up", manoeuvres=("swing",),
-        ))  # fmt: skip
+        effects.append(
+            Effect(
+                name=f"effect_{i:02d}",
+                cause=f"cause {i}",
+                equation=f"F += theta phi_{i}",
+                unit="m" if sensing else "N",
+                block="sensing" if sensing else blocks[i % len(blocks)],
+                bounds=(-2e-2, 2e-2) if sensing else (-1.0, 1.0),
+                prior_sd=5e-3 if sensing else 0.2 if i % 2 else 0.05,
+                floor=1e-4 if sensing else 4e-3 if i % 2 else 1e-3,
+                channels=("payload_pos_w",) if i % 2 == 0 else ("pos_w",),
+                source="made up",
+                manoeuvres=("swing",),
+            )
+        )
     return tuple(effects)
 
 
@@ -64,7 +73,9 @@ class SyntheticModel:
     noise: float = 1.0
     gust: float = 1.0
     curvature: float = 0.0  # of the response, a 30 floors' size bends it by this share
-    same: dict[str, tuple[str, float]] = field(default_factory=dict)  # effect -> (of which it is a multiple, factor)
+    same: dict[str, tuple[str, float]] = field(
+        default_factory=dict
+    )  # effect -> (of which it is a multiple, factor)
     law: str = ""  # a hidden force outside the catalogue: "speed" or "swirl" or "thrust"
     law_size: float = 0.0
     channels: tuple[str, ...] = CHANNELS
@@ -79,8 +90,12 @@ class SyntheticModel:
         self._time = np.arange(0.0, LENGTH, 1.0 / self.rate)
         self._knots = np.linspace(0.0, LENGTH, KNOTS)
         self._placed = _response(self._time, self._knots)
-        self.by_law: list[np.ndarray] = []  # of each window, what the law adds to the measured positions
-        self._windows = [w for flight in range(self.free + self.throws) for w in self._flight(flight)]
+        self.by_law: list[
+            np.ndarray
+        ] = []  # of each window, what the law adds to the measured positions
+        self._windows = [
+            w for flight in range(self.free + self.throws) for w in self._flight(flight)
+        ]
 
     def _flight(self, flight: int) -> list[Window]:
         if flight < self.free:
@@ -89,8 +104,14 @@ class SyntheticModel:
 
     def _smooth(self, size: int, scale: float, at: np.ndarray | None = None) -> np.ndarray:
         at = self._knots if at is None else at
-        phase, speed = self._rng.uniform(0, 2 * np.pi, (3, size)), self._rng.uniform(2.0, 9.0, (3, size))
-        waves = np.sin(speed[..., None] * at + phase[..., None]) * self._rng.normal(size=(3, size))[..., None]
+        phase, speed = (
+            self._rng.uniform(0, 2 * np.pi, (3, size)),
+            self._rng.uniform(2.0, 9.0, (3, size)),
+        )
+        waves = (
+            np.sin(speed[..., None] * at + phase[..., None])
+            * self._rng.normal(size=(3, size))[..., None]
+        )
         return scale * waves.sum(0).T / 1.7  # (times, size)
 
     def _motion(self, vigour: float) -> dict[str, np.ndarray]:
@@ -98,12 +119,17 @@ class SyntheticModel:
         at = _fine()
         velocity = self._smooth(3, 1.5 * vigour, at)
         return {
-            "time": at, "pos_w": self._smooth(3, 0.5, at) + [0, 0, 1.5], "vel_w": velocity,
-            "quat_wb": np.tile([0.0, 0.0, 0.0, 1.0], (len(at), 1)), "rate_b": self._smooth(3, vigour, at),
-            "thrust": 2.63 + self._smooth(1, 0.8 * vigour, at)[:, 0], "payload_pos_w": self._smooth(3, 0.5, at) + [0, 0, 1.2],
+            "time": at,
+            "pos_w": self._smooth(3, 0.5, at) + [0, 0, 1.5],
+            "vel_w": velocity,
+            "quat_wb": np.tile([0.0, 0.0, 0.0, 1.0], (len(at), 1)),
+            "rate_b": self._smooth(3, vigour, at),
+            "thrust": 2.63 + self._smooth(1, 0.8 * vigour, at)[:, 0],
+            "payload_pos_w": self._smooth(3, 0.5, at) + [0, 0, 1.2],
             "payload_vel_w": velocity + self._smooth(3, 0.7 * vigour, at),
-            "cable_dir_w": np.tile([0.0, 0.0, -1.0], (len(at), 1)), "tension": 0.57 + self._smooth(1, 0.1, at)[:, 0],
-        }  # fmt: skip
+            "cable_dir_w": np.tile([0.0, 0.0, -1.0], (len(at), 1)),
+            "tension": 0.57 + self._smooth(1, 0.1, at)[:, 0],
+        }
 
     def _window(self, flight: int, phase: str, start: float, vigour: float) -> Window:
         n = len(self._time)
@@ -114,7 +140,9 @@ class SyntheticModel:
             on_payload = e.channels == ("payload_pos_w",)
             rows = slice(3 * n, 6 * n) if on_payload else slice(0, 3 * n)
             if e.unit == "m":
-                shape = np.array([np.interp(self._time, self._knots, c) for c in self._smooth(3, vigour).T]).T
+                shape = np.array(
+                    [np.interp(self._time, self._knots, c) for c in self._smooth(3, vigour).T]
+                ).T
             else:
                 shape = self._placed @ self._smooth(3, vigour) / MASS[on_payload]
             effects[rows, j] = shape.ravel()
@@ -133,10 +161,21 @@ class SyntheticModel:
         measured += sigma * self.noise * self._draw.normal(size=6 * n)
         measured += nuisance @ self._draw.normal(0.0, 0.02, 12)
         return Window(
-            flight, phase, start + np.tile(np.repeat(self._time, 3), 2), np.repeat([0, 1], 3 * n), measured, sigma, effects,
-            nuisance, np.full(12, 0.1), latent, np.repeat([0, 2], 3 * KNOTS), np.tile(np.repeat([0, 1, 2], KNOTS), 2),
-            np.tile(start + self._knots, 6), {**motion, "time": start + self._knots},
-        )  # fmt: skip
+            flight,
+            phase,
+            start + np.tile(np.repeat(self._time, 3), 2),
+            np.repeat([0, 1], 3 * n),
+            measured,
+            sigma,
+            effects,
+            nuisance,
+            np.full(12, 0.1),
+            latent,
+            np.repeat([0, 2], 3 * KNOTS),
+            np.tile(np.repeat([0, 1, 2], KNOTS), 2),
+            np.tile(start + self._knots, 6),
+            {**motion, "time": start + self._knots},
+        )
 
     def _gusts(self) -> np.ndarray:
         root = np.linalg.cholesky(np.exp(-np.abs(self._knots[:, None] - self._knots) / GUST_TIME))
@@ -146,12 +185,17 @@ class SyntheticModel:
     def _moved(self, moves: dict[str, np.ndarray]) -> np.ndarray:
         """What the law adds to the measured positions, shape (6 n,)."""
         forces = self._law(moves).reshape(2, 3, -1)
-        return np.concatenate([(_placed(self._time, forces[m].T) / MASS[m]).ravel() for m in range(2)])
+        return np.concatenate(
+            [(_placed(self._time, forces[m].T) / MASS[m]).ravel() for m in range(2)]
+        )
 
     def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
         force = np.zeros((2, 3, len(motion["time"])))
         if self.law == "speed":  # drag of the vehicle that grows with the square of its speed
-            force[0] = -self.law_size * (np.linalg.norm(motion["vel_w"], axis=1)[:, None] * motion["vel_w"]).T
+            force[0] = (
+                -self.law_size
+                * (np.linalg.norm(motion["vel_w"], axis=1)[:, None] * motion["vel_w"]).T
+            )
         elif self.law == "swirl":  # a force across the payload's velocity
             force[1] = self.law_size * np.cross([0.0, 0.0, 1.0], motion["payload_vel_w"]).T
         else:  # thrust grows with the square of the speed across its axis
@@ -176,8 +220,12 @@ class SyntheticModel:
         self.calls += 1
         slope = 1.0 + 2.0 * self.curvature * np.abs(self._floors(self._sizes(theta))) / 30.0
         left = self.residuals(theta)
-        return [replace(w, residual=r, effects=w.effects * slope) for w, r in zip(self._windows, left)]
+        return [
+            replace(w, residual=r, effects=w.effects * slope) for w, r in zip(self._windows, left)
+        ]
 
-    def residuals(self, theta: dict[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+    def residuals(
+        self, theta: dict[str, float], about: Linearised | None = None
+    ) -> list[np.ndarray]:
         sizes = self._sizes(theta)
         return [w.residual - self._answer(w.effects, sizes) for w in self._windows]

@@ -7,5 +7,6 @@ import os
 
 __version__ = "0.1.0"
 
-# rsl_rl imports GitPython, which raises at import where no git binary is installed unless it is told to stay quiet.
+# rsl_rl imports GitPython, which raises at import where no git binary is installed unless it is
+# told to stay quiet.
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")

@@ -1,4 +1,6 @@
-"""Calibration from pictures of a board, through OpenCV's fisheye calibration, and the check of a lens against such pictures."""
+"""Calibration from pictures of a board, through OpenCV's fisheye calibration, and the check of a
+lens against such pictures.
+"""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,12 +23,13 @@ VIEW_AT_LEAST = 6
 
 @dataclass(frozen=True)
 class BoardParams:
-    """A board: chessboard (inner corners, where four squares meet), circles (a grid of their centres) or ChArUco.
+    """A board: chessboard (inner corners, where four squares meet), circles (a grid of their
+    centres) or ChArUco.
 
     Raises ValueError: a size that is no board's, or a dictionary that OpenCV does not have.
 
-    Convention: point (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns, y along the rows.
-    """
+    Convention: point (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns,
+    y along the rows."""
 
     columns: int  # points along x: inner corners, or circles
     rows: int  # points along y
@@ -38,10 +41,14 @@ class BoardParams:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2 or not self.square_size > 0.0:
             raise ValueError(
-                f"board of {self.columns} x {self.rows} points, {self.square_size} m apart; expected 2 or more each way, above 0 m apart"
+                f"board of {self.columns} x {self.rows} points, {self.square_size} m apart;"
+                " expected 2 or more each way, above 0 m apart"
             )
         if self.pattern == "charuco" and not 0.0 < self.marker_size < self.square_size:
-            raise ValueError(f"ChArUco marker of {self.marker_size} m; expected a side above 0 and below the square's {self.square_size} m")
+            raise ValueError(
+                f"ChArUco marker of {self.marker_size} m; expected a side above 0 and below the"
+                f" square's {self.square_size} m"
+            )
 
     def corners_m(self) -> np.ndarray:
         """Points row by row [m], float64, shape (rows * columns, 3), board frame."""
@@ -54,14 +61,20 @@ class BoardParams:
 
         known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
         if self.dictionary not in known:
-            raise ValueError(f"ChArUco dictionary {self.dictionary!r}; expected one of {', '.join(known)}")
+            raise ValueError(
+                f"ChArUco dictionary {self.dictionary!r}; expected one of {', '.join(known)}"
+            )
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard((self.columns + 1, self.rows + 1), self.square_size, self.marker_size, markers)
+        return cv2.aruco.CharucoBoard(
+            (self.columns + 1, self.rows + 1), self.square_size, self.marker_size, markers
+        )
 
 
 @dataclass(frozen=True)
 class View:
-    """What of a board one picture shows: points [m], shape (N, 3), board frame, and their pixels [px], shape (N, 2)."""
+    """What of a board one picture shows: points [m], shape (N, 3), board frame, and their pixels
+    [px], shape (N, 2).
+    """
 
     points_m: np.ndarray
     pixels: np.ndarray
@@ -90,8 +103,8 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
         board: The board.
 
     Returns:
-        Its points, row by row; of a ChArUco board those that are seen. None where no whole board (of a ChArUco board: fewer
-        than six points) is found.
+        Its points, row by row; of a ChArUco board those that are seen. None where no whole board
+        (of a ChArUco board: fewer than six points) is found.
     """
     import cv2
 
@@ -100,12 +113,17 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(grey)
         if ids is None or len(ids) < VIEW_AT_LEAST:
             return None
-        margin = 0.5 * (1.0 - board.marker_size / board.square_size)  # free of the marker about each corner, in squares
+        margin = 0.5 * (
+            1.0 - board.marker_size / board.square_size
+        )  # free of the marker about each corner, in squares
         return View(board.corners_m()[ids.ravel()], _refine(grey, corners.reshape(-1, 2), margin))
     if board.pattern == "circles":
-        found, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+        found, centres = cv2.findCirclesGrid(
+            grey, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID
+        )
         return View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64)) if found else None
-    # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes second.
+    # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes
+    # second.
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
         found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
         if found:
@@ -114,28 +132,39 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
 
 
 def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.ndarray:
-    """Corners at sub-pixel accuracy, from windows that reach a share of the way to the nearest other corner.
+    """Corners at sub-pixel accuracy, from windows that reach a share of the way to the nearest
+    other corner.
 
-    The detector's own sub-pixel step assumes straight edges over a whole square, which a fisheye bends: on rendered
-    boards the lens calibrated from it was 0.76 px off, with this step 0.10 px.
+    The detector's own sub-pixel step assumes straight edges over a whole square, which a fisheye
+    bends: on rendered boards the lens calibrated from it was 0.76 px off, with this step 0.10 px.
     """
     import cv2
 
-    apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1) + np.diag(np.full(len(corners), np.inf))
+    apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1) + np.diag(
+        np.full(len(corners), np.inf)
+    )
     half = int(np.clip(share * apart.min(), 1, 8))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     start = corners.astype(np.float32).reshape(-1, 1, 2).copy()
-    return cv2.cornerSubPix(grey, start, (half, half), (-1, -1), criteria).reshape(-1, 2).astype(np.float64)
+    return (
+        cv2.cornerSubPix(grey, start, (half, half), (-1, -1), criteria)
+        .reshape(-1, 2)
+        .astype(np.float64)
+    )
 
 
-def calibrate_from_boards(images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0) -> tuple[FisheyeParams, BoardReport]:
+def calibrate_from_boards(
+    images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0
+) -> tuple[FisheyeParams, BoardReport]:
     """Calibrate a fisheye from pictures of a board.
 
-    OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the polynomial found there
-    goes on past 90 deg. Raises ValueError: pictures differ in size, too few show the board, or OpenCV finds no solution.
+    OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the
+    polynomial found there goes on past 90 deg. Raises ValueError: pictures differ in size, too few
+    show the board, or OpenCV finds no solution.
 
     Args:
-        images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3); at least three with the whole board in view.
+        images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3); at least three with the
+            whole board in view.
         board: The board.
         fov_deg: Full field of view of the result [deg].
 
@@ -146,25 +175,49 @@ def calibrate_from_boards(images: list[np.ndarray], board: BoardParams, fov_deg:
 
     (height, width), found = find_boards(images, board)
     views = [view for view in found if view is not None]
-    # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step inside the model.
-    start = np.array([[width / np.pi, 0.0, width / 2 - 0.5], [0.0, width / np.pi, height / 2 - 0.5], [0.0, 0.0, 1.0]])
+    # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step
+    # inside the model.
+    start = np.array(
+        [
+            [width / np.pi, 0.0, width / 2 - 0.5],
+            [0.0, width / np.pi, height / 2 - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
     try:
         _, matrix, k, rotations, translations = cv2.fisheye.calibrate(
-            [v.points_m[None] for v in views], [v.pixels[None] for v in views], (width, height), start, np.zeros((4, 1)),
-            flags=flags, criteria=criteria,
-        )  # fmt: skip
+            [v.points_m[None] for v in views],
+            [v.pixels[None] for v in views],
+            (width, height),
+            start,
+            np.zeros((4, 1)),
+            flags=flags,
+            criteria=criteria,
+        )
     except cv2.error as error:
-        raise ValueError(f"OpenCV found no fisheye for {len(views)} boards: {str(error).strip()}") from error
-    fx, fy, cx, cy, k1, k2, k3, k4 = map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel()))
+        raise ValueError(
+            f"OpenCV found no fisheye for {len(views)} boards: {str(error).strip()}"
+        ) from error
+    fx, fy, cx, cy, k1, k2, k3, k4 = map(
+        float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel())
+    )
     params = FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, fov_deg)
     lens, poses = Fisheye(params), iter(zip(rotations, translations, strict=True))
-    return params, _report([None if v is None else _residual(lens, v, np.concatenate(next(poses)).ravel()) for v in found])
+    return params, _report(
+        [
+            None if v is None else _residual(lens, v, np.concatenate(next(poses)).ravel())
+            for v in found
+        ]
+    )
 
 
-def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
-    """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the lens is left as it is.
+def check_boards(
+    images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams
+) -> BoardReport:
+    """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the
+    lens is left as it is.
 
     Raises ValueError: pictures are not of the lens's size, or too few show the board.
 
@@ -175,19 +228,26 @@ def check_boards(images: list[np.ndarray], board: BoardParams, fisheye: FisheyeP
     """
     size, found = find_boards(images, board)
     if size != (fisheye.height, fisheye.width):
-        raise ValueError(f"pictures of {size[1]} x {size[0]} px came; expected {fisheye.width} x {fisheye.height}, the lens's size")
+        raise ValueError(
+            f"pictures of {size[1]} x {size[0]} px came; expected {fisheye.width} x"
+            f" {fisheye.height}, the lens's size"
+        )
     lens = Fisheye(fisheye)
     return _report([None if v is None else _residual(lens, v, board_pose(lens, v)) for v in found])
 
 
-def find_boards(images: list[np.ndarray], board: BoardParams) -> tuple[tuple[int, int], list[View | None]]:
+def find_boards(
+    images: list[np.ndarray], board: BoardParams
+) -> tuple[tuple[int, int], list[View | None]]:
     """Size (height, width) of all pictures, and what each shows of the board.
 
     Raises ValueError: pictures differ in size, or fewer than three show the board.
     """
     sizes = sorted({image.shape[:2] for image in images})
     if len(sizes) != 1:
-        raise ValueError(f"pictures of sizes {sizes} came (height, width); expected one size, that of one camera")
+        raise ValueError(
+            f"pictures of sizes {sizes} came (height, width); expected one size, that of one camera"
+        )
     views = [find_board(image, board) for image in images]
     seen = sum(view is not None for view in views)
     if seen < DETECTED_AT_LEAST:
@@ -199,7 +259,9 @@ def find_boards(images: list[np.ndarray], board: BoardParams) -> tuple[tuple[int
 
 
 def board_pose(lens: Fisheye, view: View) -> np.ndarray:
-    """Pose of a board by least squares of its pixels: rotation vector [rad] and place of its first point [m], shape (6,), camera frame."""
+    """Pose of a board by least squares of its pixels: rotation vector [rad] and place of its first
+    point [m], shape (6,), camera frame.
+    """
     import cv2
     from scipy.optimize import least_squares
 
@@ -207,25 +269,34 @@ def board_pose(lens: Fisheye, view: View) -> np.ndarray:
     before = rays[:, 2] > BEFORE
     if np.count_nonzero(before) < VIEW_AT_LEAST:
         raise ValueError(
-            f"{np.count_nonzero(before)} points of a board lie within {np.degrees(np.arccos(BEFORE)):.0f} deg of the axis; "
-            f"expected {VIEW_AT_LEAST}: is this the lens of these pictures?"
+            f"{np.count_nonzero(before)} points of a board lie within"
+            f" {np.degrees(np.arccos(BEFORE)):.0f} deg of the axis; expected {VIEW_AT_LEAST}: is"
+            " this the lens of these pictures?"
         )
     plane = rays[before, :2] / rays[before, 2:]
-    _, turn, place = cv2.solvePnP(view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    _, turn, place = cv2.solvePnP(
+        view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
+    )
 
     def residual(pose: np.ndarray) -> np.ndarray:
         return _residual(lens, view, pose)
 
-    return np.asarray(least_squares(residual, np.concatenate([turn, place]).ravel(), x_scale="jac", method="lm").x)
+    return np.asarray(
+        least_squares(residual, np.concatenate([turn, place]).ravel(), x_scale="jac", method="lm").x
+    )
 
 
 def reprojected(lens: Fisheye, view: View) -> np.ndarray:
-    """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was fitted."""
+    """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was
+    fitted.
+    """
     return np.asarray(view.pixels + _residual(lens, view, board_pose(lens, view)).reshape(-1, 2))
 
 
 def _residual(lens: Fisheye, view: View, pose: np.ndarray) -> np.ndarray:
-    """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector, place)."""
+    """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector,
+    place).
+    """
     import cv2
 
     points_c = view.points_m @ np.asarray(cv2.Rodrigues(pose[:3])[0]).T + pose[3:]

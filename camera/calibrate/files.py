@@ -1,11 +1,11 @@
 """Calibration files of the field: OpenCV YAML, Kalibr camchain, ROS camera_info and basalt JSON.
 
-Convention: all four count pixels from the centre of the top left one and x right, y down, z forward, as `FisheyeParams`
-does. None of them holds a field of view; it is read from an extra key ``fov_deg``, which their own readers ignore. A
-file without it gets the ``fov_deg`` of the call [deg] or, that left out, the angle that the farthest corner of the image
-sees. A file that is missing, cut short, lacks a key, or holds another model is a ValueError; ``camera`` is the number of
-one in a file that holds several.
-"""
+Convention: all four count pixels from the centre of the top left one and x right, y down, z
+forward, as `FisheyeParams` does. None of them holds a field of view; it is read from an extra key
+``fov_deg``, which their own readers ignore. A file without it gets the ``fov_deg`` of the call
+[deg] or, that left out, the angle that the farthest corner of the image sees. A file that is
+missing, cut short, lacks a key, or holds another model is a ValueError; ``camera`` is the number of
+one in a file that holds several."""
 
 import json
 import math
@@ -26,7 +26,9 @@ _KB4 = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 
 
 def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
-    """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration, ``fisheye_model: 1``, as OpenCV's calibration sample writes it."""
+    """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration, ``fisheye_model: 1``, as
+    OpenCV's calibration sample writes it.
+    """
     import cv2
 
     text_of(path)
@@ -39,15 +41,24 @@ def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams
             if key in ("camera_matrix", "distortion_coefficients") and node.isMap():
                 tree[key] = node.mat().ravel().tolist()
     except (cv2.error, SystemError, AttributeError) as error:
-        raise ValueError(f"{path} cannot be read as an OpenCV file (cut short?): {str(error).strip()}") from error
+        raise ValueError(
+            f"{path} cannot be read as an OpenCV file (cut short?): {str(error).strip()}"
+        ) from error
     file = _Entry(path, tree)
     file["fisheye_model"].among(1)  # the Kannala-Brandt model
     size = [file[key].value for key in ("image_width", "image_height")]
-    return _params(file, size, (*file["camera_matrix"].focal_and_centre(), *file["distortion_coefficients"].floats(4)), fov_deg)
+    return _params(
+        file,
+        size,
+        (*file["camera_matrix"].focal_and_centre(), *file["distortion_coefficients"].floats(4)),
+        fov_deg,
+    )
 
 
 def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> FisheyeParams:
-    """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is Kannala-Brandt)."""
+    """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is
+    Kannala-Brandt).
+    """
     file = _yaml(path)[f"cam{camera}"]
     file["camera_model"].among("pinhole")
     file["distortion_model"].among("equidistant")
@@ -56,17 +67,31 @@ def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None)
 
 
 def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
-    """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye`` distortion model."""
+    """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye``
+    distortion model.
+    """
     file = _yaml(path)
     file["distortion_model"].among("equidistant", "fisheye")
-    values = (*file["camera_matrix"]["data"].focal_and_centre(), *file["distortion_coefficients"]["data"].floats(4))
-    for key, count in (("rectification_matrix", 9), ("projection_matrix", 12)):  # unused, but a file cut short lacks them
+    values = (
+        *file["camera_matrix"]["data"].focal_and_centre(),
+        *file["distortion_coefficients"]["data"].floats(4),
+    )
+    for key, count in (
+        ("rectification_matrix", 9),
+        ("projection_matrix", 12),
+    ):  # unused, but a file cut short lacks them
         file[key]["data"].floats(count)
-    return _params(file, [file[key].value for key in ("image_width", "image_height")], values, fov_deg)
+    return _params(
+        file, [file[key].value for key in ("image_width", "image_height")], values, fov_deg
+    )
 
 
-def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> tuple[FisheyeParams, FitReport]:
-    """Read one camera of a basalt calibration: ``kb4`` as it is, ``ds`` and ``eucm`` through a fit inside the field of view.
+def read_basalt(
+    path: str | Path, camera: int = 0, fov_deg: float | None = None
+) -> tuple[FisheyeParams, FitReport]:
+    """Read one camera of a basalt calibration:
+
+    ``kb4`` as it is, ``ds`` and ``eucm`` through a fit inside the field of view.
 
     Returns the fisheye and what the fit left over (all zero for ``kb4``).
     """
@@ -78,7 +103,9 @@ def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None)
     node = file["intrinsics"][camera]
     model = node["camera_type"].among("kb4", *sorted(FOREIGN_MODELS))
     names = _KB4 if model == "kb4" else FOREIGN_MODELS[model][0]
-    values = _Entry(path, [node["intrinsics"][name].value for name in names], "intrinsics").floats(len(names))
+    values = _Entry(path, [node["intrinsics"][name].value for name in names], "intrinsics").floats(
+        len(names)
+    )
     size = file["resolution"][camera]
     if model == "kb4":
         return _params(node, size.value, tuple(values), fov_deg), EXACT
@@ -90,19 +117,24 @@ def read_basalt(path: str | Path, camera: int = 0, fov_deg: float | None = None)
 
 
 def image_fov_deg(fisheye: FisheyeParams) -> float:
-    """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d stops growing and to
-    360."""
+    """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d
+    stops growing and to 360.
+    """
     limit = min(2.0 * math.degrees(monotonic_limit(fisheye.coefficients)), 360.0)
     widest = Fisheye(FisheyeParams(**{**vars(fisheye), "fov_deg": limit * (1.0 - 1e-9)}))
     right, low = fisheye.width - 0.5, fisheye.height - 0.5
-    corners = torch.tensor([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]], dtype=torch.float64)
+    corners = torch.tensor(
+        [[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]], dtype=torch.float64
+    )
     rays, _ = widest.unproject(corners)
     return 2.0 * math.degrees(float(widest.angle(rays)[0].max()))
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """What stands in a file under a name; where it is not what is asked for, the ValueError names both."""
+    """What stands in a file under a name; where it is not what is asked for, the ValueError names
+    both.
+    """
 
     path: str | Path
     value: Any
@@ -118,11 +150,17 @@ class _Entry:
         if isinstance(key, int):
             count = len(self.value) if isinstance(self.value, list) else 0
             if not 0 <= key < count:
-                raise ValueError(f"{self.path}: camera {key} asked for; expected below {count}, the number of {self.name} in the file")
+                raise ValueError(
+                    f"{self.path}: camera {key} asked for; expected below {count}, the number of"
+                    f" {self.name} in the file"
+                )
         elif not isinstance(self.value, dict):
             raise self._refused("a mapping of keys to values")
         elif key not in self.value:
-            raise ValueError(f"{self.path} lacks the key {key!r} (cut short?); it has {sorted(map(str, self.value))}")
+            raise ValueError(
+                f"{self.path} lacks the key {key!r} (cut short?); it has"
+                f" {sorted(map(str, self.value))}"
+            )
         return _Entry(self.path, self.value[key], f"{self.name}.{key}".lstrip("."))
 
     def among(self, *choices: Any) -> Any:
@@ -135,7 +173,9 @@ class _Entry:
         """So many numbers."""
         values = self.value
         good = isinstance(values, list | tuple) and len(values) == count
-        if not good or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+        if not good or not all(
+            isinstance(v, int | float) and not isinstance(v, bool) for v in values
+        ):
             raise self._refused(f"{count} numbers")
         return [float(v) for v in values]
 
@@ -147,27 +187,39 @@ class _Entry:
         return fx, fy, cx, cy
 
 
-def _params(entry: _Entry, size: Any, values: tuple[float, ...], asked_fov: float | None) -> FisheyeParams:
-    """Intrinsics in the order of `_KB4`; the field of view is the entry's own, the asked one, or what the farthest corner sees."""
+def _params(
+    entry: _Entry, size: Any, values: tuple[float, ...], asked_fov: float | None
+) -> FisheyeParams:
+    """Intrinsics in the order of `_KB4`; the field of view is the entry's own, the asked one, or
+    what the farthest corner sees.
+    """
     width, height = map(int, _Entry(entry.path, size, "image size").floats(2))
     lens = dict(zip(_KB4, values, strict=True))
     fov = asked_fov if entry.value.get("fov_deg") is None else entry.value["fov_deg"]
     try:
         if fov is None:
             fov = image_fov_deg(FisheyeParams(width, height, **lens, fov_deg=1.0))
-        return FisheyeParams(width, height, **lens, fov_deg=_Entry(entry.path, [fov], "fov_deg").floats(1)[0])
+        return FisheyeParams(
+            width, height, **lens, fov_deg=_Entry(entry.path, [fov], "fov_deg").floats(1)[0]
+        )
     except ValueError as error:
         raise ValueError(f"{entry.path}: {error}") from error
 
 
 def text_of(path: str | Path, whole_lines: bool = True) -> str:
-    """Text of a file that exists and, where the format has no closing bracket, does not end within a line."""
+    """Text of a file that exists and, where the format has no closing bracket, does not end within
+    a line.
+    """
     if not Path(path).is_file():
         raise ValueError(f"{path} is not a file; expected a calibration file")
     text = Path(path).read_text()
     if whole_lines and not text.endswith("\n"):
-        # "resolution: [640, 48" and "- 48" of 480 read as numbers too: only the missing line end tells.
-        raise ValueError(f"{path} ends within a line (cut short?); expected a line end, which a complete file needs")
+        # "resolution: [640, 48" and "- 48" of 480 read as numbers too: only the missing line end
+        # tells.
+        raise ValueError(
+            f"{path} ends within a line (cut short?); expected a line end, which a complete file"
+            " needs"
+        )
     return text
 
 

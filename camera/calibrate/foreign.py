@@ -1,4 +1,5 @@
-"""Other lens models of the field (double sphere, extended unified, ocam) and their conversion into ours by a fit.
+"""Other lens models of the field (double sphere, extended unified, ocam) and their conversion into
+ours by a fit.
 
 NumPy, float64: this runs once, when a calibration file is read.
 """
@@ -25,7 +26,9 @@ class FitReport:
 
 
 Unprojection = Callable[[dict[str, float], np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Of intrinsics (fx, fy, cx, cy [px], the model's own [-]) and pixels [px], shape (N, 2): unit rays, shape (N, 3), and validity, (N,)."""
+"""Of intrinsics (fx, fy, cx, cy [px], the model's own [-]) and pixels [px], shape (N, 2): unit
+rays, shape (N, 3), and validity, (N,).
+"""
 
 
 def unproject_ds(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,12 +50,14 @@ def unproject_ds(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarr
 def unproject_eucm(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rays of the extended unified camera model, as `Unprojection` says.
 
-    Source: Khomutenko, Garcia, Martinet, "An Enhanced Unified Camera Model", RA-L 1(1), 2016, eqs. 5 and 8.
-    """
+    Source: Khomutenko, Garcia, Martinet, "An Enhanced Unified Camera Model", RA-L 1(1), 2016, eqs.
+    5 and 8."""
     alpha, beta = values["alpha"], values["beta"]
     m, radius2 = _plane(values, pixels)
     discriminant = 1.0 - (2.0 * alpha - 1.0) * beta * radius2
-    mz = (1.0 - beta * alpha**2 * radius2) / (alpha * np.sqrt(np.maximum(discriminant, 0.0)) + 1.0 - alpha)
+    mz = (1.0 - beta * alpha**2 * radius2) / (
+        alpha * np.sqrt(np.maximum(discriminant, 0.0)) + 1.0 - alpha
+    )
     rays = np.column_stack([m, mz])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True), discriminant >= 0.0
 
@@ -69,8 +74,9 @@ def fit_fisheye(
 ) -> tuple[FisheyeParams, FitReport]:
     """Fit our model to a foreign one on a grid of pixels, by least squares of the pixel difference.
 
-    The principal point is taken over (all three models are symmetric about it); fx, fy and k1 to k4 are fitted. Raises ValueError: the
-    model is unknown, or no grid point lies in the field of view, or the fit describes no camera.
+    The principal point is taken over (all three models are symmetric about it); fx, fy and k1 to k4
+    are fitted. Raises ValueError: the model is unknown, or no grid point lies in the field of view,
+    or the fit describes no camera.
 
     Args:
         model: A key of `FOREIGN_MODELS`.
@@ -80,13 +86,24 @@ def fit_fisheye(
         fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
 
     Returns:
-        The fisheye and what the fit left over. Its field of view is the asked one, cut to what the image sees and to
+        The fisheye and what the fit left over. Its field of view is the asked one, cut to what the
+        image sees and to
         where theta_d stops growing: nothing is extrapolated.
     """
     if model not in FOREIGN_MODELS:
-        raise ValueError(f"camera model {model!r} cannot be fitted; expected one of {sorted(FOREIGN_MODELS)}")
+        raise ValueError(
+            f"camera model {model!r} cannot be fitted; expected one of {sorted(FOREIGN_MODELS)}"
+        )
     centre, focal = (values["cx"], values["cy"]), (values["fx"], values["fy"])
-    return fit_rays(model, lambda pixels: FOREIGN_MODELS[model][1](values, pixels), centre, focal, width, height, fov_deg)
+    return fit_rays(
+        model,
+        lambda pixels: FOREIGN_MODELS[model][1](values, pixels),
+        centre,
+        focal,
+        width,
+        height,
+        fov_deg,
+    )
 
 
 def fit_rays(
@@ -104,7 +121,8 @@ def fit_rays(
 
     Args:
         model: What the report calls the lens.
-        unproject: Rays, shape (N, 3), camera frame, and validity, shape (N,), of pixels [px], shape (N, 2).
+        unproject: Rays, shape (N, 3), camera frame, and validity, shape (N,), of pixels [px], shape
+            (N, 2).
         centre_px: Principal point, taken over.
         focal_px: fx and fy to start from.
         width: Image width [px].
@@ -121,7 +139,10 @@ def fit_rays(
     if fov_deg is not None:
         valid &= theta <= math.radians(fov_deg) / 2.0
     if np.count_nonzero(valid) < 50:
-        raise ValueError(f"{model} model sees {np.count_nonzero(valid)} of {len(pixels)} pixels of the grid; expected 50")
+        raise ValueError(
+            f"{model} model sees {np.count_nonzero(valid)} of {len(pixels)} pixels of the grid;"
+            " expected 50"
+        )
     theta, pixels = theta[valid], pixels[valid]
     centre = np.array(centre_px)
     direction = rays[valid, :2] / np.maximum(np.sin(theta), 1e-12)[:, None]
@@ -137,8 +158,12 @@ def fit_rays(
     coefficients = tuple(float(k) for k in fit.x[2:])
     limit = 2.0 * math.degrees(monotonic_limit(coefficients))
     fov = min(seen_deg if fov_deg is None else fov_deg, seen_deg, limit * (1.0 - 1e-9))
-    params = FisheyeParams(width, height, float(fit.x[0]), float(fit.x[1]), *map(float, centre), *coefficients, fov)
-    return params, FitReport(model, float(np.sqrt(np.mean(error**2))), float(error.max()), len(theta))
+    params = FisheyeParams(
+        width, height, float(fit.x[0]), float(fit.x[1]), *map(float, centre), *coefficients, fov
+    )
+    return params, FitReport(
+        model, float(np.sqrt(np.mean(error**2))), float(error.max()), len(theta)
+    )
 
 
 def _plane(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,13 +1,13 @@
 """Ball and goal square on fisheye frames, by colour and shape, with OpenCV.
 
-Colour proposes, geometry decides. A blob of the ball's hue is a ball if the edge around it lies on a circular cone of rays, as
-the outline of a ball does in every direction and under every lens; a blob of the goal's hue is the goal if its edges are four
-straight lines in the tangent plane of the rays, with a bright rim around. Edges are found to a fraction of a pixel where the colour
-has fallen to half its level just inside, so that blur moves them little.
+Colour proposes, geometry decides. A blob of the ball's hue is a ball if the edge around it lies on
+a circular cone of rays, as the outline of a ball does in every direction and under every lens; a
+blob of the goal's hue is the goal if its edges are four straight lines in the tangent plane of the
+rays, with a bright rim around. Edges are found to a fraction of a pixel where the colour has fallen
+to half its level just inside, so that blur moves them little.
 
-The result is rays, not pixels: `detected_keypoints` makes of them what the training lens would have shown, by the functions that
-training calls.
-"""
+The result is rays, not pixels: `detected_keypoints` makes of them what the training lens would have
+shown, by the functions that training calls."""
 
 import math
 from dataclasses import dataclass
@@ -26,13 +26,22 @@ from camera.detectors.edges import (
     rays_of,
 )
 from camera.fisheye import Fisheye
-from camera.keypoints import GOAL_KEYPOINTS, PAYLOAD_KEYPOINTS, KeypointCamera, by_rule, payload_keypoints
+from camera.keypoints import (
+    GOAL_KEYPOINTS,
+    PAYLOAD_KEYPOINTS,
+    KeypointCamera,
+    by_rule,
+    payload_keypoints,
+)
 
 ABOVE = 0.5
-"""Share of the ball's colour, as it is where the ball is expected, that a ground of its hue may have."""
+"""Share of the ball's colour, as it is where the ball is expected, that a ground of its hue may
+have.
+"""
 
 GATE = 4.0
-"""Standard deviations about each axis of where a thing is expected, within which it is looked for."""
+"""Standard deviations about each axis of where a thing is expected, within which it is looked for.
+"""
 
 DISTANCE_ERROR = 0.15
 """Of a ball's distance by the size of its cone, a far and blurred one [-]."""
@@ -42,15 +51,22 @@ DISTANCE_ERROR = 0.15
 class DetectorParams:
     """What ball and goal look like."""
 
-    ball_hue_deg: tuple[float, float] = (46.0, 88.0)  # tennis ball: 62 to 68, and what a wrong white balance makes of it
+    ball_hue_deg: tuple[float, float] = (
+        46.0,
+        88.0,
+    )  # tennis ball: 62 to 68, and what a wrong white balance makes of it
     goal_hue_deg: tuple[float, float] = (105.0, 165.0)  # the green field of the square; as above
     saturation: float = 0.3  # least share of colour in a pixel [-]
     brightness: float = 0.06  # least value of a pixel [-]
     ball_distance: tuple[float, float] = (0.15, 4.0)  # of the ball from the lens [m]
-    field_share: float = 0.84  # side of the goal's coloured field over that of the square with its rim [-]
+    field_share: float = (
+        0.84  # side of the goal's coloured field over that of the square with its rim [-]
+    )
     coverage: float = 0.35  # share of the ball's outline that must be seen
     misfit: float = 0.1  # largest RMS of the outline from its cone, in half-angles
-    side_tolerance: float = 0.3  # of the goal's sides from what they must be where height and attitude are known [-]
+    side_tolerance: float = (
+        0.3  # of the goal's sides from what they must be where height and attitude are known [-]
+    )
 
 
 @dataclass(frozen=True)
@@ -66,7 +82,9 @@ class BallSeen:
 class GoalSeen:
     """The goal square by its corners."""
 
-    rays_c: np.ndarray  # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
+    rays_c: (
+        np.ndarray
+    )  # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
     score: float
 
 
@@ -84,8 +102,12 @@ class Known:
     """What is known before looking; each part may be left out."""
 
     up_c: np.ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
-    height: float | None = None  # of the lens above the ground [m]; with up_c the goal's size is checked
-    ball_distance: tuple[float, float] | None = None  # of the ball from the lens [m], narrower than the parameters'
+    height: float | None = (
+        None  # of the lens above the ground [m]; with up_c the goal's size is checked
+    )
+    ball_distance: tuple[float, float] | None = (
+        None  # of the ball from the lens [m], narrower than the parameters'
+    )
     ball_ray_c: np.ndarray | None = None  # to where the ball is expected, unit, shape (3,)
     ball_within: float = math.radians(12.0)  # of ball_ray_c, `GATE` standard deviations [rad]
     goal_ray_c: np.ndarray | None = None  # to where the goal's middle is expected, unit, shape (3,)
@@ -96,7 +118,13 @@ class Known:
 class Detector:
     """Finds ball and goal in frames of one lens."""
 
-    def __init__(self, lens: Fisheye, payload_radius: float, goal_side: float, params: DetectorParams | None = None) -> None:
+    def __init__(
+        self,
+        lens: Fisheye,
+        payload_radius: float,
+        goal_side: float,
+        params: DetectorParams | None = None,
+    ) -> None:
         """Take the lens and the true sizes.
 
         Args:
@@ -109,7 +137,9 @@ class Detector:
         shape = (lens.params.height, lens.params.width)
         v, u = np.mgrid[: shape[0], : shape[1]]
         edge = self.lens.edge_radius
-        plane = np.hypot((u - lens.params.cx) / lens.params.fx, (v - lens.params.cy) / lens.params.fy)
+        plane = np.hypot(
+            (u - lens.params.cx) / lens.params.fx, (v - lens.params.cy) / lens.params.fy
+        )
         self._in_view = (plane < edge).astype(np.uint8)
 
     def detect(self, image: np.ndarray, known: Known | None = None) -> Seen:
@@ -122,8 +152,12 @@ class Detector:
         self.check(image)
         p, known = self.params, known or Known()
         colours = colours_of(image)
-        ball = colour_maps(colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow")
-        goal = colour_maps(colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green")
+        ball = colour_maps(
+            colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow"
+        )
+        goal = colour_maps(
+            colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green"
+        )
         squares = self._squares(*goal, colours.bright, known)
         return Seen(self._ball(*ball, known), squares[0] if squares else None, squares)
 
@@ -131,14 +165,23 @@ class Detector:
         """Raise ValueError for an image of another size or type."""
         shape = (*self._in_view.shape, 3)
         if image.shape != shape or image.dtype != np.uint8:
-            raise ValueError(f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8")
+            raise ValueError(
+                f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and"
+                " uint8"
+            )
 
     def _ball(self, mask: np.ndarray, level: np.ndarray, known: Known) -> BallSeen | None:
-        """The blob whose edge is the best cone; where none is, what stands out by its colour from where the ball is expected."""
+        """The blob whose edge is the best cone; where none is, what stands out by its colour from
+        where the ball is expected.
+        """
         best = self._best_cone(circles_of(mask), level, known)
-        return self._expected(level, known) if best is None and known.ball_ray_c is not None else best
+        return (
+            self._expected(level, known) if best is None and known.ball_ray_c is not None else best
+        )
 
-    def _best_cone(self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, known: Known) -> BallSeen | None:
+    def _best_cone(
+        self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, known: Known
+    ) -> BallSeen | None:
         best: BallSeen | None = None
         for centre, radius in circles:
             found = self._cone(level, centre, radius)
@@ -146,16 +189,24 @@ class Detector:
                 continue
             score = found.score
             if known.ball_ray_c is not None:
-                score -= 0.5 * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c))) / known.ball_within
+                score -= (
+                    0.5
+                    * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c)))
+                    / known.ball_within
+                )
             if best is None or score > best.score:
                 best = BallSeen(found.ray_c, found.half_angle, score)
         return best
 
     def _expected(self, level: np.ndarray, known: Known) -> BallSeen | None:
-        """A ball on a ground or beside a thing that has its colour too, about where it is expected."""
+        """A ball on a ground or beside a thing that has its colour too, about where it
+        is expected.
+        """
         import cv2
 
-        middle, inside = self.lens.project(torch.from_numpy(np.ascontiguousarray(known.ball_ray_c, np.float64)[None]))
+        middle, inside = self.lens.project(
+            torch.from_numpy(np.ascontiguousarray(known.ball_ray_c, np.float64)[None])
+        )
         if not bool(inside):
             return None
         low, high = known.ball_distance or self.params.ball_distance
@@ -168,7 +219,9 @@ class Detector:
         return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, known)
 
     def _cone(self, level: np.ndarray, centre: np.ndarray, radius: float) -> BallSeen | None:
-        """The cone about a circle [px]; looked for again from where it was found, as part of a ball may hide."""
+        """The cone about a circle [px]; looked for again from where it was found, as part of a ball
+        may hide.
+        """
         found = None
         for _ in range(2):
             edge = polar_edge(level, centre, radius)
@@ -178,7 +231,9 @@ class Detector:
             seen = edge.share * share
             if seen < 0.5 * self.params.coverage or not half_angle > 0.0:
                 return None
-            found = BallSeen(ray, half_angle, seen - misfit) if seen >= self.params.coverage else None
+            found = (
+                BallSeen(ray, half_angle, seen - misfit) if seen >= self.params.coverage else None
+            )
             middle, inside = self.lens.project(torch.from_numpy(ray[None]))
             if misfit > self.params.misfit or not bool(inside):
                 return None
@@ -192,21 +247,32 @@ class Detector:
         low, high = known.ball_distance or self.params.ball_distance
         if not low <= distance <= high:
             return False
-        if known.ball_ray_c is not None and float(ray @ known.ball_ray_c) < math.cos(known.ball_within):
+        if known.ball_ray_c is not None and float(ray @ known.ball_ray_c) < math.cos(
+            known.ball_within
+        ):
             return False
         if known.up_c is None or known.height is None:
             return True
         # A smaller thing on the ground would, were it the ball, lie below the ground.
         return known.height + distance * float(ray @ known.up_c) > -DISTANCE_ERROR * distance
 
-    def _squares(self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, known: Known) -> tuple[GoalSeen, ...]:
+    def _squares(
+        self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, known: Known
+    ) -> tuple[GoalSeen, ...]:
         """The blobs that are squares with a rim, the best first."""
-        fits = [fit_goal(self.lens, self.params.field_share, contour, level, bright) for contour in outlines_of(mask)]
-        found = [GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], known)]
+        fits = [
+            fit_goal(self.lens, self.params.field_share, contour, level, bright)
+            for contour in outlines_of(mask)
+        ]
+        found = [
+            GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], known)
+        ]
         return tuple(sorted(found, key=lambda square: -square.score))
 
     def _right_size(self, rays_c: np.ndarray, known: Known) -> bool:
-        """Whether the corners lie on the ground, a goal's side from one another; true where that cannot be told."""
+        """Whether the corners lie on the ground, a goal's side from one another; true where that
+        cannot be told.
+        """
         if known.up_c is None or known.height is None:
             return True
         down = -rays_c @ known.up_c
@@ -221,7 +287,8 @@ def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
     """Corners in the order of `camera.keypoints.goal_square`, by where they lie on the ground.
 
     Args:
-        rays_c: to the corners, in turn about the square, shape (4, 3), camera frame; all below the horizon.
+        rays_c: to the corners, in turn about the square, shape (4, 3), camera frame; all below the
+            horizon.
         rot_wc: camera to world, shape (3, 3).
 
     Returns:
@@ -231,17 +298,22 @@ def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
     ground = rays_w[:, :2] / np.maximum(-rays_w[:, 2:], 1e-3)
     off = ground - ground.mean(axis=0)
     wanted = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
-    orders = [np.roll(base, shift) for base in (np.arange(4), np.arange(4)[::-1]) for shift in range(4)]
+    orders = [
+        np.roll(base, shift) for base in (np.arange(4), np.arange(4)[::-1]) for shift in range(4)
+    ]
     best = max(orders, key=lambda order: float(np.sum(off[order] * wanted)))
     return rays_c[best]
 
 
-def detected_keypoints(camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+def detected_keypoints(
+    camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of the training camera from what was seen, by the functions that training calls.
 
-    The ball's cone gives its distance, its true radius being known, and from there on the box is training's own, with the
-    bias that training's has: extremes are exact to second order in the half-angle, 2.2e-4 of normalised coordinates at a rope's
-    length. An outline that looks too large by a share s thus moves each side of the box by s half-angles.
+    The ball's cone gives its distance, its true radius being known, and from there on the box is
+    training's own, with the bias that training's has: extremes are exact to second order in the
+    half-angle, 2.2e-4 of normalised coordinates at a rope's length. An outline that looks too large
+    by a share s thus moves each side of the box by s half-angles.
 
     Args:
         camera: of training.
@@ -249,7 +321,8 @@ def detected_keypoints(camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray) -
         rot_wb: attitude of the vehicle, body to world, shape (3, 3): says which corner is which.
 
     Returns:
-        Normalised keypoints [-], shape (8, 2), and validity, shape (8,); zero and invalid where nothing was seen.
+        Normalised keypoints [-], shape (8, 2), and validity, shape (8,); zero and invalid where
+        nothing was seen.
     """
     points = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, 2)
     valid = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, dtype=torch.bool)

@@ -1,4 +1,7 @@
-"""Edges of coloured things on a frame, to a fraction of a pixel, and the shapes through them. Used by `camera.detectors.contours`."""
+"""Edges of coloured things on a frame, to a fraction of a pixel, and the shapes through them.
+
+Used by `camera.detectors.contours`.
+"""
 
 import math
 from dataclasses import dataclass
@@ -16,12 +19,15 @@ OUTSIDE = 3.0  # how far beyond the goal's side its edge is looked for at least 
 ANGLES = 64  # directions in which a ball's edge is looked for
 STEP = 0.25  # between two samples across an edge [px]
 MOST_BENT = 0.12  # RMS of the goal's edge from its line, over the side
-LEAST_RIM = 0.05  # by which the goal's rim is brighter than what lies beyond, of that: blurred over its width by far frames
+# by which the goal's rim is brighter than what lies beyond, of that: blurred over its width by far
+# frames
+LEAST_RIM = 0.05
 OVEREXPOSED = 245.0  # above this a pixel says nothing of how bright it is, of 255
 OUTER = 0.65  # quantile of an outline's distance from its axis about which points are kept
 RIM_LEVEL = 0.42
-"""Share of the fall at which a ball ends: below a half, as it darkens towards its rim; set on rendered balls, where the mean error
-of the half-angle then vanishes."""
+"""Share of the fall at which a ball ends: below a half, as it darkens towards its rim; set on
+rendered balls, where the mean error of the half-angle then vanishes.
+"""
 BLUR_WIDTH = 1.75  # half of the widest edge of a frame that is fit to be used [px]
 ALONG = 24  # samples along a side of the goal
 LEAST_LEVEL = 8.0  # colour inside an edge that is too faint to have one, of 255
@@ -42,11 +48,19 @@ def colours_of(image: np.ndarray) -> Colours:
 
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
     blue, green, red = cv2.split(smooth)
-    return Colours((blue, green, red), cv2.cvtColor(smooth, cv2.COLOR_BGR2HSV_FULL), cv2.max(cv2.max(blue, green), red))
+    return Colours(
+        (blue, green, red),
+        cv2.cvtColor(smooth, cv2.COLOR_BGR2HSV_FULL),
+        cv2.max(cv2.max(blue, green), red),
+    )
 
 
 def colour_maps(
-    colours: Colours, hue_deg: tuple[float, float], saturation: float, brightness: float, in_view: np.ndarray,
+    colours: Colours,
+    hue_deg: tuple[float, float],
+    saturation: float,
+    brightness: float,
+    in_view: np.ndarray,
     kind: Literal["yellow", "green"],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where a colour is, and how much of it.
@@ -55,18 +69,23 @@ def colour_maps(
         colours: of the frame.
         hue_deg: range of the hue [deg]. saturation, brightness: least ones, 0 to 1.
         in_view: 1 inside the field of view, uint8, shape (H, W).
-        kind: which excess measures the colour: the lesser of red and green over blue, or green over red and blue.
+        kind: which excess measures the colour: the lesser of red and green over blue, or green over
+            red and blue.
 
     Returns:
-        Mask, uint8, shape (H, W), and the excess of 255, float32, shape (H, W): linear in the light, so that an edge
-        blurred by the lens crosses half of it where the edge is.
+        Mask, uint8, shape (H, W), and the excess of 255, float32, shape (H, W): linear in the
+        light, so that an edge blurred by the lens crosses half of it where the edge is.
     """
     import cv2
 
     blue, green, red = colours.bgr
     low, high = (round(hue * 256.0 / 360.0) for hue in hue_deg)
-    found = cv2.inRange(colours.hsv, (low, 255.0 * saturation, 255.0 * brightness), (high, 255, 255))
-    mask = cv2.morphologyEx(cv2.bitwise_and(found, in_view), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    found = cv2.inRange(
+        colours.hsv, (low, 255.0 * saturation, 255.0 * brightness), (high, 255, 255)
+    )
+    mask = cv2.morphologyEx(
+        cv2.bitwise_and(found, in_view), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
+    )
     pair = (cv2.min(red, green), blue) if kind == "yellow" else (green, cv2.max(red, blue))
     return mask, cv2.subtract(*pair, dtype=cv2.CV_32F)
 
@@ -76,11 +95,16 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
     import cv2
 
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return [c[:, 0].astype(np.float64) for c in contours if cv2.contourArea(c) >= LEAST_AREA or len(c) >= LEAST_AREA]
+    return [
+        c[:, 0].astype(np.float64)
+        for c in contours
+        if cv2.contourArea(c) >= LEAST_AREA or len(c) >= LEAST_AREA
+    ]
 
 
 def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Circles about the blobs of a mask, and about pairs of near ones, which may be one thing with something across it.
+    """Circles about the blobs of a mask, and about pairs of near ones, which may be one thing with
+    something across it.
 
     Returns the centre [px], shape (2,), and radius [px] of each.
     """
@@ -119,35 +143,45 @@ def polar_edge(level: np.ndarray, centre: np.ndarray, radius: float) -> Edge:
     u = centre[0] + np.cos(angle)[:, None] * reach
     v = centre[1] + np.sin(angle)[:, None] * reach
     found, at = _last_crossing(_sample(level, u, v), reach)
-    points = np.column_stack([centre[0] + np.cos(angle) * at, centre[1] + np.sin(angle) * at])[found]
+    points = np.column_stack([centre[0] + np.cos(angle) * at, centre[1] + np.sin(angle) * at])[
+        found
+    ]
     return Edge(points, float(found.mean()))
 
 
 def cone_fit(rays: np.ndarray) -> tuple[np.ndarray, float, float, float]:
-    """Circular cone through rays: they meet the plane ``ray . n = 1`` where n is the axis over the cosine of the half-angle.
+    """Circular cone through rays: they meet the plane ``ray . n = 1`` where n is the axis over the
+    cosine of the half-angle.
 
     Args:
         rays: unit, shape (N, 3).
 
     Returns:
-        Axis, shape (3,), half-angle [rad], RMS of the misfit of the rays that belong to it in half-angles, and their share.
+        Axis, shape (3,), half-angle [rad], RMS of the misfit of the rays that belong to it in
+        half-angles, and their share.
     """
     good = np.ones(len(rays), bool)
     axis, half_angle, off = rays.mean(axis=0), 0.0, np.zeros(len(rays))
     for width in (0.4, 0.2, 0.1, 0.07, 0.07):
-        # About the mean ray the plane is nearly across; in its basis the least squares are well conditioned.
+        # About the mean ray the plane is nearly across; in its basis the least squares are well
+        # conditioned.
         mean = rays[good].mean(axis=0)
         frame = _basis(mean / np.linalg.norm(mean))
         local = rays[good] @ frame
         plane = local[:, :2] / local[:, 2:]
-        unknown = np.linalg.lstsq(np.column_stack([plane, np.ones(len(plane))]), 1.0 / local[:, 2], rcond=None)[0]
+        unknown = np.linalg.lstsq(
+            np.column_stack([plane, np.ones(len(plane))]), 1.0 / local[:, 2], rcond=None
+        )[0]
         normal = frame @ unknown
         size = float(np.linalg.norm(normal))
         if not size > 1.0:
             return axis / np.linalg.norm(axis), 0.0, math.inf, 0.0
         axis, half_angle = normal / size, math.acos(1.0 / size)
-        off = np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis) / half_angle - 1.0
-        # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer points count.
+        off = (
+            np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis) / half_angle - 1.0
+        )
+        # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer
+        # points count.
         outer = np.quantile(off[np.abs(off) < 0.5], OUTER) if (np.abs(off) < 0.5).any() else 0.0
         good = np.abs(off - outer) < width
         if good.sum() < 6:
@@ -168,8 +202,8 @@ def fit_goal(
         bright: greatest channel, uint8, shape (H, W).
 
     Returns:
-        Unit rays to the outer corners, clockwise in the image, shape (4, 3), and a score of at most 1; None where it is no
-        square with a rim.
+        Unit rays to the outer corners, clockwise in the image, shape (4, 3), and a score of at most
+        1; None where it is no square with a rim.
     """
     rays = rays_of(lens, outline)
     centre = rays.mean(axis=0)
@@ -188,7 +222,10 @@ def fit_goal(
     if misfit > MOST_BENT or share < 0.5 or rim < LEAST_RIM:
         return None
     rays_c = np.column_stack([outer, np.ones(4)]) @ frame.T
-    return rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True), (share - misfit + min(rim, 0.5)) / 1.5
+    return (
+        rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True),
+        (share - misfit + min(rim, 0.5)) / 1.5,
+    )
 
 
 def _quadrangle(points: np.ndarray) -> np.ndarray | None:
@@ -216,7 +253,9 @@ def _quadrangle(points: np.ndarray) -> np.ndarray | None:
 def _refined(
     lens: Fisheye, corners: np.ndarray, frame: np.ndarray, level: np.ndarray
 ) -> tuple[np.ndarray, float, float] | None:
-    """Corners by lines through the edges near each side; with the misfit over the side's length and the share found."""
+    """Corners by lines through the edges near each side; with the misfit over the side's length and
+    the share found.
+    """
     lines, misfit, share = [], [], []
     middle = corners.mean(axis=0)
     for first, second in zip(corners, np.roll(corners, -1, axis=0)):
@@ -232,7 +271,11 @@ def _refined(
         way *= (1.0 + np.maximum(0.0, OUTSIDE / np.maximum(length, 1e-9) - 0.35 / 0.75))[:, None]
         length = np.linalg.norm(way, axis=1)
         reach = np.linspace(0.0, 1.0, max(8, math.ceil(float(length.max()) / STEP)))
-        values = _sample(level, start[:, 0, None] + way[:, 0, None] * reach, start[:, 1, None] + way[:, 1, None] * reach)
+        values = _sample(
+            level,
+            start[:, 0, None] + way[:, 0, None] * reach,
+            start[:, 1, None] + way[:, 1, None] * reach,
+        )
         found, at = _first_crossing(values, reach)
         if found.sum() < ALONG // 3:
             return None
@@ -242,7 +285,10 @@ def _refined(
         misfit.append(off / np.linalg.norm(side))
         share.append(found.mean())
     met = np.array([_meet(lines[i - 1], lines[i]) for i in range(4)])
-    if not np.isfinite(met).all() or np.abs(met - corners).max() > 0.6 * np.abs(corners - middle).max():
+    if (
+        not np.isfinite(met).all()
+        or np.abs(met - corners).max() > 0.6 * np.abs(corners - middle).max()
+    ):
         return None
     return met, float(np.max(misfit)), float(np.mean(share))
 
@@ -257,7 +303,9 @@ def _line(points: np.ndarray) -> tuple[np.ndarray, float]:
         distance = off @ normal
         scale = max(1.5 * float(np.median(np.abs(distance))), 1e-9)
         weights = 1.0 / (1.0 + (distance / scale) ** 2)
-    return np.array([*normal, normal @ mean]), float(np.sqrt(np.average(distance**2, weights=weights)))
+    return np.array([*normal, normal @ mean]), float(
+        np.sqrt(np.average(distance**2, weights=weights))
+    )
 
 
 def _meet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -278,7 +326,9 @@ def _scaled(corners: np.ndarray, factor: float) -> np.ndarray:
     return cv2.perspectiveTransform((factor * square)[None], view)[0].astype(np.float64) * size
 
 
-def _rim_contrast(lens: Fisheye, corners: np.ndarray, frame: np.ndarray, bright: np.ndarray, share: float) -> float:
+def _rim_contrast(
+    lens: Fisheye, corners: np.ndarray, frame: np.ndarray, bright: np.ndarray, share: float
+) -> float:
     """How much brighter the rim is than what lies beyond it, of that; the median along all sides.
 
     Where both are overexposed nothing can be said, and the rim is taken for there.
@@ -287,9 +337,15 @@ def _rim_contrast(lens: Fisheye, corners: np.ndarray, frame: np.ndarray, bright:
 
     def around(factor: float) -> np.ndarray:
         ring = _scaled(corners, factor)
-        points = np.concatenate([a + part * (b - a) for a, b in zip(ring, np.roll(ring, -1, axis=0))])
+        points = np.concatenate(
+            [a + part * (b - a) for a, b in zip(ring, np.roll(ring, -1, axis=0))]
+        )
         pixels = _pixels(lens, points, frame)
-        return np.full(len(points), math.nan) if pixels is None else _sample(bright, pixels[:, 0], pixels[:, 1])
+        return (
+            np.full(len(points), math.nan)
+            if pixels is None
+            else _sample(bright, pixels[:, 0], pixels[:, 1])
+        )
 
     rim, beyond = around(0.5 * (1.0 + 1.0 / share)), around(1.0 / share + 0.25)
     if np.isnan(rim).any() or np.isnan(beyond).any():
@@ -301,7 +357,9 @@ def _rim_contrast(lens: Fisheye, corners: np.ndarray, frame: np.ndarray, bright:
 
 
 def _pixels(lens: Fisheye, plane: np.ndarray, frame: np.ndarray) -> np.ndarray | None:
-    """Pixels of points of a tangent plane, shape (N, 2); None where one lies outside of the view."""
+    """Pixels of points of a tangent plane, shape (N, 2); None where one lies outside of
+    the view.
+    """
     rays = np.column_stack([plane, np.ones(len(plane))]) @ frame.T
     pixels, valid = lens.project(torch.from_numpy(rays))
     return pixels.numpy() if bool((valid & lens.on_sensor(pixels)).all()) else None
@@ -313,7 +371,9 @@ def rays_of(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
 
 
 def _basis(ray: np.ndarray) -> np.ndarray:
-    """Rotation whose last column is a unit ray, shape (3, 3): from its tangent plane to the camera."""
+    """Rotation whose last column is a unit ray, shape (3, 3): from its tangent plane to
+    the camera.
+    """
     helper = np.array([1.0, 0.0, 0.0]) if abs(ray[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
     x = helper - ray * (helper @ ray)
     x /= np.linalg.norm(x)
@@ -326,21 +386,31 @@ def _sample(picture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
     u, v = (np.ascontiguousarray(a, np.float32) for a in (u, v))
     flat = (u.reshape(1, -1), v.reshape(1, -1)) if u.ndim == 1 else (u, v)
-    values = cv2.remap(picture.astype(np.float32, copy=False), *flat, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(
+        picture.astype(np.float32, copy=False),
+        *flat,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     return values.reshape(u.shape)
 
 
 def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outermost fall of each row from the level just inside to that just outside; whether there is one, and where.
+    """Outermost fall of each row from the level just inside to that just outside; whether there is
+    one, and where.
 
-    A ball is darker towards its rim, so the levels are taken next to the edge, a blur's width away from it.
-    """
+    A ball is darker towards its rim, so the levels are taken next to the edge, a blur's width away
+    from it."""
     plateau = np.quantile(values, 0.75, axis=1)
     inside = values > 0.4 * plateau[:, None]
     falls = inside[:, :-1] & ~inside[:, 1:]
     last = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
     found = falls.any(axis=1) & (plateau > LEAST_LEVEL) & ~inside[:, -1]
-    away, rows, most = round(BLUR_WIDTH / STEP), np.arange(len(values))[:, None], values.shape[1] - 1
+    away, rows, most = (
+        round(BLUR_WIDTH / STEP),
+        np.arange(len(values))[:, None],
+        values.shape[1] - 1,
+    )
     near = np.arange(away, 2 * away)
     high = np.quantile(values[rows, np.clip(last[:, None] - near, 0, most)], 0.75, axis=1)
     low = np.median(values[rows, np.clip(last[:, None] + near, 0, most)], axis=1)
@@ -355,14 +425,18 @@ def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _first_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First fall of each row through half of its level at the start; whether there is one, and where."""
+    """First fall of each row through half of its level at the start; whether there is one, and
+    where.
+    """
     plateau = np.median(values[:, : max(2, len(reach) // 5)], axis=1)
     falls = (values[:, :-1] > 0.5 * plateau[:, None]) & (values[:, 1:] <= 0.5 * plateau[:, None])
     found = falls.any(axis=1) & (plateau > LEAST_LEVEL)
     return found, _between(values, reach, np.argmax(falls, axis=1), 0.5 * plateau)
 
 
-def _between(values: np.ndarray, reach: np.ndarray, index: np.ndarray, level: np.ndarray) -> np.ndarray:
+def _between(
+    values: np.ndarray, reach: np.ndarray, index: np.ndarray, level: np.ndarray
+) -> np.ndarray:
     """Place between two samples where a level is crossed."""
     rows = np.arange(len(values))
     high, low = values[rows, index], values[rows, index + 1]

@@ -1,9 +1,10 @@
-"""Ball and goal from frame to frame: where they are looked for, what the ball reads while it is missed, and which square is the goal.
+"""Ball and goal from frame to frame: where they are looked for, what the ball reads while it is
+missed, and which square is the goal.
 
-A ball is a direction in the world that turns. One that hangs is a pendulum: the vehicle's thrust drives its direction about the lens,
-the same gravity pulls both. What is not known of it is noise of a Kalman filter, whose spread says how far off a prediction can be.
-A square lies at a place on the ground, where what each frame says of it adds up; the likeliest of all is the goal.
-"""
+A ball is a direction in the world that turns. One that hangs is a pendulum: the vehicle's thrust
+drives its direction about the lens, the same gravity pulls both. What is not known of it is noise
+of a Kalman filter, whose spread says how far off a prediction can be. A square lies at a place on
+the ground, where what each frame says of it adds up; the likeliest of all is the goal."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,35 +14,49 @@ import numpy as np
 from camera.detectors.contours import GATE, BallSeen, GoalSeen, Known, Seen
 
 READ = 0.01
-"""Of a direction in the world, about each axis: of the attitude, with which a detection is turned there, and of the detection [rad]."""
+"""Of a direction in the world, about each axis: of the attitude, with which a detection is turned
+there, and of the detection [rad].
+"""
 
 TURNS = 4.0  # rate of a ball that was seen once, about each axis [rad/s]
 
 DRIVEN = 8.0
-"""Of a direction's acceleration in each frame, about each axis, beyond a pendulum's [rad/s^2]. Set on 20 throws of the training simulator;
-on 10 of the realistic reference plant five blind frames are 2.7 deg off (rms), where the filter's spread about both axes says 2.8."""
+"""Of a direction's acceleration in each frame, about each axis, beyond a pendulum's [rad/s^2].
+
+Set on 20 throws of the training simulator; on 10 of the realistic reference plant five blind frames
+are 2.7 deg off (rms), where the filter's spread about both axes says 2.8.
+"""
 
 THRUST = 14.0
-"""Specific thrust of the vehicle [m/s^2]: median of throws of `vision`, which have 10 to 25; a hover has 12.5. The rest is in `DRIVEN`."""
+"""Specific thrust of the vehicle [m/s^2]: median of throws of `vision`, which have 10 to 25; a
+hover has 12.5. The rest is in `DRIVEN`.
+"""
 
 STILL = 0.05, 0.2  # of a ball that is said to hang still: direction [rad] and its rate [rad/s]
 
 LOST = 0.04
-"""Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by as much in a frame of a throw, and of
-the frames of training one in twenty is repeated."""
+"""Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by
+as much in a frame of a throw, and of the frames of training one in twenty is repeated.
+"""
 
 MEMORY = 2.0
-"""Time in which what a frame said of a square fades to 1/e, and after which one that was not seen again is forgotten [s]: a hover.
-A frame counts by the time since the one before, as frames err alike the closer they are."""
+"""Time in which what a frame said of a square fades to 1/e, and after which one that was not seen
+again is forgotten [s]: a hover. A frame counts by the time since the one before, as frames err
+alike the closer they are.
+"""
 
 SUREST = 0.99  # probability of a square in one frame at most
 
 
 class Track:
-    """A direction in the world, its rate and how well both are known; the same about each axis across it."""
+    """A direction in the world, its rate and how well both are known; the same about each axis
+    across it.
+    """
 
     def __init__(self, ray_w: np.ndarray, stamp: float, spread: float, rate: float) -> None:
-        """Begin with a unit ray, shape (3,), at a time [s], and standard deviations about each axis of it [rad] and its rate [rad/s]."""
+        """Begin with a unit ray, shape (3,), at a time [s], and standard deviations about each axis
+        of it [rad] and its rate [rad/s].
+        """
         self.ray_w, self.rate_w, self.stamp = ray_w, np.zeros(3), stamp
         self._covariance = np.diag([spread**2, rate**2])
 
@@ -51,7 +66,9 @@ class Track:
         return math.sqrt(self._covariance[0, 0])
 
     def predict(self, stamp: float, driven_w: np.ndarray) -> None:
-        """Turn on to a time [s]; ``driven_w``: acceleration of the direction [rad/s^2], shape (3,)."""
+        """Turn on to a time [s]; ``driven_w``: acceleration of the direction [rad/s^2],
+        shape (3,).
+        """
         dt, self.stamp = stamp - self.stamp, stamp
         moved, push = np.array([[1.0, dt], [0.0, 1.0]]), np.array([0.5 * dt * dt, dt])
         self.ray_w = _unit(self.ray_w + dt * self.rate_w + push[0] * driven_w)
@@ -69,7 +86,9 @@ class Track:
 
 @dataclass(eq=False)
 class Square:
-    """What may be the goal: where it was seen last on the ground [m], shape (2,), when [s], and its log-odds by the frames so far."""
+    """What may be the goal: where it was seen last on the ground [m], shape (2,), when [s], and its
+    log-odds by the frames so far.
+    """
 
     place_w: np.ndarray
     stamp: float
@@ -80,29 +99,47 @@ class Following:
     """What one camera has seen of ball and goal."""
 
     def __init__(self, radius: float, side: float, ball_w: np.ndarray | None = None) -> None:
-        """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the lens [m], shape (3,), or with none."""
+        """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the
+        lens [m], shape (3,), or with none.
+        """
         self._radius, self._side, self._half_angle, self._begin = radius, side, 0.0, ball_w
         self._ball: Track | None = None
         self._squares: list[Square] = []
         self._eye_w, self._stamp, self._weight = np.zeros(3), math.inf, 0.0
 
-    def known(self, rot_wc: np.ndarray, up_w: np.ndarray, eye_w: np.ndarray, distance: tuple[float, float] | None, stamp: float) -> Known:
+    def known(
+        self,
+        rot_wc: np.ndarray,
+        up_w: np.ndarray,
+        eye_w: np.ndarray,
+        distance: tuple[float, float] | None,
+        stamp: float,
+    ) -> Known:
         """What a detector is told of a frame.
 
         Args:
-            rot_wc: camera to world, shape (3, 3). up_w: the vehicle's z, along which it thrusts, shape (3,).
+            rot_wc: camera to world, shape (3, 3). up_w: the vehicle's z, along which it thrusts,
+                shape (3,).
             eye_w: the lens [m], shape (3,). distance: of a ball that hangs [m]; None: it does not.
             stamp: of the frame [s].
         """
         if self._begin is not None:
             far = float(np.linalg.norm(self._begin))
-            self._ball, self._half_angle = Track(self._begin / far, stamp, *STILL), math.asin(self._radius / far)
+            self._ball, self._half_angle = (
+                Track(self._begin / far, stamp, *STILL),
+                math.asin(self._radius / far),
+            )
             self._begin = None
         where = {}
         if self._ball is not None:
-            pull = THRUST * math.sin(self._half_angle) / self._radius if distance is not None else 0.0
+            pull = (
+                THRUST * math.sin(self._half_angle) / self._radius if distance is not None else 0.0
+            )
             self._ball.predict(stamp, -pull * _across(up_w, self._ball.ray_w))
-            where = {"ball_ray_c": rot_wc.T @ self._ball.ray_w, "ball_within": min(GATE * self._ball.spread, math.pi)}
+            where = {
+                "ball_ray_c": rot_wc.T @ self._ball.ray_w,
+                "ball_within": min(GATE * self._ball.spread, math.pi),
+            }
         self._squares = [square for square in self._squares if stamp - square.stamp < MEMORY]
         self._weight = -math.expm1(-max(stamp - self._stamp, 0.0) / MEMORY)
         for square in self._squares:
@@ -110,11 +147,15 @@ class Following:
         self._eye_w, self._stamp = eye_w, stamp
         if self._squares:
             away = np.append(self._likeliest().place_w, 0.0) - eye_w
-            where |= {"goal_ray_c": rot_wc.T @ _unit(away), "goal_within": self._side / float(np.linalg.norm(away))}
+            where |= {
+                "goal_ray_c": rot_wc.T @ _unit(away),
+                "goal_within": self._side / float(np.linalg.norm(away)),
+            }
         return Known(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
     def take(self, seen: Seen, rot_wc: np.ndarray | None, stamp: float) -> Seen:
-        """What was seen in a frame, with a ball that was missed where it is predicted, and of the squares the one that is the goal.
+        """What was seen in a frame, with a ball that was missed where it is predicted, and of the
+        squares the one that is the goal.
 
         Without an attitude nothing is followed.
         """
@@ -124,7 +165,9 @@ class Following:
         seen = replace(seen, goal=self._goal(seen, rot_wc))
         if seen.ball is not None:
             ray_w = rot_wc @ seen.ball.ray_c
-            if self._ball is not None and ray_w @ self._ball.ray_w > math.cos(min(GATE * math.hypot(self._ball.spread, READ), math.pi)):
+            if self._ball is not None and ray_w @ self._ball.ray_w > math.cos(
+                min(GATE * math.hypot(self._ball.spread, READ), math.pi)
+            ):
                 self._ball.see(ray_w)
             else:
                 self._ball = Track(ray_w, stamp, READ, TURNS)
@@ -134,7 +177,9 @@ class Following:
         return seen
 
     def _goal(self, seen: Seen, rot_wc: np.ndarray) -> GoalSeen | None:
-        """Add up what a frame says of squares, of which two are no nearer than a side; returns the goal, unless it was missed."""
+        """Add up what a frame says of squares, of which two are no nearer than a side; returns the
+        goal, unless it was missed.
+        """
         found: dict[int, GoalSeen] = {}
         for one in seen.squares:  # the likeliest first
             ray_w = rot_wc @ one.rays_c.mean(0)
@@ -145,7 +190,11 @@ class Following:
                 continue
             if i == len(self._squares):
                 self._squares.append(Square(place_w, self._stamp))
-            square, sure, found[i] = self._squares[i], min(max(one.score, 1.0 - SUREST), SUREST), one
+            square, sure, found[i] = (
+                self._squares[i],
+                min(max(one.score, 1.0 - SUREST), SUREST),
+                one,
+            )
             square.place_w, square.stamp = place_w, self._stamp
             square.log_odds += self._weight * math.log(sure / (1.0 - sure))
         return found.get(self._squares.index(self._likeliest())) if self._squares else None

@@ -1,10 +1,11 @@
-"""Ball and goal square on fisheye frames by small learnt networks; beside `camera.detectors.contours`, with the same face.
+"""Ball and goal square on fisheye frames by small learnt networks; beside
+`camera.detectors.contours`, with the same face.
 
-One network looks at the whole frame, halved, and names places: for each cell of a grid whether a ball (a square) has its middle
-there, where in the cell and how large. Two others look at those places, each in a patch that is rectified about its ray, so that no
-lens bends it: how sure, where and how large exactly, and to what accuracy. What comes out are rays. Confidences are calibrated on
-pictures that were not trained on, and told as probabilities.
-"""
+One network looks at the whole frame, halved, and names places: for each cell of a grid whether a
+ball (a square) has its middle there, where in the cell and how large. Two others look at those
+places, each in a patch that is rectified about its ray, so that no lens bends it: how sure, where
+and how large exactly, and to what accuracy. What comes out are rays. Confidences are calibrated on
+pictures that were not trained on, and told as probabilities."""
 
 import json
 import math
@@ -29,9 +30,14 @@ KINDS = ("ball", "goal")
 PATCH = {"ball": 40, "goal": 56}  # side of a patch [px]
 
 REACH = {"ball": 2.2, "goal": 1.9}
-"""Half side of a patch over the size: the ball's half-angle, the mean angle from the square's middle to its corners."""
+"""Half side of a patch over the size: the ball's half-angle, the mean angle from the square's
+middle to its corners.
+"""
 
-LEAST_REACH = {"ball": 0.05, "goal": 0.05}  # half side of a patch at least, as a tangent: what is far is looked at with its surroundings
+LEAST_REACH = {
+    "ball": 0.05,
+    "goal": 0.05,
+}  # half side of a patch at least, as a tangent: what is far is looked at with its surroundings
 
 PLACES = 3  # of a kind that are looked at closely
 
@@ -43,14 +49,21 @@ def _block(inward: int, outward: int, stride: int) -> nn.Sequential:
 
 
 class Search(nn.Module):
-    """Whole frames, halved, (B, 3, H / 2, W / 2), to (B, 2, 4, H / 16, W / 16): logit, place in the cell [cells] and log size [cells]."""
+    """Whole frames, halved, (B, 3, H / 2, W / 2), to (B, 2, 4, H / 16, W / 16): logit, place in the
+    cell [cells] and log size [cells].
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.body = nn.Sequential(
-            nn.Conv2d(3, 12, 5, 2, 2), nn.SiLU(), _block(12, 24, 2), _block(24, 40, 2), _block(40, 40, 1), _block(40, 40, 1),
+            nn.Conv2d(3, 12, 5, 2, 2),
+            nn.SiLU(),
+            _block(12, 24, 2),
+            _block(24, 40, 2),
+            _block(40, 40, 1),
+            _block(40, 40, 1),
             nn.Conv2d(40, 8, 1),
-        )  # fmt: skip
+        )
         with torch.no_grad():
             self.body[-1].bias[0::4] = -5.0  # few cells of a frame show anything
 
@@ -59,15 +72,23 @@ class Search(nn.Module):
 
 
 class Look(nn.Module):
-    """Patches (B, 3, S, S) to (B, outputs): logit, log accuracy, and what is where, in half sides of the patch."""
+    """Patches (B, 3, S, S) to (B, outputs): logit, log accuracy, and what is where, in half sides
+    of the patch.
+    """
 
     def __init__(self, side: int, outputs: int) -> None:
         super().__init__()
         last = -(-side // 8)
         self.body = nn.Sequential(
-            _block(3, 16, 1), _block(16, 24, 2), _block(24, 32, 2), _block(32, 24, 2), nn.Flatten(),
-            nn.Linear(24 * last * last, 48), nn.SiLU(), nn.Linear(48, outputs),
-        )  # fmt: skip
+            _block(3, 16, 1),
+            _block(16, 24, 2),
+            _block(24, 32, 2),
+            _block(32, 24, 2),
+            nn.Flatten(),
+            nn.Linear(24 * last * last, 48),
+            nn.SiLU(),
+            nn.Linear(48, outputs),
+        )
 
     def forward(self, patches: Tensor) -> Tensor:
         return self.body(patches)
@@ -83,16 +104,31 @@ class Networks(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.search, self.ball, self.goal = Search(), Look(PATCH["ball"], 5), Look(PATCH["goal"], 10)
+        self.search, self.ball, self.goal = (
+            Search(),
+            Look(PATCH["ball"], 5),
+            Look(PATCH["goal"], 10),
+        )
         self.calibration = {kind: (1.0, 0.0, 1.0) for kind in KINDS}
         self.made_by: dict = {}
 
     def save(self, path: str | Path) -> None:
-        """Write an ``.npz`` without pickle: the weights in half precision, and ``header``, JSON text."""
-        header = {"format_version": FORMAT, "calibration": self.calibration, "made_by": self.made_by}
-        arrays = {name: value.detach().cpu().numpy().astype(np.float16) for name, value in self.state_dict().items()}
+        """Write an ``.npz`` without pickle: the weights in half precision, and ``header``, JSON
+        text.
+        """
+        header = {
+            "format_version": FORMAT,
+            "calibration": self.calibration,
+            "made_by": self.made_by,
+        }
+        arrays = {
+            name: value.detach().cpu().numpy().astype(np.float16)
+            for name, value in self.state_dict().items()
+        }
         with open(path, "wb") as file:
-            np.savez_compressed(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+            np.savez_compressed(
+                file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays
+            )
 
     @staticmethod
     def load(path: str | Path = SHIPPED) -> "Networks":
@@ -102,18 +138,27 @@ class Networks(nn.Module):
             with np.load(path, allow_pickle=False) as arrays:
                 header = json.loads(arrays["header"].tobytes())
                 if header["format_version"] != FORMAT:
-                    raise ValueError(f"format version {header['format_version']}, this program reads {FORMAT}")
+                    raise ValueError(
+                        f"format version {header['format_version']}, this program reads {FORMAT}"
+                    )
                 names = [name for name in arrays.files if name != "header"]
-                found.load_state_dict({name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names})
+                found.load_state_dict(
+                    {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names}
+                )
         except (OSError, EOFError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
-            raise ValueError(f"{path}: no detector written by `visthrow detector train`: {error}") from error
+            raise ValueError(
+                f"{path}: no detector written by `visthrow detector train`: {error}"
+            ) from error
         found.calibration = {kind: tuple(header["calibration"][kind]) for kind in KINDS}
         found.made_by = header["made_by"]
         return found.eval()
 
 
 def halved(frames: Tensor) -> Tensor:
-    """Frames as the search sees them: RGB in -1 to 1, (B, 3, H / 2, W / 2), of uint8 (B, H, W, 3)."""
+    """Frames as the search sees them:
+
+    RGB in -1 to 1, (B, 3, H / 2, W / 2), of uint8 (B, H, W, 3).
+    """
     return F.avg_pool2d(frames.permute(0, 3, 1, 2).float(), 2) / 127.5 - 1.0
 
 
@@ -137,13 +182,16 @@ class Views:
 
 
 def views_about(rays: Tensor, reach: Tensor, north_c: Tensor) -> Views:
-    """Patches about unit rays, shape (B, 3), upright along a direction in the camera frame, shape (B, 3).
+    """Patches about unit rays, shape (B, 3), upright along a direction in the camera frame, shape
+    (B, 3).
 
-    The world's x where the attitude is known, so that a square that is laid along the world's axes shows its corners in one order.
-    """
+    The world's x where the attitude is known, so that a square that is laid along the world's axes
+    shows its corners in one order."""
     up = north_c - (north_c * rays).sum(-1, keepdim=True) * rays
     spare = torch.tensor([[0.0, -1.0, 0.0]], dtype=rays.dtype, device=rays.device)
-    up = torch.where(up.norm(dim=-1, keepdim=True) > 0.1, up, spare - (spare * rays).sum(-1, keepdim=True) * rays)
+    up = torch.where(
+        up.norm(dim=-1, keepdim=True) > 0.1, up, spare - (spare * rays).sum(-1, keepdim=True) * rays
+    )
     down = -F.normalize(up, dim=-1)
     right = torch.linalg.cross(down, rays)
     return Views(torch.stack([right, down, rays], 1), reach)
@@ -157,7 +205,9 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
         views: of the patches. lens: of the frames. side: S.
     """
     at = (torch.arange(side, device=frames.device) + 0.5) * (2.0 / side) - 1.0
-    grid = torch.stack([at[None, :].expand(side, -1), at[:, None].expand(-1, side)], -1).reshape(1, -1, 2)
+    grid = torch.stack([at[None, :].expand(side, -1), at[:, None].expand(-1, side)], -1).reshape(
+        1, -1, 2
+    )
     rays = views.rays(grid.expand(len(index), -1, -1))
     pixels, _ = lens.project(rays)
     height, width = frames.shape[1:3]
@@ -172,16 +222,28 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
 
 
 class LearntDetector(Detector):
-    """Finds ball and goal in frames of one lens by the networks; what is known narrows it as it does the OpenCV detector."""
+    """Finds ball and goal in frames of one lens by the networks; what is known narrows it as it
+    does the OpenCV detector.
+    """
 
-    def __init__(self, lens: Fisheye, payload_radius: float, goal_side: float, params=None, networks: Networks | None = None) -> None:
+    def __init__(
+        self,
+        lens: Fisheye,
+        payload_radius: float,
+        goal_side: float,
+        params=None,
+        networks: Networks | None = None,
+    ) -> None:
         """Take the lens, the true sizes and the networks; left out, those that are shipped.
 
         Raises ValueError: a frame whose sides are no multiples of a cell.
         """
         super().__init__(lens, payload_radius, goal_side, params)
         if lens.params.height % CELL or lens.params.width % CELL:
-            raise ValueError(f"frames of {lens.params.width} x {lens.params.height} px; expected multiples of {CELL} px for the networks")
+            raise ValueError(
+                f"frames of {lens.params.width} x {lens.params.height} px; expected multiples of"
+                f" {CELL} px for the networks"
+            )
         self.networks = networks or Networks.load()
 
     @torch.inference_mode()
@@ -191,21 +253,31 @@ class LearntDetector(Detector):
         known = known or Known()
         frames = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))[None]
         places = places_of(self.networks.search(halved(frames)), self.lens)
-        north = torch.tensor(known.north_c if known.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32)
+        north = torch.tensor(
+            known.north_c if known.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32
+        )
         ball, goal = (self._closest(kind, frames, *places[kind], north) for kind in KINDS)
         squares = self._squares(*goal, known)
         return Seen(self._best_ball(*ball, known), squares[0] if squares else None, squares)
 
-    def _closest(self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor) -> tuple[Tensor, Tensor]:
+    def _closest(
+        self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Probabilities and findings at places."""
         factor, offset, _ = self.networks.calibration[kind]
         views, found, _, _ = looked(self.networks, kind, frames, rays, sizes, self.lens, north)
         probability = torch.sigmoid(factor * found[:, 0] + offset)
-        things = ball_of(views, found) if kind == "ball" else views.rays(found[:, 2:].unflatten(1, (4, 2)))
+        things = (
+            ball_of(views, found)
+            if kind == "ball"
+            else views.rays(found[:, 2:].unflatten(1, (4, 2)))
+        )
         return probability, things
 
     def _best_ball(self, probability: Tensor, things: Tensor, known: Known) -> BallSeen | None:
-        probability = self._expected_there(probability, things[:, :3], known.ball_ray_c, known.ball_within)
+        probability = self._expected_there(
+            probability, things[:, :3], known.ball_ray_c, known.ball_within
+        )
         for i in probability.argsort(descending=True).tolist():
             ray, half_angle = things[i, :3].double().numpy(), float(things[i, 3])
             if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, known):
@@ -213,38 +285,60 @@ class LearntDetector(Detector):
         return None
 
     def _squares(self, probability: Tensor, things: Tensor, known: Known) -> tuple[GoalSeen, ...]:
-        """What is sure, or sure where it is expected, the likeliest first; each by its own probability, which frames add up."""
-        raised = self._expected_there(probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within)
+        """What is sure, or sure where it is expected, the likeliest first; each by its own
+        probability, which frames add up.
+        """
+        raised = self._expected_there(
+            probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within
+        )
         found = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
-            if max(probability[i], raised[i]) >= LEAST_PROBABILITY and self._right_size(rays, known):
+            if max(probability[i], raised[i]) >= LEAST_PROBABILITY and self._right_size(
+                rays, known
+            ):
                 found.append(GoalSeen(rays, float(probability[i])))
         return tuple(found)
 
-    def _expected_there(self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float) -> Tensor:
-        """Probabilities where it is known about where the thing is; the networks' own are of a thing that can be anywhere in view.
+    def _expected_there(
+        self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float
+    ) -> Tensor:
+        """Probabilities where it is known about where the thing is; the networks' own are of a
+        thing that can be anywhere in view.
 
-        Bayes' rule: the odds grow by the normal density of where it is expected over the even one in the view's solid angle.
-        """
+        Bayes' rule: the odds grow by the normal density of where it is expected over the even one
+        in the view's solid angle."""
         if expected_c is None:
             return probability
         cosine, variance = rays @ torch.from_numpy(expected_c).float(), (within / GATE) ** 2
-        likelier = (1.0 - math.cos(self.lens.params.half_fov)) / variance * (-0.5 / variance * cosine.clamp(-1.0, 1.0).acos() ** 2).exp()
+        likelier = (
+            (1.0 - math.cos(self.lens.params.half_fov))
+            / variance
+            * (-0.5 / variance * cosine.clamp(-1.0, 1.0).acos() ** 2).exp()
+        )
         odds = probability / (1.0 - probability).clamp(min=1e-6) * likelier
         return odds / (1.0 + odds)
 
 
 def looked(
-    networks: Networks, kind: str, frame: Tensor, rays: Tensor, sizes: Tensor, lens: Fisheye, north: Tensor
+    networks: Networks,
+    kind: str,
+    frame: Tensor,
+    rays: Tensor,
+    sizes: Tensor,
+    lens: Fisheye,
+    north: Tensor,
 ) -> tuple[Views, Tensor, Tensor, Tensor]:
-    """Patches about places of one frame, what the network of a kind makes of them, shape (B, outputs), and `middle_of` that.
+    """Patches about places of one frame, what the network of a kind makes of them, shape (B,
+    outputs), and `middle_of` that.
 
     They are looked at twice: the second patch lies where the first found the thing.
     """
     index = torch.zeros(len(rays), dtype=torch.long, device=rays.device)
     for _ in range(2):
-        views = views_about(rays, (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0), north.expand_as(rays))
+        views = views_about(
+            rays, (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0), north.expand_as(rays)
+        )
         found = getattr(networks, kind)(patches_of(frame, index, views, lens, PATCH[kind]))
         rays, sizes = middle_of(kind, views, found)
     return views, found, rays, sizes
@@ -263,7 +357,15 @@ def middle_of(kind: str, views: Views, found: Tensor) -> tuple[Tensor, Tensor]:
 def ball_of(views: Views, found: Tensor) -> Tensor:
     """Unit ray and half-angle [rad] of balls, shape (B, 4)."""
     ray = views.rays(found[:, None, 2:4])[:, 0]
-    return torch.cat([ray, (views.reach / REACH["ball"] * found[:, 4].clamp(-3.0, 1.5).exp())[:, None].clamp(1e-3, 1.2)], -1)
+    return torch.cat(
+        [
+            ray,
+            (views.reach / REACH["ball"] * found[:, 4].clamp(-3.0, 1.5).exp())[:, None].clamp(
+                1e-3, 1.2
+            ),
+        ],
+        -1,
+    )
 
 
 def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
@@ -276,12 +378,22 @@ def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
     for k, kind in enumerate(KINDS):
         logits = grids[0, k, 0]
         peak = F.max_pool2d(logits[None, None], 3, 1, 1)[0, 0]
-        best = torch.where(logits == peak, logits, logits.new_full((), -1e3)).flatten().topk(PLACES).indices
+        best = (
+            torch.where(logits == peak, logits, logits.new_full((), -1e3))
+            .flatten()
+            .topk(PLACES)
+            .indices
+        )
         j, i = best // logits.shape[1], best % logits.shape[1]
         du, dv, size = grids[0, k, 1:, j, i]
-        pixels = torch.stack([(i + 0.5 + du.clamp(-1, 1)) * CELL - 0.5, (j + 0.5 + dv.clamp(-1, 1)) * CELL - 0.5], -1)
+        pixels = torch.stack(
+            [(i + 0.5 + du.clamp(-1, 1)) * CELL - 0.5, (j + 0.5 + dv.clamp(-1, 1)) * CELL - 0.5], -1
+        )
         rays, _ = lens.unproject(pixels)
-        found[kind] = (F.normalize(rays, dim=-1), size.clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx))
+        found[kind] = (
+            F.normalize(rays, dim=-1),
+            size.clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx),
+        )
     return found
 
 

@@ -1,9 +1,10 @@
-"""Where a payload would land if the latch tripped now, by its own poses: a release that leads astray is held back.
+"""Where a payload would land if the latch tripped now, by its own poses: a release that leads
+astray is held back.
 
-What comes between now and the landing is not known better than this: until it separates the payload keeps the velocity that it has,
-then it flies freely. For right throws of the shipped policies at 2 m that is off by 0.05 to 0.20 m: it tells a throw from none, and
-from a wild one, but not a good one from a better one.
-"""
+What comes between now and the landing is not known better than this: until it separates the payload
+keeps the velocity that it has, then it flies freely. For right throws of the shipped policies at 2
+m that is off by 0.05 to 0.20 m: it tells a throw from none, and from a wild one, but not a good one
+from a better one."""
 
 import math
 from dataclasses import dataclass
@@ -22,14 +23,20 @@ LONGEST = 3.0  # after which a payload that has not come down is not followed fu
 class AimParams(Bounded):
     """What is done about releases that would lead astray."""
 
-    bound: Positive  # a release whose predicted landing is further from the goal than this is held back [m]
-    patience: Positive  # so long after the first one that was held back the throw ends without a release [s]
+    # a release whose predicted landing is further from the goal than this is held back [m]
+    bound: Positive
+    # so long after the first one that was held back the throw ends without a release [s]
+    patience: Positive
 
 
 class Aim:
-    """Judges the releases that a policy asks for; ``held`` counts those held back so far in this run."""
+    """Judges the releases that a policy asks for; ``held`` counts those held back so far in this
+    run.
+    """
 
-    def __init__(self, params: AimParams | None, ahead: float, height: float, rope: dict[str, Any]) -> None:
+    def __init__(
+        self, params: AimParams | None, ahead: float, height: float, rope: dict[str, Any]
+    ) -> None:
         """Take what the policy was trained with.
 
         Args:
@@ -47,7 +54,9 @@ class Aim:
         self._first = None
 
     def landing(self, payload: BodyState) -> tuple[float, float]:
-        """Return where a payload in this state would land [m], world frame, if the latch tripped now."""
+        """Return where a payload in this state would land [m], world frame, if the latch tripped
+        now.
+        """
         vel = payload.vel
         pos = tuple(x + self._ahead * v for x, v in zip(payload.pos, vel))
         time = 0.0
@@ -75,8 +84,13 @@ class Aim:
             return None
         self.held += 1
         self._first = now if self._first is None else self._first
-        return f"it would land at ({x:.2f}, {y:.2f}) m, {off:.2f} m from the goal, within {self._params.bound:g} m expected"
+        return (
+            f"it would land at ({x:.2f}, {y:.2f}) m, {off:.2f} m from the goal, within"
+            f" {self._params.bound:g} m expected"
+        )
 
     def given_up(self, now: float) -> bool:
-        """Return whether this throw is over at a time [s]: nothing better came within the patience after what was held back."""
+        """Return whether this throw is over at a time [s]: nothing better came within the patience
+        after what was held back.
+        """
         return self._first is not None and now - self._first >= self._params.patience

@@ -1,9 +1,10 @@
-"""Hover calibration in a run: a still hover, a small sway of the runner's own, and what they show of camera and thrust.
+"""Hover calibration in a run: a still hover, a small sway of the runner's own, and what they show
+of camera and thrust.
 
-The runner hovers and sways and takes down what came; the sums are done elsewhere (`Solver`), so that no tick waits for them. What
-they gave is recorded with the tick that it came in, so that a replay decides alike. A throw waits for it, and is refused where it lies
-outside of what was trained or is not known well enough.
-"""
+The runner hovers and sways and takes down what came; the sums are done elsewhere (`Solver`), so
+that no tick waits for them. What they gave is recorded with the tick that it came in, so that a
+replay decides alike. A throw waits for it, and is refused where it lies outside of what was trained
+or is not known well enough."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -29,8 +30,12 @@ class CalibrationParams(Bounded):
     sway: Positive = calibration.SWAY  # [s]
     rate: Positive = calibration.SWAY_RATE  # amplitude of the sway's body rates [rad/s]
     frequency: Positive = calibration.SWAY_FREQUENCY  # of the sway [Hz]
-    most_tilt_deg: Positive = 10.0  # of the camera, which is corrected for; beyond it the field of view is another one
-    most_scale: Positive = 0.06  # of the focal length off the nominal one, which is corrected for [-]
+    most_tilt_deg: Positive = (
+        10.0  # of the camera, which is corrected for; beyond it the field of view is another one
+    )
+    most_scale: Positive = (
+        0.06  # of the focal length off the nominal one, which is corrected for [-]
+    )
     most_latency: Positive = 0.06  # of the keypoints, which is made up for [s]
     thrust: Positive = 0.1  # off the commanded one: twice the spread of masses in training
     sure_tilt_deg: Positive = 0.5  # standard deviation at most
@@ -87,7 +92,9 @@ class Calibrating:
         self._waits = False
 
     def rates(self, now: float, quiet: bool) -> tuple[float, float]:
-        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the vehicle hovers and nothing swings."""
+        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the
+        vehicle hovers and nothing swings.
+        """
         p = self.params
         if self.found is not None or self._waits:
             return 0.0, 0.0
@@ -103,11 +110,33 @@ class Calibrating:
             return 0.0, 0.0
         return calibration.sway(since, p.rate, p.frequency)
 
-    def note(self, now: float, vehicle: BodyState, thrust: float, points: np.ndarray, valid: np.ndarray, age: float) -> None:
-        """Take down a tick: the vehicle as of the poses, the commanded thrust [N], normalised keypoints of a new frame, shape (8, 2), their
-        validity, shape (8,), and their age by the frame's stamp beyond that of the poses [s]."""
+    def note(
+        self,
+        now: float,
+        vehicle: BodyState,
+        thrust: float,
+        points: np.ndarray,
+        valid: np.ndarray,
+        age: float,
+    ) -> None:
+        """Take down a tick: the vehicle as of the poses, the commanded thrust [N], normalised
+        keypoints of a new frame, shape (8, 2), their validity, shape (8,), and their age by the
+        frame's stamp beyond that of the poses [s].
+        """
         if self._begin is not None and not self._waits and self.found is None:
-            self._rows.append((now, vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, thrust, points, valid, age))
+            self._rows.append(
+                (
+                    now,
+                    vehicle.pos,
+                    vehicle.quat,
+                    vehicle.vel,
+                    vehicle.rate,
+                    thrust,
+                    points,
+                    valid,
+                    age,
+                )
+            )
 
     def stop(self) -> None:
         """Begin anew with the next quiet hover: the vehicle was not ours."""
@@ -143,12 +172,24 @@ class Calibrating:
             return ["calibrating in the hover" + (f" again: {self._why}" if self._why else "")]
         tilt, tilts = np.degrees(found.turn_b[:2]), np.degrees(found.turn_sigma[:2])
         limits = {
-            f"camera tilted by {np.abs(tilt).max():.1f} deg, {p.most_tilt_deg:g} at most": np.abs(tilt).max() > p.most_tilt_deg,
-            f"camera's tilt known to {tilts.max():.2f} deg, {p.sure_tilt_deg:g} at most": tilts.max() > p.sure_tilt_deg,
-            f"focal length off by {100 * abs(found.scale):.1f} %, {100 * p.most_scale:g} at most": abs(found.scale) > p.most_scale,
-            f"keypoints {1e3 * found.latency:.0f} ms late, {1e3 * p.most_latency:g} at most": found.latency > p.most_latency,
-            f"keypoints' latency known to {1e3 * found.latency_sigma:.1f} ms, {1e3 * p.sure_latency:g} at most": found.latency_sigma
-            > p.sure_latency,
-            f"thrust {found.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected": abs(found.thrust - 1.0) > p.thrust,
+            f"camera tilted by {np.abs(tilt).max():.1f} deg, {p.most_tilt_deg:g} at most": (
+                np.abs(tilt).max() > p.most_tilt_deg
+            ),
+            f"camera's tilt known to {tilts.max():.2f} deg, {p.sure_tilt_deg:g} at most": (
+                tilts.max() > p.sure_tilt_deg
+            ),
+            f"focal length off by {100 * abs(found.scale):.1f} %, {100 * p.most_scale:g} at most": (
+                abs(found.scale) > p.most_scale
+            ),
+            f"keypoints {1e3 * found.latency:.0f} ms late, {1e3 * p.most_latency:g} at most": (
+                found.latency > p.most_latency
+            ),
+            (
+                f"keypoints' latency known to {1e3 * found.latency_sigma:.1f} ms, "
+                f"{1e3 * p.sure_latency:g} at most"
+            ): found.latency_sigma > p.sure_latency,
+            f"thrust {found.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected": (
+                abs(found.thrust - 1.0) > p.thrust
+            ),
         }
         return [f"{text}: outside of what was trained" for text, broken in limits.items() if broken]

@@ -1,4 +1,6 @@
-"""Hovering on poses, before a throw and after it: where, with what command, and what thrust it takes."""
+"""Hovering on poses, before a throw and after it: where, with what command, and what thrust it
+takes.
+"""
 
 from collections import deque
 
@@ -36,9 +38,16 @@ class Hovering:
         self.place_w = (x, y, max(z - DESCENT * self._period, 0.0))
 
     def command(self, vehicle: BodyState, mass: float) -> tuple[float, ...]:
-        """Return the thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that hangs on it."""
+        """Return the thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that
+        hangs on it.
+        """
         found = self._controller.step(
-            np.array([vehicle.pos]), np.array([vehicle.quat]), np.array([vehicle.vel]), np.array(self.place_w), mass, self._heading
+            np.array([vehicle.pos]),
+            np.array([vehicle.quat]),
+            np.array([vehicle.vel]),
+            np.array(self.place_w),
+            mass,
+            self._heading,
         )
         return tuple(found[0].tolist())
 

@@ -20,9 +20,10 @@ from hil.poses.sources.base import Source
 from hil.poses.sources.images import Eyes
 
 AHEAD, AHEAD_SPREAD = 1e-3, 5e-3
-"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or two alone; earlier by a share of
-the second number that goes round from tick to tick, so that the link is looked at, and peers are asked for their time, at any
-point of their periods."""
+"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or
+two alone; earlier by a share of the second number that goes round from tick to tick, so that the
+link is looked at, and peers are asked for their time, at any point of their periods.
+"""
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -30,7 +31,9 @@ SAY_AGAIN = 3.0  # between two words on why it does not go on that differ in the
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
-COLLECT_ALL = 50  # ticks between two looks of the garbage collector at all that was made since the start; the others see the last tick's
+# ticks between two looks of the garbage collector at all that was made since the start; the others
+# see the last tick's
+COLLECT_ALL = 50
 
 
 class Operator(Protocol):
@@ -41,7 +44,9 @@ class Operator(Protocol):
 
 
 class Lander:
-    """Another operator, who lands too once the camera is calibrated: for a run that is flown for nothing else."""
+    """Another operator, who lands too once the camera is calibrated: for a run that is flown for
+    nothing else.
+    """
 
     def __init__(self, operator: Operator, calibrating: Calibrating) -> None:
         self._operator, self._calibrating = operator, calibrating
@@ -60,7 +65,10 @@ class Loop:
     clock: Clock  # of the ticks
     operator: Operator  # who arms
     recorder: Recorder | None = None  # of the run's folder
-    tell: Callable[[Decision], None] | None = None  # called with the first decision of each state, and of each reason why it does not go on
+    tell: Callable[[Decision], None] | None = (
+        # called with the first decision of each state, and of each reason why it does not go on
+        None
+    )
     stages: Stages = field(default_factory=Stages)  # filled with the times of each stage
     eyes: Eyes | None = None  # a camera, where keypoints are a detector's
     solver: Solver | None = None  # of its calibration
@@ -70,17 +78,20 @@ class Loop:
     _ended: float = -math.inf
     _state: str = ""
     _waits: str = ""
-    _said: dict[str, float] = field(default_factory=dict)  # reasons to wait, without their numbers, and when they were said [s]
+    _said: dict[str, float] = field(
+        default_factory=dict
+    )  # reasons to wait, without their numbers, and when they were said [s]
 
     def __post_init__(self) -> None:
         self.ticker = Ticker(self.clock, self.runner.pilot.period)
 
     def fly(self, most: float = math.inf) -> dict[str, Any]:
-        """Run until the state machine is done, the recorded poses have ended, or for ``most`` seconds; returns the summary.
+        """Run until the state machine is done, the recorded poses have ended, or for ``most``
+        seconds; returns the summary.
 
-        A vehicle that is ours is never left without a word: where the time is over in flight, or something raises, the run is aborted and
-        goes on until it has ended. A second Ctrl-C ends it at once, after one more request to land.
-        """
+        A vehicle that is ours is never left without a word: where the time is over in flight, or
+        something raises, the run is aborted and goes on until it has ended. A second Ctrl-C ends it
+        at once, after one more request to land."""
         runner, clock, begin = self.runner, self.clock, self.clock.now()
         with collected():
             while runner.machine.state is not State.DONE and not self.source.ended:
@@ -92,16 +103,29 @@ class Loop:
                 except KeyboardInterrupt as error:
                     runner.fail(clock.now(), error)
                     break
-                except Exception as error:  # of what stands around the runner: it ends in abort all the same
+                except (
+                    Exception
+                ) as error:  # of what stands around the runner: it ends in abort all the same
                     runner.fail(clock.now(), error)
                     clock.sleep_until(clock.now() + runner.pilot.period)
         return self.summary()
 
     def turn(self, over: bool) -> None:
         """Do one tick; ``over``: the run's time is, and what flies is to come down."""
-        runner, source, clock, ticker, backend = self.runner, self.source, self.clock, self.ticker, self.runner.backend
+        runner, source, clock, ticker, backend = (
+            self.runner,
+            self.source,
+            self.clock,
+            self.ticker,
+            self.runner.backend,
+        )
         source.hold(runner.in_flight)
-        _wait(clock, ticker.due() - AHEAD - AHEAD_SPREAD * (self.count * GOLDEN % 1.0), backend, source)
+        _wait(
+            clock,
+            ticker.due() - AHEAD - AHEAD_SPREAD * (self.count * GOLDEN % 1.0),
+            backend,
+            source,
+        )
         early = source.poll(clock.now())
         runner.take(early)
         _wait(clock, ticker.due(), backend, source)
@@ -123,7 +147,12 @@ class Loop:
         decision = runner.tick(now, late, status, words, recording)
         if self.solver is not None and (hovered := runner.calibrating.due()) is not None:
             self.solver.submit(hovered)
-        times = {"late": ticker.late, "poll": polled - start, **self.stages.poses(early + late, now), **runner.spent}
+        times = {
+            "late": ticker.late,
+            "poll": polled - start,
+            **self.stages.poses(early + late, now),
+            **runner.spent,
+        }
         if "total" in times:
             times["total"] += asked - start
         backend.service(now)
@@ -132,13 +161,17 @@ class Loop:
             self.throws.append(now)
         self._tell(decision)
         if self.recorder is not None:
-            self.recorder.tick(ticker.index, early + late, status, words, recording, decision, times)
+            self.recorder.tick(
+                ticker.index, early + late, status, words, recording, decision, times
+            )
         self.count += 1
         gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
         self._ended = clock.now()
 
     def _tell(self, decision: Decision) -> None:
-        """Say a change of state and a new reason to wait at once, and one that differs in its numbers alone every few seconds."""
+        """Say a change of state and a new reason to wait at once, and one that differs in its
+        numbers alone every few seconds.
+        """
         waits, now = decision.waits, decision.time
         kind = NUMBER.sub("", waits)
         if decision.state != self._state:
@@ -152,7 +185,9 @@ class Loop:
             self.tell(decision)
 
     def summary(self) -> dict[str, Any]:
-        """Return the runner's summary with ticks, misses (all, and ours: of a tick that took too long), and each stage's times."""
+        """Return the runner's summary with ticks, misses (all, and ours: of a tick that took too
+        long), and each stage's times.
+        """
         runner, backend, ticker = self.runner, self.runner.backend, self.ticker
         record = getattr(backend, "release_record", None)  # a dry run has none
         for delay in record.answers if record is not None else ():
@@ -160,9 +195,14 @@ class Loop:
         if runner.machine.state is State.DONE and not runner.machine.aborted:
             backend.finish(self.clock.now())
         return {
-            **runner.summary(), "ticks": self.count, "missed": ticker.missed, "missed_ours": self.ours,
-            "worst_late_s": ticker.worst, "latency": self.stages.summary(), "latch_times": self.throws,
-        }  # fmt: skip
+            **runner.summary(),
+            "ticks": self.count,
+            "missed": ticker.missed,
+            "missed_ours": self.ours,
+            "worst_late_s": ticker.worst,
+            "latency": self.stages.summary(),
+            "latch_times": self.throws,
+        }
 
 
 def _wait(clock: Clock, until: float, backend: Backend, source: Source) -> None:

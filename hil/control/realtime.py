@@ -1,8 +1,9 @@
-"""What a system can be asked for, so that ticks come in time: a real-time priority, and memory that stays in memory.
+"""What a system can be asked for, so that ticks come in time: a real-time priority, and memory that
+stays in memory.
 
-Both need rights: ``setcap cap_sys_nice,cap_ipc_lock+ep`` on the interpreter, or ``rtprio`` and ``memlock`` in
-``/etc/security/limits.conf``. What is not granted is said, and the run goes on without it.
-"""
+Both need rights: ``setcap cap_sys_nice,cap_ipc_lock+ep`` on the interpreter, or ``rtprio`` and
+``memlock`` in ``/etc/security/limits.conf``. What is not granted is said, and the run goes on
+without it."""
 
 import ctypes
 import gc
@@ -15,7 +16,9 @@ from typing import Annotated
 
 from visthrow.config.bounds import Bound, Bounded
 
-SWITCH = 5e-4  # after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
+SWITCH = (
+    5e-4  # after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
+)
 LOCK_CURRENT, LOCK_FUTURE = 1, 2  # Flags of mlockall(2)
 
 
@@ -42,10 +45,11 @@ def collected() -> Iterator[None]:
 
 
 def prepare(params: RealtimeParams) -> list[str]:
-    """Ask for what is wanted, for this thread and those that it starts from now on; returns what was refused, and why.
+    """Ask for what is wanted, for this thread and those that it starts from now on; returns what
+    was refused, and why.
 
-    The network runs on one thread, more only wait for each other; the recorder's gives way to the flying one soon.
-    """
+    The network runs on one thread, more only wait for each other; the recorder's gives way to the
+    flying one soon."""
     import torch
 
     torch.set_num_threads(1)
@@ -64,7 +68,9 @@ def prepare(params: RealtimeParams) -> list[str]:
 
 
 def keep(params: RealtimeParams) -> list[str]:
-    """Keep the priority from threads and processes that are started from now on; returns as :func:`prepare`."""
+    """Keep the priority from threads and processes that are started from now on; returns as
+    :func:`prepare`.
+    """
     return _schedule(params.priority, os.SCHED_RESET_ON_FORK) if params.priority else []
 
 

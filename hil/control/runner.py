@@ -1,8 +1,9 @@
-"""The runner: each tick from poses to a command. Nothing raises past it; what goes wrong ends in the abort state.
+"""The runner: each tick from poses to a command.
 
-A tick depends on its time, the poses that came, the back-end's status and the operator's words, and on nothing else;
-these are recorded, so that a replay decides alike to the last bit.
-"""
+Nothing raises past it; what goes wrong ends in the abort state.
+
+A tick depends on its time, the poses that came, the back-end's status and the operator's words, and
+on nothing else; these are recorded, so that a replay decides alike to the last bit."""
 
 import copy
 import math
@@ -34,18 +35,27 @@ from visthrow.onboard.pilot import Pilot, PilotOutput
 from visthrow.onboard.policy import Policy
 
 STILL_OFFSET, STILL_SPEED = 0.05, 0.25
-"""Vehicle off its hover point [m], vehicle and payload speed over 0.2 s [m/s] that count as quiet: half of what the
-policies were trained to start from."""
+"""Vehicle off its hover point [m], vehicle and payload speed over 0.2 s [m/s] that count as quiet:
+half of what the policies were trained to start from.
+"""
 
-REACQUIRE = 1.0  # before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is [s]
+# before the vehicle is ours, a body that was refused or gone for this long is taken wherever it is
+# [s]
+REACQUIRE = 1.0
 
 HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
-"""Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on poses [m/s, rad]."""
+"""Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on
+poses [m/s, rad].
+"""
 
 GROUND = 0.12  # height of the vehicle that counts as landed [m]
-LEVEL_TIME = 0.5  # an aborted run without poses levels the vehicle for this long and then falls silent: the autopilot's failsafes act [s]
+# an aborted run without poses levels the vehicle for this long and then falls silent: the
+# autopilot's failsafes act [s]
+LEVEL_TIME = 0.5
 
-WARM_CALLS = 3  # calls of the policy before it is to fly: the first records its operations, the others find code and data at hand
+# calls of the policy before it is to fly: the first records its operations, the others find code
+# and data at hand
+WARM_CALLS = 3
 MOST_ERRORS = 100  # tracebacks that are kept
 
 
@@ -66,7 +76,9 @@ class Seen:
 def calm(vehicle: BodyState) -> bool:
     """Return whether a vehicle is slow and level enough to be handed over."""
     x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
-    return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
+    return math.hypot(*vehicle.vel) < HAND_OVER_SPEED and 1.0 - 2.0 * (x * x + y * y) > math.cos(
+        HAND_OVER_TILT
+    )
 
 
 class Runner:
@@ -78,31 +90,56 @@ class Runner:
         tracks: by body. latch: of the release, with the landings so far.
         hovering: on poses, where no policy flies. errors: tracebacks of what was caught, each once.
         mass: of vehicle, rope and payload [kg]. alone: of the vehicle [kg].
-        mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick [m].
+        mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick
+            [m].
         spent: time that parts of the last tick took [s]; those that it did not do are missing.
         watcher: called with each pose's body and track once it was taken; None for nobody.
     """
 
-    def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0) -> None:
+    def __init__(
+        self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0
+    ) -> None:
         """Build all parts; the mechanism's lag is from its command to separation [s].
 
-        Raises MismatchError, PolicyError: the camera is not the one that the policy was trained with, or the policy is incomplete;
-        RunError: the mechanism is slower than the policy was trained for.
-        """
+        Raises MismatchError, PolicyError: the camera is not the one that the policy was trained
+        with, or the policy is incomplete; RunError: the mechanism is slower than the policy was
+        trained for."""
         self.params, self.backend = params, backend
         self.pilot = Pilot(policy, params.camera)
         contract = policy.contract
         rope, body, action = contract["rope"], contract["vehicle"]["body"], contract["action"]
-        self.alone, self.mass = body["mass"], body["mass"] + rope["rope_mass"] + rope["payload_mass"]
+        self.alone, self.mass = (
+            body["mass"],
+            body["mass"] + rope["rope_mass"] + rope["payload_mass"],
+        )
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
-        height, later = params.landing_height, params.delay.command if params.delay.compensate else 0.0
-        self.latch = Latch(self.pilot.lag, mechanism_lag, self.hang, params.check.rope_tolerance, height, later)
-        self._reach = math.hypot(*rope["mount"]) + rope["length"] + rope["payload_offset"] + params.check.rope_tolerance
-        self.guard = Guard(params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"])))
-        self.tracks = {name: Track(frames, params.gate, params.estimate, name == VEHICLE) for name, frames in params.frames.items()}
-        self.machine = Machine(params.states, params.throws, params.observe, params.backend != "dry-run")
+        height, later = (
+            params.landing_height,
+            (params.delay.command if params.delay.compensate else 0.0),
+        )
+        self.latch = Latch(
+            self.pilot.lag, mechanism_lag, self.hang, params.check.rope_tolerance, height, later
+        )
+        self._reach = (
+            math.hypot(*rope["mount"])
+            + rope["length"]
+            + rope["payload_offset"]
+            + params.check.rope_tolerance
+        )
+        self.guard = Guard(
+            params.guard, float(action["max_thrust"]), tuple(map(float, action["max_rate"]))
+        )
+        self.tracks = {
+            name: Track(frames, params.gate, params.estimate, name == VEHICLE)
+            for name, frames in params.frames.items()
+        }
+        self.machine = Machine(
+            params.states, params.throws, params.observe, params.backend != "dry-run"
+        )
         heading = math.radians(params.check.heading_deg)
-        self.hovering = Hovering(params.home_w, heading, float(action["max_thrust"]), self.pilot.period)
+        self.hovering = Hovering(
+            params.home_w, heading, float(action["max_thrust"]), self.pilot.period
+        )
         self._aged = 0.5 * sum(contract["observation"]["latency"])
         self.aim = Aim(params.aim, self._aged + self.latch.lag, height, rope)
         self._acted = State.IDLE
@@ -113,17 +150,31 @@ class Runner:
         self.spent: dict[str, float] = {}
         self._untaken: Exception | None = None
         self.watcher: Callable[[str, Track], None] | None = None
-        self.detections = Detections(self.pilot.camera, params.images.hold) if params.keypoints == "detector" else None
+        self.detections = (
+            Detections(self.pilot.camera, params.images.hold)
+            if params.keypoints == "detector"
+            else None
+        )
         self._detection: Detection | None = None
         wants = params.calibration is not None and self.detections is not None
-        self.calibrating = Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
+        self.calibrating = (
+            Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
+        )
         self._calibration: Calibration | str | None = None
 
-    def tick(self, now: float, poses: list[Pose], status: Status, words: OperatorInput, recording: bool = True) -> Decision:
+    def tick(
+        self,
+        now: float,
+        poses: list[Pose],
+        status: Status,
+        words: OperatorInput,
+        recording: bool = True,
+    ) -> Decision:
         """Decide one tick and send its command.
 
         Args:
-            now: on the runner's clock [s]. poses: raw, that have come since the last tick. status: of the back-end, at this tick.
+            now: on the runner's clock [s]. poses: raw, that have come since the last tick. status:
+                of the back-end, at this tick.
             words: of the operator. recording: whether all was recorded so far.
         """
         self.spent = {}
@@ -133,11 +184,22 @@ class Runner:
             return self.fail(now, error)
 
     def fail(self, now: float, error: BaseException) -> Decision:
-        """End the run because of an exception: abort, and no further release. The autopilot is asked to land, tick by tick."""
+        """End the run because of an exception: abort, and no further release.
+
+        The autopilot is asked to land, tick by tick.
+        """
         told = "".join(traceback.format_exception(error))
-        if isinstance(error, Exception) and told not in self.errors and len(self.errors) < MOST_ERRORS:
+        if (
+            isinstance(error, Exception)
+            and told not in self.errors
+            and len(self.errors) < MOST_ERRORS
+        ):
             self.errors.append(told)
-        what = "Ctrl-C twice" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
+        what = (
+            "Ctrl-C twice"
+            if isinstance(error, KeyboardInterrupt)
+            else f"{type(error).__name__}: {error}"
+        )
         self.machine.step(now, Inputs(3, 3, failure=what))
         self.backend.stop_release()
         if self.machine.flown:
@@ -150,11 +212,23 @@ class Runner:
         return self.machine.flown and self.machine.state is not State.DONE
 
     def warm_up(self, vehicle: BodyState | None = None) -> None:
-        """Call the policy a few times on a copy, so that the first calls of a throw find code and data at hand."""
-        pilot, pos = copy.copy(self.pilot), np.array([self.params.home_w if vehicle is None else vehicle.pos])
+        """Call the policy a few times on a copy, so that the first calls of a throw find code and
+        data at hand.
+        """
+        pilot, pos = (
+            copy.copy(self.pilot),
+            np.array([self.params.home_w if vehicle is None else vehicle.pos]),
+        )
         still, goal_w = np.zeros((1, 3)), np.array(self.params.goal_w)
         for _ in range(WARM_CALLS):
-            pilot.act(pos, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, pos - [0.0, 0.0, self.hang], goal_w)
+            pilot.act(
+                pos,
+                np.array([[0.0, 0.0, 0.0, 1.0]]),
+                still,
+                still,
+                pos - [0.0, 0.0, self.hang],
+                goal_w,
+            )
 
     def look(self, detections: list[Detection]) -> None:
         """Take in what a camera saw since the last tick; of several frames the newest counts."""
@@ -162,16 +236,21 @@ class Runner:
             self._detection = detections[-1]
 
     def hint(self, now: float) -> Hint | None:
-        """Return what a detector is told before it looks: vehicle and, while the payload hangs, how far off it can be."""
+        """Return what a detector is told before it looks: vehicle and, while the payload hangs, how
+        far off it can be.
+        """
         vehicle = self.tracks[VEHICLE].state(now)
         if vehicle is None or vehicle.quat is None or self.tracks[VEHICLE].gate.level(now) >= HOLD:
             return None
         hangs = self.latch.at is None
-        return Hint(vehicle.pos, vehicle.quat, (0.5 * self.hang, 1.4 * self.hang) if hangs else None)
+        return Hint(
+            vehicle.pos, vehicle.quat, (0.5 * self.hang, 1.4 * self.hang) if hangs else None
+        )
 
     def take(self, poses: list[Pose]) -> None:
-        """Take in poses before the tick that they belong to, so that it has less to do, and decides as with all of them: what goes wrong
-        here comes up there."""
+        """Take in poses before the tick that they belong to, so that it has less to do, and decides
+        as with all of them: what goes wrong here comes up there.
+        """
         try:
             if self._untaken is None:
                 self._take(poses)
@@ -187,9 +266,13 @@ class Runner:
             if took and self.watcher is not None:
                 self.watcher(pose.body, track)
             if took and pose.body == PAYLOAD:
-                self.latch.follow(pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos)
+                self.latch.follow(
+                    pose.arrival - pose.transit(self.params.delay.source), track.gate.last.pos
+                )
 
-    def _tick(self, now: float, poses: list[Pose], status: Status, words: OperatorInput, recording: bool) -> Decision:
+    def _tick(
+        self, now: float, poses: list[Pose], status: Status, words: OperatorInput, recording: bool
+    ) -> Decision:
         begin = perf_counter()
         seen = self._estimate(now, poses)
         decision, state = self._decide(now, seen, status, words, recording)
@@ -200,7 +283,9 @@ class Runner:
         self._ask(now, state, seen.vehicle, status)
         if self.params.observe and decision.action is None and seen.known and seen.vehicle.quat:
             self._show(seen, decision)
-        decision.command = self._guarded(now, wanted if self._ours(state, status) else None, decision)
+        decision.command = self._guarded(
+            now, wanted if self._ours(state, status) else None, decision
+        )
         self._send(now, state, decision, status, seen, begin)
         return decision
 
@@ -213,18 +298,22 @@ class Runner:
         self.latch.overdue(now)
         if self.machine.state in (State.IDLE, State.CHECK):
             for track in self.tracks.values():
-                # On the ground a body may be carried about out of sight; in flight what has jumped stays refused.
+                # On the ground a body may be carried about out of sight; in flight what has jumped
+                # stays refused.
                 if REACQUIRE < track.gate.age(now) < math.inf:
                     track.restart()
         bodies = {name: self._state(track, now) for name, track in self.tracks.items()}
         self.seen_goal_w = self._goal(bodies)
         return Seen(bodies[VEHICLE], bodies[PAYLOAD], self.seen_goal_w)
 
-    def _decide(self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool) -> tuple[Decision, State]:
+    def _decide(
+        self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool
+    ) -> tuple[Decision, State]:
         """Move the state machine on, and do what a change of state brings with it."""
         inputs = self._inputs(now, seen, status, words, recording)
         state = self.machine.step(now, inputs)
-        # The last tick may itself have ended in another state than it acted in: a command refused, an exception.
+        # The last tick may itself have ended in another state than it acted in: a command refused,
+        # an exception.
         before, self._acted = self._acted, state
         if state is not before:
             self._entered(now, before, state, seen.vehicle)
@@ -235,14 +324,20 @@ class Runner:
         detection, self._detection = self._detection, None
         if self.detections is not None and detection is not None:
             decision.seen = detection.values()
-        if self.detections is not None and seen.vehicle is not None and seen.vehicle.quat is not None:
+        if (
+            self.detections is not None
+            and seen.vehicle is not None
+            and seen.vehicle.quat is not None
+        ):
             self.detections.along(now, seen.vehicle.pos, seen.vehicle.quat)
             if detection is not None:
                 self.detections.take(detection, seen.vehicle.quat, self._shown_age(now))
         return decision, state
 
     def _ours(self, state: State, status: Status) -> bool:
-        """Return whether commands are sent: not to what was handed or taken over, hears nothing or was never ours."""
+        """Return whether commands are sent: not to what was handed or taken over, hears nothing or
+        was never ours.
+        """
         if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
             return False
         return state is not State.ABORT or (status.connected and self.machine.flown)
@@ -252,9 +347,17 @@ class Runner:
         self._calibration = result
 
     def _calibrated(
-        self, now: float, state: State, seen: Seen, status: Status, wanted: tuple[float, ...] | None, decision: Decision
+        self,
+        now: float,
+        state: State,
+        seen: Seen,
+        status: Status,
+        wanted: tuple[float, ...] | None,
+        decision: Decision,
     ) -> tuple[float, ...] | None:
-        """Return the command with the sway of a calibration; what came in this tick is taken down."""
+        """Return the command with the sway of a calibration; what came in this tick is
+        taken down.
+        """
         calibrating, result = self.calibrating, self._calibration
         if result is not None:
             self._calibration = None
@@ -262,17 +365,26 @@ class Runner:
             decision.calibration = result if isinstance(result, str) else result.values()
             if isinstance(result, Calibration) and self.detections is not None:
                 self.detections.correct(result)
-        ours = state is State.READY and status.mode == FOLLOW and seen.known and seen.vehicle.quat is not None
+        ours = (
+            state is State.READY
+            and status.mode == FOLLOW
+            and seen.known
+            and seen.vehicle.quat is not None
+        )
         if not ours or wanted is None:
             calibrating.stop()
             return wanted
         roll, pitch = calibrating.rates(now, self._still(seen.vehicle, seen.payload, False))
         if decision.seen is not None and self.detections.fresh is not None:
             stamp, points, valid = self.detections.fresh
-            calibrating.note(now, seen.vehicle, wanted[0], points, valid, now - self._shown_age(now) - stamp)
+            calibrating.note(
+                now, seen.vehicle, wanted[0], points, valid, now - self._shown_age(now) - stamp
+            )
         return (wanted[0], wanted[1] + roll, wanted[2] + pitch, wanted[3])
 
-    def _guarded(self, now: float, wanted: tuple[float, ...] | None, decision: Decision) -> tuple[float, ...] | None:
+    def _guarded(
+        self, now: float, wanted: tuple[float, ...] | None, decision: Decision
+    ) -> tuple[float, ...] | None:
         """Return a command within its limits; one that is not finite ends the run."""
         if wanted is None:
             self.guard.reset()
@@ -285,14 +397,20 @@ class Runner:
             self.backend.stop_release()
         return command
 
-    def _send(self, now: float, state: State, decision: Decision, status: Status, seen: Seen, begin: float) -> None:
+    def _send(
+        self, now: float, state: State, decision: Decision, status: Status, seen: Seen, begin: float
+    ) -> None:
         """Send the command, then the release, then the request to land."""
         if decision.command is not None:
             ready = perf_counter()
             self.backend.send(decision.command, now)
             self.spent["send"] = perf_counter() - ready
             self.spent["total"] = perf_counter() - begin
-        hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW and decision.command is not None
+        hovers = (
+            state in (State.READY, State.ARMED)
+            and status.mode == FOLLOW
+            and decision.command is not None
+        )
         self.hovering.note(decision.command[0] / (self.mass * GRAVITY) if hovers else None)
         if decision.release:
             self.backend.release(self.latch.trip(now, seen.goal_w))
@@ -300,7 +418,9 @@ class Runner:
             self.backend.abort(now)
 
     def _tether(self, pose: Pose) -> Tether | None:
-        """Return the cable's other end for a pose of vehicle or payload while the payload hangs; None on the ground and after."""
+        """Return the cable's other end for a pose of vehicle or payload while the payload hangs;
+        None on the ground and after.
+        """
         other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
         if other is None or self.latch.at is not None or self.machine.state not in FLYING:
             return None
@@ -322,7 +442,9 @@ class Runner:
             self.backend.ask(LAND, now)
 
     def _state(self, track: Track, now: float) -> BodyState | None:
-        """Return the state of a body, carried forward to the age that the policy was trained with where the config says so."""
+        """Return the state of a body, carried forward to the age that the policy was trained with
+        where the config says so.
+        """
         delay, age = self.params.delay, self._age(track, now)
         ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
         return track.state(now, ahead)
@@ -333,7 +455,9 @@ class Runner:
         return track.gate.age(now) + (source if last is None else last.transit(source))
 
     def _shown_age(self, now: float) -> float:
-        """Return the age of the vehicle's pose as the policy is shown it [s]: younger ones than it was trained with stay so."""
+        """Return the age of the vehicle's pose as the policy is shown it [s]: younger ones than it
+        was trained with stay so.
+        """
         age = self._age(self.tracks[VEHICLE], now)
         return min(age, self._aged) if self.params.delay.compensate else age
 
@@ -341,7 +465,9 @@ class Runner:
         goal = bodies.get(GOAL)
         return self.params.goal_w if GOAL not in self.tracks else None if goal is None else goal.pos
 
-    def _inputs(self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool) -> Inputs:
+    def _inputs(
+        self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool
+    ) -> Inputs:
         p, state = self.params, self.machine.state
         vehicle, payload, goal_w = seen.vehicle, seen.payload, seen.goal_w
         hanging = payload if self.latch.at is None else None
@@ -349,8 +475,13 @@ class Runner:
         if status.release == FAILED and state in (State.THROW, State.RECOVER):
             failure = "the release was refused or not answered"
         checks = ["a body has no pose yet"]
-        # After a throw the payload may have been hung on again; only the operator's next word makes the latch new.
-        if seen.known and state is not State.THROW and (self.latch.at is None or state is State.READY):
+        # After a throw the payload may have been hung on again; only the operator's next word makes
+        # the latch new.
+        if (
+            seen.known
+            and state is not State.THROW
+            and (self.latch.at is None or state is State.READY)
+        ):
             checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
@@ -359,27 +490,56 @@ class Runner:
                 checks += self.detections.problems(now)
                 checks += self.calibrating.problems() if self.calibrating is not None else []
         # What has not been answered is not over: the payload may yet come off.
-        over = vehicle is not None and state in (State.ARMED, State.RECOVER) and status.release != PENDING
+        over = (
+            vehicle is not None
+            and state in (State.ARMED, State.RECOVER)
+            and status.release != PENDING
+        )
         # While landing the fence's floor is left on purpose.
-        fence = fence_broken(p.fence, vehicle, hanging) if vehicle is not None and state is not State.LAND else None
+        fence = (
+            fence_broken(p.fence, vehicle, hanging)
+            if vehicle is not None and state is not State.LAND
+            else None
+        )
         return Inputs(
-            self.tracks[VEHICLE].gate.level(now), self.tracks[PAYLOAD].gate.level(now), status.connected, tuple(checks), fence,
-            over and self._still(vehicle, payload, status.mode == HELD), self.latch.separated(now), self.latch.at is not None,
-            self.latch.at is None and not self._carries(now, vehicle, payload), self.aim.given_up(now),
-            vehicle is not None and vehicle.pos[2] < GROUND, failure,
-            words.arm, words.land, words.abort, recording, status.mode == FOLLOW, status.note, words.why,
-        )  # fmt: skip
+            self.tracks[VEHICLE].gate.level(now),
+            self.tracks[PAYLOAD].gate.level(now),
+            status.connected,
+            tuple(checks),
+            fence,
+            over and self._still(vehicle, payload, status.mode == HELD),
+            self.latch.separated(now),
+            self.latch.at is not None,
+            self.latch.at is None and not self._carries(now, vehicle, payload),
+            self.aim.given_up(now),
+            vehicle is not None and vehicle.pos[2] < GROUND,
+            failure,
+            words.arm,
+            words.land,
+            words.abort,
+            recording,
+            status.mode == FOLLOW,
+            status.note,
+            words.why,
+        )
 
     def _thrust_off(self) -> list[str]:
-        """Return whether hovering takes another thrust than the weight: then the calibration is wrong, or the battery low."""
+        """Return whether hovering takes another thrust than the weight: then the calibration is
+        wrong, or the battery low.
+        """
         p, ratio = self.params, self.hovering.share()
         allowed = math.inf if p.backend == "dry-run" else getattr(p, p.backend).thrust.tolerance
         if ratio is None or abs(ratio - 1.0) <= allowed:
             return []
-        return [f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate the thrust"]
+        return [
+            f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected:"
+            " calibrate the thrust"
+        ]
 
     def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
-        """Return whether all is quiet, at the hover point or where the autopilot holds the vehicle."""
+        """Return whether all is quiet, at the hover point or where the autopilot holds
+        the vehicle.
+        """
         if not held and math.dist(vehicle.pos, self.params.home_w) > STILL_OFFSET:
             return False
         moving = [VEHICLE] + ([PAYLOAD] if self.latch.at is None and payload is not None else [])
@@ -388,8 +548,13 @@ class Runner:
     def _entered(self, now: float, before: State, state: State, vehicle: BodyState | None) -> None:
         """Do what a change of state brings with it."""
         if before is State.THROW:
-            # A fast mechanism may have to be told only after the policy's own time of separation, where commands act late.
-            self._stop_at = self.latch.commanded if state is State.RECOVER and self.latch.at is not None else now
+            # A fast mechanism may have to be told only after the policy's own time of separation,
+            # where commands act late.
+            self._stop_at = (
+                self.latch.commanded
+                if state is State.RECOVER and self.latch.at is not None
+                else now
+            )
         if state is State.ARMED:
             self.latch.rearm()
             self.backend.rearm()
@@ -403,7 +568,9 @@ class Runner:
         if state in (State.LAND, State.ABORT) and vehicle is not None:
             self.hovering.hold(vehicle.pos)
 
-    def _command(self, now: float, state: State, seen: Seen, decision: Decision) -> tuple[float, ...] | None:
+    def _command(
+        self, now: float, state: State, seen: Seen, decision: Decision
+    ) -> tuple[float, ...] | None:
         """Return what to send in a state, before the guard; None for nothing."""
         if state not in FLYING and state is not State.ABORT:
             return None
@@ -432,7 +599,9 @@ class Runner:
         if out.release[0] and self.latch.at is None:
             fence = self.params.fence
             beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
-            wrong = f"payload {beyond}" if beyond else self.aim.astray(decision.time, payload, goal_w)
+            wrong = (
+                f"payload {beyond}" if beyond else self.aim.astray(decision.time, payload, goal_w)
+            )
             decision.release = wrong is None
             if wrong is not None:
                 decision.note = f"release refused: {wrong}"
@@ -443,9 +612,14 @@ class Runner:
         """Show the policy what there is to see, and note what it makes of it."""
         vehicle, payload = seen.vehicle, seen.payload
         attached = not self.latch.separated(decision.time)
-        views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
+        views = [
+            np.array([v])
+            for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)
+        ]
         keypoints = None if self.detections is None else self.detections.keypoints(decision.time)
-        out: PilotOutput = self.pilot.act(*views, np.array(seen.goal_w), attached, keypoints, decision.time)
+        out: PilotOutput = self.pilot.act(
+            *views, np.array(seen.goal_w), attached, keypoints, decision.time
+        )
         self.spent["observation"], self.spent["policy"] = self.pilot.spent
         decision.action = out.action[0].tolist()
         decision.observation = out.observation[0].tolist()
@@ -461,19 +635,34 @@ class Runner:
         if missing:
             return missing
         p = self.params
-        return failed_checks(p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang)
+        return failed_checks(
+            p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return counts of the run so far."""
         machine, found = self.machine, None if self.calibrating is None else self.calibrating.found
         bodies = {
-            name: {"accepted": track.accepted, "refused": track.gate.refused, "filter_lag": track.filter.lag}
+            name: {
+                "accepted": track.accepted,
+                "refused": track.gate.refused,
+                "filter_lag": track.filter.lag,
+            }
             for name, track in self.tracks.items()
         }
         return {
-            "state": machine.state.value, "reason": machine.reason, "aborted": machine.aborted, "throws": machine.throws,
-            "cancelled": machine.cancelled, "latches": self.latch.count, "stuck": self.latch.stuck, "held_back": self.aim.held,
+            "state": machine.state.value,
+            "reason": machine.reason,
+            "aborted": machine.aborted,
+            "throws": machine.throws,
+            "cancelled": machine.cancelled,
+            "latches": self.latch.count,
+            "stuck": self.latch.stuck,
+            "held_back": self.aim.held,
             "landings": [asdict(landing) for landing in self.latch.landings],
-            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")}, "bodies": bodies,
-            "left_fence": machine.left_fence, "calibration": None if found is None else found.values(), "errors": self.errors,
-        }  # fmt: skip
+            "guard": {k: getattr(self.guard, k) for k in ("clipped", "slewed", "refused")},
+            "bodies": bodies,
+            "left_fence": machine.left_fence,
+            "calibration": None if found is None else found.values(),
+            "errors": self.errors,
+        }

@@ -12,17 +12,24 @@ from visthrow.config.bounds import Bounded, Positive
 
 @dataclass(frozen=True)
 class GuardParams(Bounded):
-    """Limits on the change of a command from one tick to the next. Its bounds are those of the policy's training."""
+    """Limits on the change of a command from one tick to the next.
+
+    Its bounds are those of the policy's training.
+    """
 
     slew_thrust: Positive  # [N]
     slew_rate: tuple[Positive, Positive, Positive]  # [rad/s]
 
 
 class Guard:
-    """Clips and slew-limits commands, and refuses those that are not finite; counts what it clipped, slewed and refused."""
+    """Clips and slew-limits commands, and refuses those that are not finite; counts what it
+    clipped, slewed and refused.
+    """
 
     def __init__(self, params: GuardParams, max_thrust: float, max_rate: Vector) -> None:
-        """Take the limits: collective thrust within 0 and ``max_thrust`` [N], body rates within ``max_rate`` [rad/s]."""
+        """Take the limits: collective thrust within 0 and ``max_thrust`` [N], body rates within
+        ``max_rate`` [rad/s].
+        """
         self._low, self._high = (0.0, *(-r for r in max_rate)), (max_thrust, *max_rate)
         self._slew = (params.slew_thrust, *params.slew_rate)
         self._last: tuple[float, ...] | None = None
@@ -37,10 +44,15 @@ class Guard:
         if len(command) != 4 or not all(map(math.isfinite, command)):
             self.refused += 1
             return None
-        bounded = tuple(min(max(c, low), high) for c, low, high in zip(command, self._low, self._high))
+        bounded = tuple(
+            min(max(c, low), high) for c, low, high in zip(command, self._low, self._high)
+        )
         self.clipped += bounded != command
         if self._last is not None:
-            slow = tuple(min(max(c, last - s), last + s) for c, last, s in zip(bounded, self._last, self._slew))
+            slow = tuple(
+                min(max(c, last - s), last + s)
+                for c, last, s in zip(bounded, self._last, self._slew)
+            )
             self.slewed += slow != bounded
             bounded = slow
         self._last = bounded
@@ -49,7 +61,9 @@ class Guard:
 
 @dataclass(frozen=True)
 class FenceParams(Bounded):
-    """Boxes in our world that vehicle and payload may not leave, and the goal may not lie outside of."""
+    """Boxes in our world that vehicle and payload may not leave, and the goal may not lie outside
+    of.
+    """
 
     vehicle_low: tuple[float, float, float]  # [m]
     vehicle_high: tuple[float, float, float]  # [m]
@@ -59,13 +73,20 @@ class FenceParams(Bounded):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for body, lowest, highest in (("vehicle", self.vehicle_low, self.vehicle_high), ("payload", self.payload_low, self.payload_high)):
+        for body, lowest, highest in (
+            ("vehicle", self.vehicle_low, self.vehicle_high),
+            ("payload", self.payload_low, self.payload_high),
+        ):
             if any(low >= high for low, high in zip(lowest, highest)):
-                raise ConfigError(f"{body}_low is {lowest} m, {body}_high {highest} m; expected ascending corners")
+                raise ConfigError(
+                    f"{body}_low is {lowest} m, {body}_high {highest} m; expected ascending corners"
+                )
 
 
 def outside(point: Vector, low: Vector, high: Vector) -> str | None:
-    """Return the first axis along which a point lies outside of a box, with its value; None inside."""
+    """Return the first axis along which a point lies outside of a box, with its value;
+    None inside.
+    """
     for axis, x, least, most in zip("xyz", point, low, high):
         if not least <= x <= most:
             return f"{axis} {x:.2f} m beyond {least:g} to {most:g} m"
@@ -73,8 +94,13 @@ def outside(point: Vector, low: Vector, high: Vector) -> str | None:
 
 
 def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | None) -> str | None:
-    """Return which fence is broken, or will be at the end of braking, or None. A payload that flies freely, None, cannot brake."""
-    stop = tuple(x + v * abs(v) / (2.0 * params.deceleration) for x, v in zip(vehicle.pos, vehicle.vel))
+    """Return which fence is broken, or will be at the end of braking, or None.
+
+    A payload that flies freely, None, cannot brake.
+    """
+    stop = tuple(
+        x + v * abs(v) / (2.0 * params.deceleration) for x, v in zip(vehicle.pos, vehicle.vel)
+    )
     bodies = [("vehicle", vehicle.pos, "vehicle"), ("vehicle's braking point", stop, "vehicle")]
     bodies += [] if payload is None else [("payload", payload.pos, "payload")]
     for name, point, box in bodies:
@@ -85,21 +111,32 @@ def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | N
 
 @dataclass(frozen=True)
 class CheckParams:
-    """What must hold before the runner lets itself be armed; each catches a mistake that no single pose betrays."""
+    """What must hold before the runner lets itself be armed; each catches a mistake that no single
+    pose betrays.
+    """
 
     tilt_deg: float  # of the vehicle: a wrong quaternion order stands it on its head
-    heading_deg: float  # that the vehicle is put up with: 90 or 180 deg off, an axis or a quaternion is exchanged
+    # that the vehicle is put up with: 90 or 180 deg off, an axis or a quaternion is exchanged
+    heading_deg: float
     heading_tolerance_deg: float
-    rope_tolerance: float  # between payload and vehicle against the rope's length [m]: bodies exchanged, marker lost
+    # between payload and vehicle against the rope's length [m]: bodies exchanged, marker lost
+    rope_tolerance: float
     home_radius: float  # of the vehicle from its hover point [m]
     speed: float  # of the vehicle, noise included [m/s]
 
 
 def failed_checks(
-    params: CheckParams, fence: FenceParams, vehicle: BodyState, payload: BodyState, goal_w: Vector, home_w: Vector,
+    params: CheckParams,
+    fence: FenceParams,
+    vehicle: BodyState,
+    payload: BodyState,
+    goal_w: Vector,
+    home_w: Vector,
     hang: float,
-) -> list[str]:  # fmt: skip
-    """Return what speaks against a throw, in words; ``hang`` is what the payload hangs below the vehicle at rest [m]."""
+) -> list[str]:
+    """Return what speaks against a throw, in words; ``hang`` is what the payload hangs below the
+    vehicle at rest [m].
+    """
     failed = []
     if vehicle.quat is None:
         return ["the vehicle's source gives no attitude"]
@@ -108,10 +145,16 @@ def failed_checks(
         failed.append(f"vehicle tilted by {tilt:.0f} deg (quaternion order or body axes wrong?)")
     off = (heading - params.heading_deg + 180.0) % 360.0 - 180.0
     if abs(off) > params.heading_tolerance_deg:
-        failed.append(f"heading {heading:.0f} deg, not {params.heading_deg:g} (axes, yaw offset or quaternion wrong?)")
+        failed.append(
+            f"heading {heading:.0f} deg, not {params.heading_deg:g} (axes, yaw offset or quaternion"
+            " wrong?)"
+        )
     below = math.dist(payload.pos, (vehicle.pos[0], vehicle.pos[1], vehicle.pos[2] - hang))
     if below > params.rope_tolerance:
-        failed.append(f"payload {below:.2f} m from where it should hang (bodies exchanged, or an offset wrong?)")
+        failed.append(
+            f"payload {below:.2f} m from where it should hang (bodies exchanged, or an offset"
+            " wrong?)"
+        )
     away = math.dist(vehicle.pos, home_w)
     if away > params.home_radius:
         failed.append(f"vehicle {away:.2f} m from its hover point")

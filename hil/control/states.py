@@ -1,11 +1,12 @@
-"""State machine of a run: what stale poses, fences, time-outs and a silent autopilot lead to; pure logic.
+"""State machine of a run: what stale poses, fences, time-outs and a silent autopilot lead to; pure
+logic.
 
     idle -> check -> ready -> armed -> throw -> recover -> ready (more throws) or land -> done
     any -> abort -> done
 
-``idle`` waits for poses and the autopilot, ``check`` for the checks to hold for a while. From ``ready`` on the runner
-commands: its hover controller holds the vehicle. Each throw needs its own word of the operator.
-"""
+``idle`` waits for poses and the autopilot, ``check`` for the checks to hold for a while. From
+``ready`` on the runner commands: its hover controller holds the vehicle. Each throw needs its own
+word of the operator."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -28,7 +29,13 @@ class State(StrEnum):
     DONE = "done"
 
 
-FLYING = (State.READY, State.ARMED, State.THROW, State.RECOVER, State.LAND)  # states in which the runner commands the vehicle
+FLYING = (
+    State.READY,
+    State.ARMED,
+    State.THROW,
+    State.RECOVER,
+    State.LAND,
+)  # states in which the runner commands the vehicle
 
 
 @dataclass(frozen=True)
@@ -74,8 +81,16 @@ class Inputs:
 
     def missing(self) -> list[str]:
         """Return what has to be there before anything is checked, and is not."""
-        found = [f"no fresh pose of the {n}" for n, level in (("vehicle", self.vehicle), ("payload", self.payload)) if level >= HOLD]
-        return found if self.connected else [*found, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
+        found = [
+            f"no fresh pose of the {n}"
+            for n, level in (("vehicle", self.vehicle), ("payload", self.payload))
+            if level >= HOLD
+        ]
+        return (
+            found
+            if self.connected
+            else [*found, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
+        )
 
 
 class Machine:
@@ -84,17 +99,22 @@ class Machine:
     Attributes:
         state: now. reason: of the last change. since: time of it [s].
         throws: throws begun. cancelled: throws that ended without a release.
-        flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an abort.
-        left_fence: how the vehicle left its fence after a throw; that ends the run by a landing, and is no abort.
+        flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an
+            abort.
+        left_fence: how the vehicle left its fence after a throw; that ends the run by a landing,
+            and is no abort.
     """
 
-    def __init__(self, params: StateParams, throws: int, patient: bool = False, sends: bool = True) -> None:
+    def __init__(
+        self, params: StateParams, throws: int, patient: bool = False, sends: bool = True
+    ) -> None:
         """Begin in idle.
 
         Args:
             params: times. throws: after which it lands.
             patient: idle and check may last for ever, as where poses are only looked at.
-            sends: whether commands go to a vehicle. Where they do not, no fence ends what others fly before a throw is armed.
+            sends: whether commands go to a vehicle. Where they do not, no fence ends what others
+                fly before a throw is armed.
         """
         self.params, self.most, self.patient, self.sends = params, throws, patient, sends
         self.state, self.reason = State.IDLE, "start"
@@ -130,10 +150,16 @@ class Machine:
         if seen.vehicle >= ABORT:
             return "no new pose of the vehicle"
         others = self.state is State.READY and not self.sends
-        if seen.fence is not None and not others and not (self.state is State.RECOVER and seen.released):
+        if (
+            seen.fence is not None
+            and not others
+            and not (self.state is State.RECOVER and seen.released)
+        ):
             return f"fence: {seen.fence}"
         if not seen.connected:
-            return "the autopilot is silent, disarmed or in another mode" + (f": {seen.note}" if seen.note else "")
+            return "the autopilot is silent, disarmed or in another mode" + (
+                f": {seen.note}" if seen.note else ""
+            )
         return None
 
     def _go(self, now: float, state: State, reason: str) -> None:
@@ -153,7 +179,11 @@ class Machine:
         if self.state in (State.READY, State.ARMED):
             texts += [] if seen.payload < HOLD else ["no fresh pose of the payload"]
             texts += [] if seen.recording else ["the recording failed"]
-            texts += [] if seen.following else ["it does not follow yet" + (f" ({seen.note})" if seen.note else "")]
+            texts += (
+                []
+                if seen.following
+                else ["it does not follow yet" + (f" ({seen.note})" if seen.note else "")]
+            )
         if self.state in (State.ARMED, State.RECOVER) and not seen.still:
             texts.append("not quiet yet")
         if self.state is State.READY and not texts and not seen.arm:
@@ -182,12 +212,22 @@ class Machine:
         if self._lasted(now, good, self.params.check_hold):
             self._go(now, State.READY, "checks passed")
         elif self._late(now) and not self.patient:
-            self._go(now, State.ABORT, f"checks: {self.waits(seen) or 'poses or autopilot come and go'}")
+            self._go(
+                now, State.ABORT, f"checks: {self.waits(seen) or 'poses or autopilot come and go'}"
+            )
 
     def _ready(self, now: float, seen: Inputs) -> None:
         if seen.land or self._late(now):
-            self._go(now, State.LAND, "the operator said land" if seen.land else "nobody armed a throw")
-        elif seen.arm and seen.following and seen.recording and not seen.failed_checks and seen.payload < HOLD:
+            self._go(
+                now, State.LAND, "the operator said land" if seen.land else "nobody armed a throw"
+            )
+        elif (
+            seen.arm
+            and seen.following
+            and seen.recording
+            and not seen.failed_checks
+            and seen.payload < HOLD
+        ):
             self._go(now, State.ARMED, "the operator armed this throw")
 
     def _armed(self, now: float, seen: Inputs) -> None:
@@ -195,11 +235,17 @@ class Machine:
         if seen.land:
             self._go(now, State.LAND, "the operator said land")
         elif max(seen.vehicle, seen.payload) >= HOLD or not (seen.recording and seen.following):
-            self._go(now, State.READY, "disarmed: stale poses, not followed, or the recording failed")
+            self._go(
+                now, State.READY, "disarmed: stale poses, not followed, or the recording failed"
+            )
         elif self._lasted(now, seen.still and not seen.failed_checks, self.params.quiet) and long:
             self._go(now, State.THROW, "quiet")
         elif self._late(now):
-            self._go(now, State.READY, f"disarmed: {self.waits(seen) or 'the swing did not become quiet'}")
+            self._go(
+                now,
+                State.READY,
+                f"disarmed: {self.waits(seen) or 'the swing did not become quiet'}",
+            )
 
     def _throw(self, now: float, seen: Inputs) -> None:
         if seen.separated:
@@ -217,14 +263,20 @@ class Machine:
 
     def _recover(self, now: float, seen: Inputs) -> None:
         # An old pose is always quiet: what stands still there is the motion capture.
-        if seen.fence is not None:  # it brakes as hard as it can, and what was to be done is done: no more throws
+        if (
+            seen.fence is not None
+        ):  # it brakes as hard as it can, and what was to be done is done: no more throws
             self.left_fence = seen.fence
             self._go(now, State.LAND, f"after the throw, fence: {seen.fence}")
         elif self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
             more = self.throws < self.most
             self._go(now, State.READY if more else State.LAND, "hovering again")
         elif seen.land or self._late(now):
-            self._go(now, State.LAND, "the operator said land" if seen.land else "not quiet again in time")
+            self._go(
+                now,
+                State.LAND,
+                "the operator said land" if seen.land else "not quiet again in time",
+            )
 
     def _land(self, now: float, seen: Inputs) -> None:
         if seen.grounded or self._late(now):
@@ -232,10 +284,18 @@ class Machine:
 
 
 _STEPS = {
-    State.IDLE: Machine._idle, State.CHECK: Machine._check, State.READY: Machine._ready, State.ARMED: Machine._armed,
-    State.THROW: Machine._throw, State.RECOVER: Machine._recover, State.LAND: Machine._land,
-}  # fmt: skip
-"""By state. A name put together at each tick would stay in Python's cache of attributes, a new one for each."""
+    State.IDLE: Machine._idle,
+    State.CHECK: Machine._check,
+    State.READY: Machine._ready,
+    State.ARMED: Machine._armed,
+    State.THROW: Machine._throw,
+    State.RECOVER: Machine._recover,
+    State.LAND: Machine._land,
+}
+"""By state.
+
+A name put together at each tick would stay in Python's cache of attributes, a new one for each.
+"""
 
 
 @dataclass(frozen=True)
@@ -263,5 +323,9 @@ class Decision:
     release: bool = False  # the policy asked for it and it was done
     note: str = ""
     waits: str = ""  # why it does not go on
-    seen: list | None = None  # of a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
-    calibration: dict | str | None = None  # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
+    seen: list | None = (
+        None  # of a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
+    )
+    calibration: dict | str | None = (
+        None  # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
+    )

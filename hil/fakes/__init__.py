@@ -1,1 +1,3 @@
-"""Fake autopilots that behave over the wire as the real ones were measured to; what flies behind them is injected."""
+"""Fake autopilots that behave over the wire as the real ones were measured to; what flies behind
+them is injected.
+"""

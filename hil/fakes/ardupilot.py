@@ -1,25 +1,38 @@
 """A fake ArduCopter.
 
-It follows SET_ATTITUDE_TARGET only in GUIDED or GUIDED_NOGPS, armed, for its own system id and with a type mask of 128 alone,
-and ignores all else without a word; it takes a NaN thrust and falls; without bit 3 of GUID_OPTIONS thrust is a climb rate; with
-ATC_ANGLE_BOOST it grows with tilt; silence of GUID_TIMEOUT levels it; DO_SET_SERVO is accepted on an output that has a
-function, and moves nothing. Until the first command it holds its place.
-"""
+It follows SET_ATTITUDE_TARGET only in GUIDED or GUIDED_NOGPS, armed, for its own system id and with
+a type mask of 128 alone, and ignores all else without a word; it takes a NaN thrust and falls;
+without bit 3 of GUID_OPTIONS thrust is a climb rate; with ATC_ANGLE_BOOST it grows with tilt;
+silence of GUID_TIMEOUT levels it; DO_SET_SERVO is accepted on an output that has a function, and
+moves nothing. Until the first command it holds its place."""
 
 from typing import Any
 
 import numpy as np
 
 from hil.fakes.mavlink import SERVO, FakeMavlink
-from hil.links.backends.ardupilot import BRAKE, GUIDED, GUIDED_NOGPS, LAND_MODE, LOITER, SERVO_GRIPPER, THRUST_AS_THRUST
+from hil.links.backends.ardupilot import (
+    BRAKE,
+    GUIDED,
+    GUIDED_NOGPS,
+    LAND_MODE,
+    LOITER,
+    SERVO_GRIPPER,
+    THRUST_AS_THRUST,
+)
 from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
-FULL_CLIMB = 2.5  # climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]
+FULL_CLIMB = (
+    2.5  # climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]
+)
 CLIMB_GAIN = 5.0  # gain of the climb rate's loop, PSC_VELZ_P's default [1/s]
-ANSWERS = {"denied": mav.MAV_RESULT_DENIED, "in-progress": mav.MAV_RESULT_IN_PROGRESS}  # to a release, where it is not accepted
+ANSWERS = {
+    "denied": mav.MAV_RESULT_DENIED,
+    "in-progress": mav.MAV_RESULT_IN_PROGRESS,
+}  # to a release, where it is not accepted
 
 
 class FakeArduPilot(FakeMavlink):
@@ -30,9 +43,13 @@ class FakeArduPilot(FakeMavlink):
     usual_mode, pilots_mode = GUIDED, LOITER
     thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
-        "GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "EK3_SRC1_POSXY": 6.0, "GRIP_ENABLE": 1.0,
+        "GUID_OPTIONS": 8.0,
+        "ATC_ANGLE_BOOST": 0.0,
+        "GUID_TIMEOUT": 0.5,
+        "EK3_SRC1_POSXY": 6.0,
+        "GRIP_ENABLE": 1.0,
         f"SERVO{SERVO}_FUNCTION": float(SERVO_GRIPPER),
-    }  # fmt: skip
+    }
 
     def listens(self) -> bool:
         return self.armed and self.mode in (GUIDED, GUIDED_NOGPS)
@@ -42,7 +59,10 @@ class FakeArduPilot(FakeMavlink):
         return servo or super().is_release(message)
 
     def answer_release(self, message: Any) -> None:
-        servo, function = message.command == mav.MAV_CMD_DO_SET_SERVO, self.parameters[f"SERVO{SERVO}_FUNCTION"]
+        servo, function = (
+            message.command == mav.MAV_CMD_DO_SET_SERVO,
+            self.parameters[f"SERVO{SERVO}_FUNCTION"],
+        )
         able = servo or bool(self.parameters["GRIP_ENABLE"])
         if able and function == (0.0 if servo else SERVO_GRIPPER):
             self.open_mechanism()

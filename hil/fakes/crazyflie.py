@@ -1,8 +1,8 @@
 """A fake Crazyflie on a CRTP port; the poses come from the motion capture's bridge beside it.
 
-Set-points are angles until both modes were set to rates, and fly nothing until one without thrust unlocked it and it was armed. Pitch is
-nose down. Silence of its commander levels it after 0.5 s and stops its motors after 2 s. An unknown parameter is answered with an error.
-"""
+Set-points are angles until both modes were set to rates, and fly nothing until one without thrust
+unlocked it and it was armed. Pitch is nose down. Silence of its commander levels it after 0.5 s and
+stops its motors after 2 s. An unknown parameter is answered with an error."""
 
 import math
 from typing import Any
@@ -13,19 +13,28 @@ from hil.fakes.base import PortFake
 from hil.links import crtp
 from hil.links.backends.crazyflie import FULL, MODES
 
-LEVELS_AFTER, STOPS_AFTER = 0.5, 2.0  # silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN
+LEVELS_AFTER, STOPS_AFTER = (
+    0.5,
+    2.0,
+)  # silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN
 LEAST = 1000  # Thrust below this is none (MIN_THRUST)
 
 ENOENT = 2
 
 
 class FakeCrazyflie(PortFake):
-    """See the head of this module; ``placed`` holds external poses that came, position [m] and attitude xyzw."""
+    """See the head of this module; ``placed`` holds external poses that came, position [m] and
+    attitude xyzw.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.armed = False
-        self.parameters: dict[str, float] = {**dict.fromkeys(MODES, 1), "hook.open": 0, **self.options.parameters}
+        self.parameters: dict[str, float] = {
+            **dict.fromkeys(MODES, 1),
+            "hook.open": 0,
+            **self.options.parameters,
+        }
         self.placed: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
         self._locked, self._heard, self._stopped = True, -math.inf, False
 
@@ -38,21 +47,41 @@ class FakeCrazyflie(PortFake):
         place, data = (packet.port, packet.channel), packet.data
         if place == (crtp.COMMANDER, 0) and len(data) == crtp.SET_POINT.size:
             self._set_point(*crtp.SET_POINT.unpack(data))
-        elif place == (crtp.LOCALIZATION, crtp.GENERIC) and len(data) == crtp.POSE.size and data[0] == crtp.EXTERNAL_POSE:
+        elif (
+            place == (crtp.LOCALIZATION, crtp.GENERIC)
+            and len(data) == crtp.POSE.size
+            and data[0] == crtp.EXTERNAL_POSE
+        ):
             values = crtp.POSE.unpack(data)[1:]
             self.placed.append((values[:3], values[3:]))
         elif place == (crtp.SUPERVISOR, crtp.INFO) and data[:1] == bytes([crtp.STATE]):
             flying, stopped = bool(self.last_thrust > 0.0), self._stopped
-            state = crtp.CAN_FLY | crtp.ARMED * self.armed | crtp.FLYING * flying | crtp.LOCKED * stopped
-            self._answer(crtp.SUPERVISOR, crtp.INFO, bytes([crtp.STATE | crtp.ANSWER]) + state.to_bytes(4, "little"))
-        elif place == (crtp.SUPERVISOR, crtp.COMMAND) and data[:1] == bytes([crtp.ARM]) and len(data) == 2:
+            state = (
+                crtp.CAN_FLY
+                | crtp.ARMED * self.armed
+                | crtp.FLYING * flying
+                | crtp.LOCKED * stopped
+            )
+            self._answer(
+                crtp.SUPERVISOR,
+                crtp.INFO,
+                bytes([crtp.STATE | crtp.ANSWER]) + state.to_bytes(4, "little"),
+            )
+        elif (
+            place == (crtp.SUPERVISOR, crtp.COMMAND)
+            and data[:1] == bytes([crtp.ARM])
+            and len(data) == 2
+        ):
             self.armed = bool(data[1]) and self.options.arming and not self._stopped
             self.happened("armed" if self.armed else "disarmed")
         elif place == (crtp.PARAM, crtp.BY_NAME) and data[:1] == bytes([crtp.SET_BY_NAME]):
             self._set_parameter(data)
 
     def _answer(self, port: int, channel: int, data: bytes) -> None:
-        self.later(self.options.answer_delay, lambda: self.port.write(crtp.Packet(port, channel, data).pack()))
+        self.later(
+            self.options.answer_delay,
+            lambda: self.port.write(crtp.Packet(port, channel, data).pack()),
+        )
 
     def _set_parameter(self, data: bytes) -> None:
         group, name, rest = data[1:].split(b"\0", 2)
@@ -73,8 +102,14 @@ class FakeCrazyflie(PortFake):
         self._heard = self.plant.time
         self._locked &= thrust != 0
         rates = tuple(math.radians(rate) for rate in (roll, -pitch, yaw))
-        command = (self.thrust_map.thrust(min(thrust, FULL) / FULL) if thrust >= LEAST else 0.0, *rates)
-        self.set_point(command, self.armed and not self._locked and not any(self.parameters[mode] for mode in MODES))
+        command = (
+            self.thrust_map.thrust(min(thrust, FULL) / FULL) if thrust >= LEAST else 0.0,
+            *rates,
+        )
+        self.set_point(
+            command,
+            self.armed and not self._locked and not any(self.parameters[mode] for mode in MODES),
+        )
 
     def take(self) -> None:
         """Stop all: there is no pilot beside the runner, but its emergency stop."""
@@ -82,7 +117,9 @@ class FakeCrazyflie(PortFake):
         self.happened("emergency stop")
 
     def flown(self) -> np.ndarray:
-        """Return the command of this period; before the runner has it somebody holds it in the hand."""
+        """Return the command of this period; before the runner has it somebody holds it in the
+        hand.
+        """
         quiet = self.plant.time - self._heard
         if self._target is None or not self.followed:
             return self.hold(self._place)

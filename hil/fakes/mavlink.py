@@ -1,4 +1,6 @@
-"""What the fakes of ArduPilot and PX4 share: commands and their answers, parameters, TIMESYNC, heartbeats, streams."""
+"""What the fakes of ArduPilot and PX4 share: commands and their answers, parameters, TIMESYNC,
+heartbeats, streams.
+"""
 
 from abc import abstractmethod
 from typing import Any
@@ -29,7 +31,9 @@ class FakeMavlink(Fake):
         self.mode = self.usual_mode if self.options.mode is None else self.options.mode
         self.parameters = {**self.defaults, **self.options.parameters}
         self._next_beat = 0.0
-        self._streams: dict[int, tuple[float, float]] = {}  # by message: time of the next one, and period [s]
+        self._streams: dict[
+            int, tuple[float, float]
+        ] = {}  # by message: time of the next one, and period [s]
         self.refusals: list[str] = []
         self.link.listen(self._hear)
 
@@ -43,7 +47,10 @@ class FakeMavlink(Fake):
             self._command(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
             now = arrival + self.question_lag + self.options.clock_offset
-            self.say(mav.MAVLink_timesync_message(int(now * 1e9), message.ts1), self.options.timesync_delay)
+            self.say(
+                mav.MAVLink_timesync_message(int(now * 1e9), message.ts1),
+                self.options.timesync_delay,
+            )
         elif kind == "PARAM_REQUEST_READ" and message.target_system == VEHICLE_ID[0]:
             self._tell_parameter(message.param_id)
         elif kind == "PARAM_SET" and message.param_id in self.parameters:
@@ -61,10 +68,17 @@ class FakeMavlink(Fake):
 
     def acknowledge(self, command: int, result: int, delay: float | None = None) -> None:
         """Answer a command."""
-        self.say(mav.MAVLink_command_ack_message(command, result), self.options.answer_delay if delay is None else delay)
+        self.say(
+            mav.MAVLink_command_ack_message(command, result),
+            self.options.answer_delay if delay is None else delay,
+        )
 
     def _set_point(self, message: Any) -> None:
-        thrust = self.thrust_map.thrust(message.thrust) if np.isfinite(message.thrust) else message.thrust
+        thrust = (
+            self.thrust_map.thrust(message.thrust)
+            if np.isfinite(message.thrust)
+            else message.thrust
+        )
         command = (thrust, message.body_roll_rate, -message.body_pitch_rate, -message.body_yaw_rate)
         ours = message.target_system == VEHICLE_ID[0] and message.type_mask == IGNORE_ATTITUDE
         self.set_point(command, ours and self.listens())
@@ -101,7 +115,9 @@ class FakeMavlink(Fake):
         elif number == mav.MAV_CMD_COMPONENT_ARM_DISARM:
             self._arm(message)
         elif number == mav.MAV_CMD_REQUEST_MESSAGE:
-            self._next_beat = 0.0 if int(message.param1) == mav.MAVLINK_MSG_ID_HEARTBEAT else self._next_beat
+            self._next_beat = (
+                0.0 if int(message.param1) == mav.MAVLINK_MSG_ID_HEARTBEAT else self._next_beat
+            )
             self.acknowledge(number, mav.MAV_RESULT_ACCEPTED)
         elif number == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._streams[int(message.param1)] = (self.plant.time, 1e-6 * message.param2)
@@ -118,7 +134,10 @@ class FakeMavlink(Fake):
 
     def is_release(self, message: Any) -> bool:
         """Return whether a command opens the mechanism."""
-        return message.command == mav.MAV_CMD_DO_GRIPPER and message.param2 == mav.GRIPPER_ACTION_RELEASE
+        return (
+            message.command == mav.MAV_CMD_DO_GRIPPER
+            and message.param2 == mav.GRIPPER_ACTION_RELEASE
+        )
 
     @abstractmethod
     def answer_release(self, message: Any) -> None:
@@ -128,7 +147,11 @@ class FakeMavlink(Fake):
         wanted = message.param1 == 1.0
         flying = self.plant.state["pos_w"][2] > 0.3
         if wanted and not self.options.arming:
-            self.link.send(mav.MAVLink_statustext_message(mav.MAV_SEVERITY_CRITICAL, b"Arm: battery below minimum"))
+            self.link.send(
+                mav.MAVLink_statustext_message(
+                    mav.MAV_SEVERITY_CRITICAL, b"Arm: battery below minimum"
+                )
+            )
             self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
         elif not wanted and flying and message.param2 != FORCE:
             self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
@@ -149,9 +172,14 @@ class FakeMavlink(Fake):
     def _tell_parameter(self, name: str) -> None:
         if name in self.parameters:
             field, kind = self.field(name)
-            self.say(mav.MAVLink_param_value_message(name.encode(), field, kind, 1, 0), self.options.answer_delay)
+            self.say(
+                mav.MAVLink_param_value_message(name.encode(), field, kind, 1, 0),
+                self.options.answer_delay,
+            )
         elif self.tells_unknown:
-            error = mav.MAVLink_param_error_message(245, 191, name.encode(), -1, mav.MAV_PARAM_ERROR_DOES_NOT_EXIST)
+            error = mav.MAVLink_param_error_message(
+                245, 191, name.encode(), -1, mav.MAV_PARAM_ERROR_DOES_NOT_EXIST
+            )
             self.say(error, self.options.answer_delay)
 
     def speak(self) -> None:
@@ -169,17 +197,29 @@ class FakeMavlink(Fake):
         boot = int(self.clock() * 1e3) & 0xFFFFFFFF
         if number == mav.MAVLINK_MSG_ID_HEARTBEAT:
             flags = CUSTOM | (ARMED if self.armed else 0)
-            self.link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3))
+            self.link.send(
+                mav.MAVLink_heartbeat_message(
+                    mav.MAV_TYPE_QUADROTOR, self.autopilot, flags, self.mode, 4, 3
+                )
+            )
         elif number == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
             outputs = [0] * 16
             outputs[SERVO - 1] = self.ends[self.moved]
-            self.link.send(mav.MAVLink_servo_output_raw_message(int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs))
+            self.link.send(
+                mav.MAVLink_servo_output_raw_message(
+                    int(self.clock() * 1e6) & 0xFFFFFFFF, 0, *outputs
+                )
+            )
         elif number == mav.MAVLINK_MSG_ID_ATTITUDE:
             x, y, z = map(float, self.plant.state["rate_b"])
             self.link.send(mav.MAVLink_attitude_message(boot, 0.0, 0.0, 0.0, x, -y, -z))
         elif number == mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
             share = self.thrust_map.share(self.last_thrust)
-            self.link.send(mav.MAVLink_attitude_target_message(boot, 0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, share))
+            self.link.send(
+                mav.MAVLink_attitude_target_message(
+                    boot, 0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, share
+                )
+            )
 
     def report(self) -> dict[str, Any]:
         return {**super().report(), "mode": self.mode, "parameters": self.parameters}

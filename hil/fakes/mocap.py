@@ -1,7 +1,7 @@
 """What a motion-capture system makes of the truth: rate, noise, latency and loss, from a seed.
 
-The fake autopilot sends these poses over the wire; the same seed gives a throw flown in the simulator directly the same ones.
-"""
+The fake autopilot sends these poses over the wire; the same seed gives a throw flown in the
+simulator directly the same ones."""
 
 import math
 from dataclasses import dataclass
@@ -41,16 +41,24 @@ class Mocap:
         return time >= self._next - SLACK
 
     def measure(self, time: float, truth: dict[str, Any]) -> list[Pose]:
-        """Measure both bodies at this time [s], which is the due one, of their true ``pos_w``, ``quat_wb`` and ``payload_pos_w``.
+        """Measure both bodies at this time [s], which is the due one, of their true ``pos_w``,
+        ``quat_wb`` and ``payload_pos_w``.
 
-        Those that are not lost come back, vehicle first, in our frames; their arrival is the latency after the instant.
-        """
+        Those that are not lost come back, vehicle first, in our frames; their arrival is the
+        latency after the instant."""
         self._next += 1.0 / self.params.rate
         p, rng = self.params, self._rng
         names = ("pos_w", "payload_pos_w", "quat_wb")
-        noise = dict(zip(names, (p.position_noise, p.position_noise, math.radians(p.angle_noise_deg))))
-        vehicle, payload, quat = measured({name: truth[name][None].astype(float) for name in names}, noise, rng).values()
+        noise = dict(
+            zip(names, (p.position_noise, p.position_noise, math.radians(p.angle_noise_deg)))
+        )
+        vehicle, payload, quat = measured(
+            {name: truth[name][None].astype(float) for name in names}, noise, rng
+        ).values()
         lost = rng.random(2) < p.loss
         seen = ((VEHICLE, vehicle, quat[0].tolist()), (PAYLOAD, payload, (0.0, 0.0, 0.0, 1.0)))
-        poses = [Pose(time, time + p.latency, body, tuple(pos[0].tolist()), tuple(attitude)) for body, pos, attitude in seen]
+        poses = [
+            Pose(time, time + p.latency, body, tuple(pos[0].tolist()), tuple(attitude))
+            for body, pos, attitude in seen
+        ]
         return [pose for pose, gone in zip(poses, lost) if not gone]

@@ -1,4 +1,6 @@
-"""The fake autopilot's process: builds one of `hil.fakes` around an injected plant and flies it in real time."""
+"""The fake autopilot's process: builds one of `hil.fakes` around an injected plant and flies it in
+real time.
+"""
 
 import contextlib
 import importlib
@@ -23,30 +25,42 @@ from hil.links.mavlink_link import Link
 from visthrow.common.arguments import StopRequest
 from visthrow.common.errors import suggest
 
-KINDS = {"ardupilot": FakeArduPilot, "px4": FakePx4, "betaflight": FakeBetaflight, "crazyflie": FakeCrazyflie}
-AFTER_LANDING = 10.0  # the process ends this long after the payload has landed [s]: the vehicle has landed by then
+KINDS = {
+    "ardupilot": FakeArduPilot,
+    "px4": FakePx4,
+    "betaflight": FakeBetaflight,
+    "crazyflie": FakeCrazyflie,
+}
+# the process ends this long after the payload has landed [s]: the vehicle has landed by then
+AFTER_LANDING = 10.0
 
 
 def load_plant(target: str, policy: str, seed: int) -> WirePlant:
-    """Call ``module:function`` with policy and seed; raises `RunError` where there is none, or one that makes no plant of these two."""
+    """Call ``module:function`` with policy and seed; raises `RunError` where there is none, or one
+    that makes no plant of these two.
+    """
     module, _, name = target.partition(":")
     try:
         make = getattr(importlib.import_module(module), name)
         inspect.signature(make).bind(policy, seed)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise RunError(
-            f"plant '{target}': {error}; expected module:function, as visthrow.throws.wire_plant:make, called with policy and seed"
+            f"plant '{target}': {error}; expected module:function, as"
+            " visthrow.throws.wire_plant:make, called with policy and seed"
         ) from error
     return make(policy, seed)
 
 
 class ListeningPort:
-    """A TCP port of this machine that serves one peer at a time: what a flight controller in software offers."""
+    """A TCP port of this machine that serves one peer at a time: what a flight controller in
+    software offers.
+    """
 
     whole, sender, peer = False, None, None
 
     def __init__(self, number: int, other: str = "") -> None:
-        """Listen on a port of the loopback address; raises `LinkError` where it is taken, or there is none of that number.
+        """Listen on a port of the loopback address; raises `LinkError` where it is taken, or there
+        is none of that number.
 
         ``other``: as of `hil.links.device.refused`.
         """
@@ -101,23 +115,40 @@ class AnsweringPort(UdpPort):
 
 
 def make_fake(
-    kind: str, plant: WirePlant, link: Link, mocap: MocapParams | None = None, seed: int = 0,
-    options: Options | None = None, port: Any = None,
-) -> Fake:  # fmt: skip
-    """Return a fake of a kind, with its port of MSP for Betaflight, of CRTP for the Crazyflie; raises `RunError` for an unknown kind."""
+    kind: str,
+    plant: WirePlant,
+    link: Link,
+    mocap: MocapParams | None = None,
+    seed: int = 0,
+    options: Options | None = None,
+    port: Any = None,
+) -> Fake:
+    """Return a fake of a kind, with its port of MSP for Betaflight, of CRTP for the Crazyflie;
+    raises `RunError` for an unknown kind.
+    """
     if kind not in KINDS:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, KINDS)}")
     return KINDS[kind](plant, link, mocap, seed, options, port)
 
 
-def serve(fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING) -> dict[str, Any]:
-    """Fly in real time until ``after`` seconds after the landing, for ``most`` seconds, or until Ctrl-C; returns the report."""
+def serve(
+    fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
+) -> dict[str, Any]:
+    """Fly in real time until ``after`` seconds after the landing, for ``most`` seconds, or until
+    Ctrl-C; returns the report.
+    """
     plant, begun, late = fake.plant, fake.plant.time, 0
-    start = clock.now() - begun  # where the machine is late the vehicle's clock is as late as the vehicle
+    start = (
+        clock.now() - begun
+    )  # where the machine is late the vehicle's clock is as late as the vehicle
     fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
     fake.question_lag = 0.0
     asked = StopRequest((signal.SIGINT,))
-    with contextlib.suppress(KeyboardInterrupt), asked as stop, collected():  # a collection of all takes a tenth of a second
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        asked as stop,
+        collected(),
+    ):  # a collection of all takes a tenth of a second
         while plant.time - begun < most and not stop.asked:
             time = plant.time + plant.period
             due = start + time

@@ -1,10 +1,11 @@
 """A fake PX4.
 
-OFFBOARD is refused until set-points have come for a second without a gap, and left for what COM_OBL_RC_ACT says when they cease
-for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and ACCEPTED when PD_GRIPPER_TO is over, whatever moves; the gripper opens to its
-output's minimum; there is no PD_GRIPPER_EN since 1.17; integer parameters travel as bytes. Out of OFFBOARD set-points vanish without
-a word. Its heartbeat comes once a second and with no change of mode. Until it is taken the pilot holds it in Position mode.
-"""
+OFFBOARD is refused until set-points have come for a second without a gap, and left for what
+COM_OBL_RC_ACT says when they cease for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and
+ACCEPTED when PD_GRIPPER_TO is over, whatever moves; the gripper opens to its output's minimum;
+there is no PD_GRIPPER_EN since 1.17; integer parameters travel as bytes. Out of OFFBOARD set-points
+vanish without a word. Its heartbeat comes once a second and with no change of mode. Until it is
+taken the pilot holds it in Position mode."""
 
 from typing import Any
 
@@ -15,7 +16,10 @@ from hil.links.backends import px4
 from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 
-STREAM_FIRST, STREAM_GAP = 1.0, 0.5  # set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]
+STREAM_FIRST, STREAM_GAP = (
+    1.0,
+    0.5,
+)  # set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]
 
 INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PWM_AUX_FUNC1", "PWM_AUX_MIN1", "PWM_AUX_MAX1")
 
@@ -39,9 +43,14 @@ class FakePx4(FakeMavlink):
     usually_prompt, tells_unknown = False, True
     thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
-        "COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 5.0, "EKF2_EV_CTRL": 11.0, "PD_GRIPPER_TO": 1.0, "PWM_AUX_FUNC1": 430.0,
-        "PWM_AUX_MIN1": 1000.0, "PWM_AUX_MAX1": 2000.0,
-    }  # fmt: skip
+        "COM_OF_LOSS_T": 0.5,
+        "COM_OBL_RC_ACT": 5.0,
+        "EKF2_EV_CTRL": 11.0,
+        "PD_GRIPPER_TO": 1.0,
+        "PWM_AUX_FUNC1": 430.0,
+        "PWM_AUX_MIN1": 1000.0,
+        "PWM_AUX_MAX1": 2000.0,
+    }
     _stream_since = _last = -np.inf
 
     def _set_point(self, message: Any) -> None:
@@ -83,7 +92,11 @@ class FakePx4(FakeMavlink):
         if gripper:
             self.acknowledge(number, mav.MAV_RESULT_IN_PROGRESS)
         if answer != "in-progress":
-            self.acknowledge(number, mav.MAV_RESULT_ACCEPTED, self.parameters["PD_GRIPPER_TO"] if gripper else None)
+            self.acknowledge(
+                number,
+                mav.MAV_RESULT_ACCEPTED,
+                self.parameters["PD_GRIPPER_TO"] if gripper else None,
+            )
 
     def field(self, name: str) -> tuple[float, int]:
         if name in INTEGERS:
@@ -95,12 +108,17 @@ class FakePx4(FakeMavlink):
 
     @property
     def ends(self) -> tuple[int, int]:
-        """Ends of the mechanism's output, closed and open [us]: a gripper opens at the minimum, an actuator set's 1 is the maximum."""
+        """Ends of the mechanism's output, closed and open [us]: a gripper opens at the minimum, an
+        actuator set's 1 is the maximum.
+        """
         ends = int(self.parameters["PWM_AUX_MAX1"]), int(self.parameters["PWM_AUX_MIN1"])
         return ends if self.parameters["PWM_AUX_FUNC1"] == 430.0 else ends[::-1]
 
     def flown(self) -> np.ndarray:
-        if self.mode == OFFBOARD and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]:
+        if (
+            self.mode == OFFBOARD
+            and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]
+        ):
             self.happened("left OFFBOARD: no set-points")
             self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == px4.LAND_OR_HOLD[0] else HOLD)
             self.beat_soon()

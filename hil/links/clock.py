@@ -18,7 +18,9 @@ class Clock(Protocol):
         """Wait until a time [s]; at once where it has passed."""
 
     def wait_for(self, files: Sequence[Any], when: float) -> None:
-        """Wait until there is something to read from a file (anything with ``fileno``), or until a time [s]."""
+        """Wait until there is something to read from a file (anything with ``fileno``), or until a
+        time [s].
+        """
 
 
 class MonotonicClock:
@@ -62,11 +64,13 @@ class ManualClock:
 
 @dataclass
 class Ticker:
-    """Ticks at fixed times, start + n period; a tick that comes more than a period late skips those it missed.
+    """Ticks at fixed times, start + n period; a tick that comes more than a period late skips those
+    it missed.
 
     Attributes:
         index: number of the current tick, missed ones counted. missed: ticks that were skipped.
-        late: how late the current tick is, after those it skipped [s]. worst: the longest wait of any tick [s].
+        late: how late the current tick is, after those it skipped [s]. worst: the longest wait of
+            any tick [s].
     """
 
     clock: Clock
@@ -96,12 +100,13 @@ class Ticker:
 
 
 class TimeSync:
-    """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip; ``steps``: how often a clock was set.
+    """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip;
+    ``steps``: how often a clock was set.
 
-    The peer answers ``tc1`` (its time) to ``ts1`` (ours). The true offset lies within half the round trip of
-    ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one. Exchanges that contradict it, by more than both
-    round trips and some drift allow, are set aside; several in a row say that a clock was set, and begin anew.
-    """
+    The peer answers ``tc1`` (its time) to ``ts1`` (ours). The true offset lies within half the
+    round trip of ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one.
+    Exchanges that contradict it, by more than both round trips and some drift allow, are set aside;
+    several in a row say that a clock was set, and begin anew."""
 
     DRIFT = 1e-3  # that clocks may part by within the window: 200 parts in a million over 5 s [s]
     STEP_AFTER = 3  # contradicting exchanges in a row that make a step
@@ -117,10 +122,15 @@ class TimeSync:
         return int(now * 1e9)
 
     def take(self, tc1: int, ts1: int, now: float) -> None:
-        """Take the answer to a request of ours, at a time [s]: the peer's time and the request's [ns]."""
+        """Take the answer to a request of ours, at a time [s]: the peer's time and the request's
+        [ns].
+        """
         sent = ts1 / 1e9
         trip, offset = now - sent, tc1 / 1e9 - 0.5 * (sent + now)
-        if self._exchanges and abs(offset - self.offset) > 0.5 * (trip + self.round_trip) + self.DRIFT:
+        if (
+            self._exchanges
+            and abs(offset - self.offset) > 0.5 * (trip + self.round_trip) + self.DRIFT
+        ):
             self._odd += 1
             if self._odd < self.STEP_AFTER:
                 return

@@ -1,11 +1,12 @@
 """CRTP, the Crazyflie's packets: ports, their layout, and the links that carry them.
 
-A packet is a header, port in the high half and channel in the low two bits, and up to 30 bytes. On ``udpout:`` devices each datagram is
-a packet, as cflib's UDP driver and Bitcraze's software in the loop have it; ``radio://`` and ``usb://`` addresses go through cflib.
+A packet is a header, port in the high half and channel in the low two bits, and up to 30 bytes. On
+``udpout:`` devices each datagram is a packet, as cflib's UDP driver and Bitcraze's software in the
+loop have it; ``radio://`` and ``usb://`` addresses go through cflib.
 
-Source: bitcraze.io, CRTP; crazyflie-firmware, src/modules/interface/crtp.h, crtp_commander_rpyt.c (legacy set-point), param_logic.c
-(set by name), supervisor; cflib, crtp/udpdriver.py, crazyflie/supervisor.py.
-"""
+Source: bitcraze.io, CRTP; crazyflie-firmware, src/modules/interface/crtp.h, crtp_commander_rpyt.c
+(legacy set-point), param_logic.c (set by name), supervisor; cflib, crtp/udpdriver.py,
+crazyflie/supervisor.py."""
 
 import struct
 from dataclasses import dataclass
@@ -18,12 +19,27 @@ from visthrow.common.extras import load_extra
 PARAM, COMMANDER, LOCALIZATION, SUPERVISOR = 2, 3, 6, 9  # ports
 
 BY_NAME, GENERIC, INFO, COMMAND = 3, 1, 0, 1
-"""Channels: of parameters by name, of localization's further messages, of the supervisor's state and commands."""
+"""Channels: of parameters by name, of localization's further messages, of the supervisor's state
+and commands.
+"""
 
 SET_POINT, POSE = struct.Struct("<fffH"), struct.Struct("<B7f")
 
-EXTERNAL_POSE, SET_BY_NAME, UINT8, STATE, ARM, ANSWER = 8, 0, 0x08, 0x0C, 0x01, 0x80  # types within packets
-ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED = 1 << 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6  # bits of the supervisor's state
+EXTERNAL_POSE, SET_BY_NAME, UINT8, STATE, ARM, ANSWER = (
+    8,
+    0,
+    0x08,
+    0x0C,
+    0x01,
+    0x80,
+)  # types within packets
+ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED = (
+    1 << 1,
+    1 << 3,
+    1 << 4,
+    1 << 5,
+    1 << 6,
+)  # bits of the supervisor's state
 MOST = 31  # bytes of a packet
 
 CFLIB = ("radio://", "usb://", "serial://")
@@ -48,7 +64,9 @@ def unpack(data: bytes) -> Packet | None:
 
 
 def set_point(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
-    """Return the legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the firmware's pitch is nose down."""
+    """Return the legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the
+    firmware's pitch is nose down.
+    """
     roll, pitch, yaw = rates_dps
     return Packet(COMMANDER, 0, SET_POINT.pack(roll, -pitch, yaw, thrust)).pack()
 
@@ -81,7 +99,9 @@ class CflibPort:
     def __init__(self, address: str) -> None:
         """Open it; raises `LinkError` where cflib is missing, or the link cannot be opened."""
         crtp = load_extra("cflib.crtp", "crazyflie", f"the Crazyflie at {address}", LinkError)
-        self._packet = load_extra("cflib.crtp.crtpstack", "crazyflie", "the Crazyflie", LinkError).CRTPPacket
+        self._packet = load_extra(
+            "cflib.crtp.crtpstack", "crazyflie", "the Crazyflie", LinkError
+        ).CRTPPacket
         self.lost: str | None = None
         try:
             crtp.init_drivers()
@@ -89,7 +109,10 @@ class CflibPort:
         except Exception as error:  # USB, and the package's own
             raise LinkError(f"cannot open {address}: {error}") from error
         if self._link is None:
-            raise LinkError(f"cannot open {address}: no driver of cflib takes it; expected {', '.join(CFLIB)}...")
+            raise LinkError(
+                f"cannot open {address}: no driver of cflib takes it; expected"
+                f" {', '.join(CFLIB)}..."
+            )
 
     def _lose(self, message: str) -> None:
         self.lost = message
@@ -114,4 +137,8 @@ class CflibPort:
 
 def open_crtp(device: str, remote: bool) -> Any:
     """Open the port of a device; raises `LinkError` where it is refused, or cannot be opened."""
-    return CflibPort(device) if device.startswith(CFLIB) else open_port(check_device(device, remote=remote), "--set crazyflie.device=...")
+    return (
+        CflibPort(device)
+        if device.startswith(CFLIB)
+        else open_port(check_device(device, remote=remote), "--set crazyflie.device=...")
+    )

@@ -1,8 +1,10 @@
-"""Device strings: which are allowed, and the ports behind them. Nothing here is ever executed or looked up elsewhere.
+"""Device strings: which are allowed, and the ports behind them.
 
-``udp:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects, ``serial:/dev/NAME:BAUD`` opens a
-port. HOST is a numeric address; other than loopback ones only where the config says so.
-"""
+Nothing here is ever executed or looked up elsewhere.
+
+``udp:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
+``serial:/dev/NAME:BAUD`` opens a port. HOST is a numeric address; other than loopback ones only
+where the config says so."""
 
 import errno
 import ipaddress
@@ -17,11 +19,17 @@ from typing import Any, Protocol
 from hil.errors import LinkError
 
 _NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):([0-9]{1,5})")
-_SERIAL = re.compile(r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})")
+_SERIAL = re.compile(
+    r"serial:(/dev/(?:tty[A-Za-z0-9]+|serial/by-id/[\w.:+-]+|cu\.[\w-]+)):([0-9]{4,7})"
+)
 PLUGGED = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "cu.*")  # names of serial ports in /dev
 LARGEST_DATAGRAM = 65536
-MOST_CHUNKS = 256  # datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
-MOST_SHUT_OUT = 4096  # datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of those that are ours
+MOST_CHUNKS = (
+    256  # datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
+)
+# datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of
+# those that are ours
+MOST_SHUT_OUT = 4096
 
 
 @dataclass(frozen=True)
@@ -34,25 +42,33 @@ class Device:
 
 
 def check_device(text: str, *, remote: bool = False) -> Device:
-    """Read a device string against the whitelist, loopback ones alone without ``remote``; raises `LinkError` with what is allowed."""
+    """Read a device string against the whitelist, loopback ones alone without ``remote``; raises
+    `LinkError` with what is allowed.
+    """
     found = _SERIAL.fullmatch(text)
     if found:
         return Device("serial", found[1], int(found[2]))
     found = _NETWORK.fullmatch(text)
     if not found:
         raise LinkError(
-            f"device {text[:80]!r} is refused; expected udp:127.0.0.1:14550 (listen), udpout:127.0.0.1:14550 (send "
-            "first), tcp:127.0.0.1:5760 or serial:/dev/ttyACM0:921600"
+            f"device {text[:80]!r} is refused; expected udp:127.0.0.1:14550 (listen),"
+            " udpout:127.0.0.1:14550 (send first), tcp:127.0.0.1:5760 or"
+            " serial:/dev/ttyACM0:921600"
         )
     host = "127.0.0.1" if found[2] == "localhost" else found[2].strip("[]")
     try:
         address, port = ipaddress.ip_address(host), int(found[3])
     except ValueError as error:
-        raise LinkError(f"device {text!r}: {error}; expected a numeric address such as 127.0.0.1") from None
+        raise LinkError(
+            f"device {text!r}: {error}; expected a numeric address such as 127.0.0.1"
+        ) from None
     if not 0 < port < 65536:
         raise LinkError(f"device {text!r}: port {port}; expected 1 to 65535")
     if not address.is_loopback and not remote:
-        raise LinkError(f"device {text!r} leaves this machine; set link.remote = true in the config where that is what you want")
+        raise LinkError(
+            f"device {text!r} leaves this machine; set link.remote = true in the config where that"
+            " is what you want"
+        )
     return Device(found[1], host, port)
 
 
@@ -67,7 +83,9 @@ class Port(Protocol):
         """Return the next chunk; None where there is none."""
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        """Return whether the bytes were taken; on UDP for an address, where the device does not name it."""
+        """Return whether the bytes were taken; on UDP for an address, where the device does not
+        name it.
+        """
 
     def fileno(self) -> int:
         """Return what can be waited for until there is something to read."""
@@ -98,7 +116,8 @@ class _Opened:
 
 
 def refused(port: str, number: int, error: OSError, other: str = "") -> LinkError:
-    """Return the error that says why a port of this machine cannot be listened on and, where another program has it, what to do.
+    """Return the error that says why a port of this machine cannot be listened on and, where
+    another program has it, what to do.
 
     Args:
         port: Its name, as ``udp:127.0.0.1:14560``.
@@ -107,12 +126,16 @@ def refused(port: str, number: int, error: OSError, other: str = "") -> LinkErro
         other: Option that names another port.
     """
     if error.errno == errno.EADDRNOTAVAIL:
-        return LinkError(f"cannot listen on {port}: no such address on this machine; expected one of its own, or 0.0.0.0 for all of them")
+        return LinkError(
+            f"cannot listen on {port}: no such address on this machine; expected one of its own, or"
+            " 0.0.0.0 for all of them"
+        )
     if error.errno != errno.EADDRINUSE:
         return LinkError(f"cannot listen on {port}: {error.strerror}")
     return LinkError(
-        f"cannot listen on {port}: another program has it, perhaps a second `visthrow hil`, a ground station or a simulator; "
-        f"`ss -{port[0]}lnp 'sport = :{number}'` shows which. End it, or take another port{other and ': ' + other}"
+        f"cannot listen on {port}: another program has it, perhaps a second `visthrow hil`, a"
+        f" ground station or a simulator; `ss -{port[0]}lnp 'sport = :{number}'` shows which. End"
+        f" it, or take another port{other and ': ' + other}"
     )
 
 
@@ -122,7 +145,10 @@ class UdpPort(_Opened):
     whole = True
 
     def __init__(self, device: Device, other: str = "") -> None:
-        """Open it; raises `LinkError` where the address is taken or not this machine's. ``other``: as of `refused`."""
+        """Open it; raises `LinkError` where the address is taken or not this machine's.
+
+        ``other``: as of `refused`.
+        """
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._open = socket.socket(family, socket.SOCK_DGRAM)
         self._open.setblocking(False)
@@ -133,7 +159,9 @@ class UdpPort(_Opened):
                 self._open.bind((device.host, device.port))
         except OSError as error:
             self._open.close()
-            raise refused(f"{device.kind}:{device.host}:{device.port}", device.port, error, other) from error
+            raise refused(
+                f"{device.kind}:{device.host}:{device.port}", device.port, error, other
+            ) from error
 
     def read(self) -> bytes | None:
         try:
@@ -179,7 +207,9 @@ class TcpPort(_Stream):
         try:
             self._open = socket.create_connection((device.host, device.port), timeout=2.0)
         except OSError as error:
-            raise LinkError(f"cannot connect to tcp:{device.host}:{device.port}: {error.strerror or error}") from error
+            raise LinkError(
+                f"cannot connect to tcp:{device.host}:{device.port}: {error.strerror or error}"
+            ) from error
         self._open.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._open.setblocking(False)
         self._get, self._put = lambda: self._open.recv(LARGEST_DATAGRAM), self._open.send
@@ -193,14 +223,19 @@ class SerialPort(_Stream):
         try:
             import serial
         except ModuleNotFoundError:
-            raise LinkError("a serial port needs pyserial; install it with: pip install 'visthrow[serial]'") from None
+            raise LinkError(
+                "a serial port needs pyserial; install it with: pip install 'visthrow[serial]'"
+            ) from None
         try:
             self._open = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
             number = getattr(error, "errno", None)  # pyserial's text names port and reason twice
-            here = ", ".join(str(path) for name in PLUGGED for path in sorted(Path("/dev").glob(name)))
+            here = ", ".join(
+                str(path) for name in PLUGGED for path in sorted(Path("/dev").glob(name))
+            )
             raise LinkError(
-                f"cannot open {device.host}: {os.strerror(number) if number else error}; plugged in here: {here or 'no serial port'}"
+                f"cannot open {device.host}: {os.strerror(number) if number else error}; plugged in"
+                f" here: {here or 'no serial port'}"
             ) from error
         self._get, self._put = lambda: self._open.read(self._open.in_waiting or 1), self._open.write
 
@@ -208,8 +243,8 @@ class SerialPort(_Stream):
 def open_port(device: Device, other: str = "") -> Port:
     """Open the port of a checked device string; raises `LinkError` where it cannot be opened.
 
-    ``other``: the option that names another device; it stands in the message of a port that is taken.
-    """
+    ``other``: the option that names another device; it stands in the message of a port that is
+    taken."""
     if device.kind in ("udp", "udpout"):
         return UdpPort(device, other)
     return TcpPort(device) if device.kind == "tcp" else SerialPort(device)

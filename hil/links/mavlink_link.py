@@ -1,8 +1,8 @@
-"""The MAVLink link: datagrams in, messages to whoever listens, messages out, both ways into a .tlog; TIMESYNC on it, both ways.
+"""The MAVLink link: datagrams in, messages to whoever listens, messages out, both ways into a
+.tlog; TIMESYNC on it, both ways.
 
-Nothing here waits, and no bytes that arrive make it raise. :func:`poses_from_message` and :func:`attitude_target` are
-the boundary between MAVLink's units and orders and ours.
-"""
+Nothing here waits, and no bytes that arrive make it raise. :func:`poses_from_message` and
+:func:`attitude_target` are the boundary between MAVLink's units and orders and ours."""
 
 import math
 import random
@@ -23,7 +23,9 @@ LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
 BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
 NAN_QUATERNION = (math.nan,) * 4
 
-IGNORE_ATTITUDE = 128  # type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently not followed
+# type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently
+# not followed
+IGNORE_ATTITUDE = 128
 
 
 class Link:
@@ -33,18 +35,26 @@ class Link:
         received, sent, dropped: messages that were taken in, went, and could not be sent.
         parser: counts what was no message. roster: who may speak.
         sender: address of the message that listeners are called with.
-        on_pump: called with the time [s] whenever arrivals were taken in. sync: `hil.links.mavlink_link.LinkSync`, where there is one.
+        on_pump: called with the time [s] whenever arrivals were taken in. sync:
+            `hil.links.mavlink_link.LinkSync`, where there is one.
     """
 
     def __init__(
-        self, port: Port, system: int = 245, component: int = 191, tlog: TlogWriter | None = None, roster: Roster | None = None,
+        self,
+        port: Port,
+        system: int = 245,
+        component: int = 191,
+        tlog: TlogWriter | None = None,
+        roster: Roster | None = None,
         key: bytes | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Wrap an open port.
 
         Args:
-            port: see `hil.links.device`. system, component: our own ids; component 191 is an onboard computer.
-            tlog: written both ways; closed with the link. roster: who may speak; None takes anybody.
+            port: see `hil.links.device`. system, component: our own ids; component 191 is an
+                onboard computer.
+            tlog: written both ways; closed with the link. roster: who may speak; None takes
+                anybody.
             key: that messages are signed with, and have to be; None: neither.
         """
         self.port, self.roster, self._tlog = port, roster or Roster(), tlog
@@ -60,16 +70,24 @@ class Link:
 
     def packer(self, system: int, component: int) -> mav.MAVLink:
         """Return what packs messages of ids of their own for this link, signed where it is."""
-        return mav.MAVLink(None, system, component) if self._key is None else Signed(self._key, system, component)
+        return (
+            mav.MAVLink(None, system, component)
+            if self._key is None
+            else Signed(self._key, system, component)
+        )
 
     def listen(self, listener: Callable[[Any, float], None]) -> None:
         """Call ``listener(message, arrival)`` for every message from now on."""
         self._listeners.append(listener)
 
     def pump(self, clock: Callable[[], float]) -> int:
-        """Hand all that has arrived to the listeners; returns the number of chunks that were read, refused ones as well."""
+        """Hand all that has arrived to the listeners; returns the number of chunks that were read,
+        refused ones as well.
+        """
         count, looked, shut = 0, 0, 0
-        while looked < MOST_CHUNKS and shut < MOST_SHUT_OUT and (data := self.port.read()) is not None:
+        while (
+            looked < MOST_CHUNKS and shut < MOST_SHUT_OUT and (data := self.port.read()) is not None
+        ):
             self.sender = self.port.sender
             if self.roster.shuts_out(self.sender):
                 shut += 1
@@ -98,7 +116,9 @@ class Link:
         return count
 
     def send(self, message: Any, to: Address = None) -> bool:
-        """Send a message, to one address or to the autopilot's where it names a target, else to all parties'; whether the port took it."""
+        """Send a message, to one address or to the autopilot's where it names a target, else to all
+        parties'; whether the port took it.
+        """
         try:
             if isinstance(self._mav, Signed):
                 self._mav.touch()
@@ -123,7 +143,9 @@ class Link:
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where one is not finite."""
+    """Return the attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where
+    one is not finite.
+    """
     if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
         return NAN_QUATERNION
     x, y, z, w = quat_of_euler(roll, pitch, yaw)
@@ -131,16 +153,29 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
-    """Return a body's pose in SI units, still in MAVLink's frames: world north east down or the like, quaternion wxyz.
+    """Return a body's pose in SI units, still in MAVLink's frames: world north east down or the
+    like, quaternion wxyz.
 
-    None for what is no ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY, and for an ODOMETRY in another frame than LOCAL_NED or
-    LOCAL_FRD.
-    """
+    None for what is no ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY, and for an ODOMETRY in
+    another frame than LOCAL_NED or LOCAL_FRD."""
     kind = message.get_type()
     if kind == "ATT_POS_MOCAP":
-        return Pose(message.time_usec / 1e6, arrival, body, (message.x, message.y, message.z), tuple(message.q))
+        return Pose(
+            message.time_usec / 1e6,
+            arrival,
+            body,
+            (message.x, message.y, message.z),
+            tuple(message.q),
+        )
     if kind == "VISION_POSITION_ESTIMATE":
-        quat, pos = quaternion_from_euler(message.roll, message.pitch, message.yaw), (message.x, message.y, message.z)
+        quat, pos = (
+            quaternion_from_euler(message.roll, message.pitch, message.yaw),
+            (
+                message.x,
+                message.y,
+                message.z,
+            ),
+        )
         return Pose(message.usec / 1e6, arrival, body, pos, quat, reset=message.reset_counter)
     if kind != "ODOMETRY" or message.frame_id not in LOCAL_FRAMES:
         return None
@@ -161,22 +196,32 @@ def _known(vector: Vector) -> Vector | None:
 
 
 def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_frd: Vector) -> Any:
-    """Return SET_ATTITUDE_TARGET at a time [s]: collective thrust, 0 to 1, body rates forward, right, down [rad/s]."""
+    """Return SET_ATTITUDE_TARGET at a time [s]: collective thrust, 0 to 1, body rates forward,
+    right, down [rad/s].
+    """
     stamp = int(time_s * 1e3) & 0xFFFFFFFF
-    return mav.MAVLink_set_attitude_target_message(stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust)
+    return mav.MAVLink_set_attitude_target_message(
+        stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust
+    )
 
 
 ASK_EVERY = (0.05, 0.15)
-"""Between two questions [s], drawn anew for each: a peer that works in periods of its own answers a question that comes at the same
-point of its period always with the same delay, which no shortest round trip would betray."""
+"""Between two questions [s], drawn anew for each: a peer that works in periods of its own answers a
+question that comes at the same point of its period always with the same delay, which no shortest
+round trip would betray.
+"""
 
 EARLY, LATE = 0.005, 0.2
-"""A pose that seems to arrive earlier than it was measured by more than this, or later by more, bears another clock [s]."""
+"""A pose that seems to arrive earlier than it was measured by more than this, or later by more,
+bears another clock [s].
+"""
 
 
 class LinkSync:
-    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one system may have two clocks. ``foreign``
-    counts poses whose stamps are not of their sender's TIMESYNC clock."""
+    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one
+    system may have two clocks. ``foreign`` counts poses whose stamps are not of their sender's
+    TIMESYNC clock.
+    """
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -200,13 +245,18 @@ class LinkSync:
         if message.get_type() != "TIMESYNC":
             return
         if message.tc1 == 0:
-            self._link.send(mav.MAVLink_timesync_message(TimeSync.stamp(arrival), message.ts1), self._link.sender)
+            self._link.send(
+                mav.MAVLink_timesync_message(TimeSync.stamp(arrival), message.ts1),
+                self._link.sender,
+            )
         elif message.ts1 in self._pending:
             peer = self.peers.setdefault((message.get_srcSystem(), self._link.sender), TimeSync())
             peer.take(message.tc1, message.ts1, arrival)
 
     def dated(self, pose: Pose, system: int) -> Pose:
-        """Return a pose of the message just handed on, dated on our clock where its sender's is known and the stamp is of it."""
+        """Return a pose of the message just handed on, dated on our clock where its sender's is
+        known and the stamp is of it.
+        """
         peer = self.peers.get((system, self._link.sender))
         if peer is None or peer.offset is None:
             return pose
@@ -220,7 +270,11 @@ class LinkSync:
         """Return offsets and round trips [s] by system and address."""
         return {
             "peers": {
-                f"{system} at {shown(address)}": {"offset": peer.offset, "round_trip": peer.round_trip, "steps": peer.steps}
+                f"{system} at {shown(address)}": {
+                    "offset": peer.offset,
+                    "round_trip": peer.round_trip,
+                    "steps": peer.steps,
+                }
                 for (system, address), peer in self.peers.items()
             },
             "foreign_stamps": self.foreign,

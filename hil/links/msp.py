@@ -1,7 +1,8 @@
-"""MSP, the serial protocol of Betaflight: frames of version 1, in which it answers what was asked in it, to bytes and back.
+"""MSP, the serial protocol of Betaflight: frames of version 1, in which it answers what was asked
+in it, to bytes and back.
 
-``$M``, direction, length, command, payload, XOR of length to payload. Directions: ``<`` to the flight controller, ``>`` its answer,
-``!`` its refusal. Numbers are little-endian.
+``$M``, direction, length, command, payload, XOR of length to payload. Directions: ``<`` to the
+flight controller, ``>`` its answer, ``!`` its refusal. Numbers are little-endian.
 
 Source: betaflight, src/main/msp/msp_serial.c and msp_protocol.h.
 """
@@ -11,12 +12,22 @@ import struct
 from dataclasses import dataclass
 from functools import reduce
 
-API_VERSION, FC_VARIANT, MODE_RANGES, FEATURE_CONFIG, RX_CONFIG, RX_MAP, FAILSAFE_CONFIG = 1, 2, 34, 36, 44, 64, 75
+API_VERSION, FC_VARIANT, MODE_RANGES, FEATURE_CONFIG, RX_CONFIG, RX_MAP, FAILSAFE_CONFIG = (
+    1,
+    2,
+    34,
+    36,
+    44,
+    64,
+    75,
+)
 STATUS, SERVO, RC, ANALOG, RC_TUNING, BOXIDS, RC_DEADBAND = 101, 103, 105, 110, 111, 119, 125
 SET_RAW_RC, SET_RC_TUNING, EEPROM_WRITE = 200, 204, 250  # command numbers
 
 TO_CONTROLLER, ANSWER, REFUSAL = b"<", b">", b"!"
-MOST_PAYLOAD = 254  # a length of 255 marks a jumbo frame; answers that are used here have some forty bytes
+MOST_PAYLOAD = (
+    254  # a length of 255 marks a jumbo frame; answers that are used here have some forty bytes
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,10 @@ def pack(frame: Frame) -> bytes:
     """Return bytes of a frame; raises `ValueError` where command or payload are too large."""
     count = len(frame.payload)
     if not (0 <= frame.command <= 255 and count <= MOST_PAYLOAD):
-        raise ValueError(f"MSP 1: command {frame.command} with {count} bytes; expected at most 255, and {MOST_PAYLOAD} bytes")
+        raise ValueError(
+            f"MSP 1: command {frame.command} with {count} bytes; expected at most 255, and"
+            f" {MOST_PAYLOAD} bytes"
+        )
     body = bytes([count, frame.command]) + frame.payload
     return b"$M" + frame.direction + body + bytes([xor(body)])
 
@@ -54,7 +68,10 @@ def xor(data: bytes) -> int:
 
 
 class Parser:
-    """Bytes of a stream to frames. No byte string makes it raise; ``errors`` counts what looked like a frame and was none."""
+    """Bytes of a stream to frames.
+
+    No byte string makes it raise; ``errors`` counts what looked like a frame and was none.
+    """
 
     def __init__(self) -> None:
         self.errors = 0
@@ -71,7 +88,9 @@ class Parser:
                     return frames  # more is to come
                 length = 6 + buffer[3]
                 if xor(buffer[3 : length - 1]) == buffer[length - 1]:
-                    frames.append(Frame(buffer[4], bytes(buffer[5 : length - 1]), bytes(buffer[2:3])))
+                    frames.append(
+                        Frame(buffer[4], bytes(buffer[5 : length - 1]), bytes(buffer[2:3]))
+                    )
                     del buffer[:length]
                     continue
             self.errors += 1

@@ -1,9 +1,11 @@
-"""The one place that imports pymavlink, after MAVLink 2 was asked for: a parser that never raises, and signed messages.
+"""The one place that imports pymavlink, after MAVLink 2 was asked for: a parser that never raises,
+and signed messages.
 
-A signature is the first six bytes of SHA-256 over key, message and a time stamp that only grows, so that nothing can be sent again.
+A signature is the first six bytes of SHA-256 over key, message and a time stamp that only grows, so
+that nothing can be sent again.
 
-Source: mavlink.io, Message Signing (time stamps of 10 us since 2015-01-01; a new stream may be a minute behind).
-"""
+Source: mavlink.io, Message Signing (time stamps of 10 us since 2015-01-01; a new stream may be a
+minute behind)."""
 
 import hashlib
 import hmac
@@ -21,12 +23,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 __all__ = ["Parser", "mav"]
 
-FORGED = "Invalid signature"  # what pymavlink calls a message without a valid signature, where one is asked for
+FORGED = (  # what pymavlink calls a message without a valid signature, where one is asked for
+    "Invalid signature"
+)
 
 
 class Parser:
-    """Bytes to messages; no byte string makes it raise. ``errors`` counts what was no message, or only in part; ``forged`` are messages of
-    the last bytes without a valid signature."""
+    """Bytes to messages; no byte string makes it raise.
+
+    ``errors`` counts what was no message, or only in part; ``forged`` are messages of the last
+    bytes without a valid signature.
+    """
 
     def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)) -> None:
         """Take what makes pymavlink's parser, which may ask for signatures."""
@@ -39,11 +46,15 @@ class Parser:
         self._mav.robust_parsing = True
 
     def parse(self, data: bytes, whole: bool = True) -> list:
-        """Return messages in a byte string: a whole datagram, of which nothing is kept for the next one, or a piece of a stream."""
+        """Return messages in a byte string: a whole datagram, of which nothing is kept for the next
+        one, or a piece of a stream.
+        """
         self.forged = []
         try:
             found = self._mav.parse_buffer(data) or []
-        except Exception:  # whatever pymavlink stumbles over, its state is not to be trusted afterwards
+        except (
+            Exception
+        ):  # whatever pymavlink stumbles over, its state is not to be trusted afterwards
             self.errors += 1
             self._fresh()
             return []
@@ -51,27 +62,38 @@ class Parser:
         self.errors += len(found) - len(messages)
         if len(found) > len(messages):
             bad = (message for message in found if message.get_msgId() < 0)
-            self.forged = [bytes(message.data) for message in bad if getattr(message, "reason", "") == FORGED]
+            self.forged = [
+                bytes(message.data) for message in bad if getattr(message, "reason", "") == FORGED
+            ]
         if whole and self._mav.buf_len():
             self.errors += 1
-            self._mav.buf, self._mav.buf_index, self._mav.expected_length = bytearray(), 0, mav.HEADER_LEN_V1 + 2
+            self._mav.buf, self._mav.buf_index, self._mav.expected_length = (
+                bytearray(),
+                0,
+                mav.HEADER_LEN_V1 + 2,
+            )
         return messages
 
 
 EPOCH = 1_420_070_400.0  # 2015-01-01, where time stamps of signatures begin [s since 1970]
-BEHIND = 6_000_000  # that the first message of a stream may be behind our clock: a minute, in units of 10 us
+# that the first message of a stream may be behind our clock: a minute, in units of 10 us
+BEHIND = 6_000_000
 MOST_STREAMS = 256  # streams of valid signatures; more than 255 link ids of one sender are none
 LEAST_WORD = 8  # characters of a pass phrase
 
 
 def read_key(path: str | Path) -> bytes:
-    """Read a key of 32 bytes: raw, as 64 hexadecimal digits, or by a pass phrase, whose SHA-256 it then is; raises `LinkError` for a file
-    that cannot be read, that others may read, or that holds no key."""
+    """Read a key of 32 bytes: raw, as 64 hexadecimal digits, or by a pass phrase, whose SHA-256 it
+    then is; raises `LinkError` for a file that cannot be read, that others may read, or that holds
+    no key.
+    """
     path = Path(path)
     try:
         data, mode = path.read_bytes(), path.stat().st_mode
     except OSError as error:
-        raise LinkError(f"key {path}: {error.strerror}; expected a file with a key for --sign") from error
+        raise LinkError(
+            f"key {path}: {error.strerror}; expected a file with a key for --sign"
+        ) from error
     if mode & (stat.S_IRGRP | stat.S_IROTH):
         raise LinkError(f"key {path} can be read by others; expected: chmod 600 {path}")
     if len(data) == 32:
@@ -84,7 +106,10 @@ def read_key(path: str | Path) -> bytes:
     if len(raw) == 32:
         return raw
     if len(word) < LEAST_WORD:
-        raise LinkError(f"key {path}: {len(word)} characters; expected 32 bytes, 64 hexadecimal digits or a phrase of {LEAST_WORD}")
+        raise LinkError(
+            f"key {path}: {len(word)} characters; expected 32 bytes, 64 hexadecimal digits or a"
+            f" phrase of {LEAST_WORD}"
+        )
     return hashlib.sha256(word).digest()
 
 
@@ -96,8 +121,12 @@ def stamp_now() -> int:
 class Signed(mav.MAVLink):
     """Packs signed messages, and parses those alone that are."""
 
-    def __init__(self, key: bytes, system: int = 0, component: int = 0, streams: dict | None = None) -> None:
-        """Take a key of 32 bytes, ids of the sender, and times of the last valid signatures, of another parser of the same link."""
+    def __init__(
+        self, key: bytes, system: int = 0, component: int = 0, streams: dict | None = None
+    ) -> None:
+        """Take a key of 32 bytes, ids of the sender, and times of the last valid signatures, of
+        another parser of the same link.
+        """
         super().__init__(None, system, component)
         self.signing.secret_key, self.signing.sign_outgoing = key, True
         self.signing.stream_timestamps = {} if streams is None else streams
@@ -110,15 +139,16 @@ class Signed(mav.MAVLink):
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
         """Return whether a signature is valid, and newer than the last valid one of its stream.
 
-        The library's own notes the time of a message before it has looked at the signature: one forged message with a late time
-        would shut the true sender out.
-        """
+        The library's own notes the time of a message before it has looked at the signature: one
+        forged message with a late time would shut the true sender out."""
         good = hashlib.sha256(self.signing.secret_key + bytes(msgbuf[:-6])).digest()[:6]
         if not hmac.compare_digest(good, bytes(msgbuf[-6:])):
             return False
         stream, last = (msgbuf[-13], srcSystem, srcComponent), self.signing.stream_timestamps
         stamp = int.from_bytes(msgbuf[-12:-6], "little")
-        if stamp <= last.get(stream, stamp_now() - BEHIND) or (stream not in last and len(last) >= MOST_STREAMS):
+        if stamp <= last.get(stream, stamp_now() - BEHIND) or (
+            stream not in last and len(last) >= MOST_STREAMS
+        ):
             return False
         last[stream] = stamp
         return True

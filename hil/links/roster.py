@@ -1,9 +1,10 @@
-"""Who may speak on a link: each party belongs to the ids that the config names, and to the address of its first valid message.
+"""Who may speak on a link: each party belongs to the ids that the config names, and to the address
+of its first valid message.
 
-A party is a body's poses or the autopilot. What comes from nobody's ids, from another address than its party's, or from an autopilot
-of another type is refused, counted, and said once a sender. On the ground a party that has fallen silent may come back from another
-address (a bridge that was started again); in flight none may.
-"""
+A party is a body's poses or the autopilot. What comes from nobody's ids, from another address than
+its party's, or from an autopilot of another type is refused, counted, and said once a sender. On
+the ground a party that has fallen silent may come back from another address (a bridge that was
+started again); in flight none may."""
 
 import ipaddress
 from collections.abc import Callable, Iterable
@@ -16,13 +17,22 @@ from visthrow.config.bounds import Bound
 
 MavlinkId = Annotated[int, Bound(1, 255)]
 
-Address = tuple[str, int] | None  # address of a datagram's sender; None on a stream, which has one peer
+Address = (
+    tuple[str, int] | None
+)  # address of a datagram's sender; None on a stream, which has one peer
 
-SILENT = 1.5  # after which another address may take a party's place on the ground: longer than a heartbeat's second [s]
-MOST_KEPT = 256  # kinds of messages of all senders that are told apart; the rest is counted together
+# after which another address may take a party's place on the ground: longer than a heartbeat's
+# second [s]
+SILENT = 1.5
+MOST_KEPT = (
+    256  # kinds of messages of all senders that are told apart; the rest is counted together
+)
 MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
-NOT_YET = "before its first"  # why a message of a party is not taken that has not been heard as the one that it is to be
-SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})  # messages that a party may send beside its own: its clock, and whether it is simulated
+# why a message of a party is not taken that has not been heard as the one that it is to be
+NOT_YET = "before its first"
+SHARED = frozenset(
+    {"TIMESYNC", "NAMED_VALUE_INT"}
+)  # messages that a party may send beside its own: its clock, and whether it is simulated
 SIMULATED = "SIMULATED"  # name of the NAMED_VALUE_INT by which a fake says that nothing real flies
 
 
@@ -33,7 +43,9 @@ class Party:
     name: str  # of a body, or "autopilot"
     system: int  # MAVLink id
     component: int  # MAVLink id; 0 for any
-    kinds: frozenset[str] = frozenset()  # messages that are its; empty: all that are no other party's
+    kinds: frozenset[str] = (
+        frozenset()
+    )  # messages that are its; empty: all that are no other party's
     autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must name
 
     def has(self, system: int, component: int) -> bool:
@@ -54,7 +66,9 @@ class Seen:
     def text(self) -> str:
         """Return it in words."""
         ids = "" if self.system is None else f" of system {self.system}, component {self.component}"
-        return f"{self.kind}{ids} from {shown(self.address)}" + (f": {self.why}" if self.why else "")
+        return f"{self.kind}{ids} from {shown(self.address)}" + (
+            f": {self.why}" if self.why else ""
+        )
 
 
 OTHERS = Seen(None, None, None, "others")
@@ -74,15 +88,24 @@ def autopilot_name(number: int) -> str:
 
 
 def check_allowed(senders: Iterable[str]) -> tuple[tuple[str, int | None], ...]:
-    """Read a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each; raises `LinkError` for what is neither."""
+    """Read a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each; raises `LinkError` for
+    what is neither.
+    """
     out = []
     for text in senders:
-        host, _, port = text.rpartition(":") if text.count(":") == 1 or (text.startswith("[") and "]:" in text) else (text, "", "")
+        host, _, port = (
+            text.rpartition(":")
+            if text.count(":") == 1 or (text.startswith("[") and "]:" in text)
+            else (text, "", "")
+        )
         try:
             address = str(ipaddress.ip_address(host.strip("[]")))
             number = int(port) if port else None
         except ValueError:
-            raise LinkError(f"link.allow '{text}'; expected a numeric address such as 192.168.1.10, or 192.168.1.10:14550") from None
+            raise LinkError(
+                f"link.allow '{text}'; expected a numeric address such as 192.168.1.10, or"
+                " 192.168.1.10:14550"
+            ) from None
         out.append((address, number))
     return tuple(out)
 
@@ -91,15 +114,24 @@ class Roster:
     """The parties of a link and where they are.
 
     Attributes:
-        at: address by party. heard: when it last spoke [s]. flying: whether parties are held to their addresses.
+        at: address by party. heard: when it last spoke [s]. flying: whether parties are held to
+            their addresses.
         seen: counts of what came. refused: messages and datagrams that were not taken.
-        moved: called with a party that came back from another address. tell: is handed each sender that is refused, once.
-        simulated: whether a party has said that nothing real flies. only: address that the device names, or None.
+        moved: called with a party that came back from another address. tell: is handed each sender
+            that is refused, once.
+        simulated: whether a party has said that nothing real flies. only: address that the device
+            names, or None.
     """
 
-    def __init__(self, parties: Iterable[Party] = (), allow: Iterable[str] = (), tell: Callable[[str], None] | None = None) -> None:
-        """Wait for all parties; without one, the first valid message of anybody says who is heard and answered. ``allow``: addresses that
-        may send at all; none: any."""
+    def __init__(
+        self,
+        parties: Iterable[Party] = (),
+        allow: Iterable[str] = (),
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
+        """Wait for all parties; without one, the first valid message of anybody says who is heard
+        and answered. ``allow``: addresses that may send at all; none: any.
+        """
         self.parties, self._allow, self.tell = tuple(parties), check_allowed(allow), tell
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}
@@ -111,13 +143,21 @@ class Roster:
         self._said: set[tuple] = set()
 
     def shuts_out(self, address: Address) -> bool:
-        """Return whether a datagram is not even looked into: not from the device's peer, not on the list, from nobody in flight."""
+        """Return whether a datagram is not even looked into: not from the device's peer, not on the
+        list, from nobody in flight.
+        """
         why = None
         if address is not None and self.only not in (None, address):
             why = f"the link's device is {shown(self.only)}"
-        elif address is not None and self._allow and not any(h == address[0] and port in (None, address[1]) for h, port in self._allow):
+        elif (
+            address is not None
+            and self._allow
+            and not any(h == address[0] and port in (None, address[1]) for h, port in self._allow)
+        ):
             why = "not on link.allow"
-        elif address is not None and self.flying and self.parties and address not in self.at.values():
+        elif (
+            address is not None and self.flying and self.parties and address not in self.at.values()
+        ):
             why = "another sender while it flies"
         if why is not None:
             self.refuse(Seen(address, None, None, "datagram", why))
@@ -137,10 +177,18 @@ class Roster:
         self.seen[seen] = self.seen.get(seen, 0) + 1
 
     def admit(self, message: Any, address: Address, now: float) -> bool:
-        """Return whether a message is one of a party's; binds the party to its sender's address at a time [s]."""
-        kind, system, component = message.get_type(), message.get_srcSystem(), message.get_srcComponent()
+        """Return whether a message is one of a party's; binds the party to its sender's address at
+        a time [s].
+        """
+        kind, system, component = (
+            message.get_type(),
+            message.get_srcSystem(),
+            message.get_srcComponent(),
+        )
         party = self._party(kind, system, component, address)
-        if party is None and any(p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties):
+        if party is None and any(
+            p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties
+        ):
             self._count(Seen(address, system, component, kind))  # a party's, that nobody asked for
             return False
         if self.parties:
@@ -148,7 +196,9 @@ class Roster:
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
         seen = Seen(address, system, component, kind, why or "")
-        if why is not None and not why.startswith(NOT_YET):  # that of no stranger: its first one is on its way
+        if why is not None and not why.startswith(
+            NOT_YET
+        ):  # that of no stranger: its first one is on its way
             self.refuse(seen)
         else:
             self._count(seen)
@@ -167,24 +217,42 @@ class Roster:
         return True
 
     def _party(self, kind: str, system: int, component: int, address: Address) -> Party | None:
-        """Return whose message it is by kind and ids; of a shared kind, one of theirs at this address first."""
+        """Return whose message it is by kind and ids; of a shared kind, one of theirs at this
+        address first.
+        """
         ours = [party for party in self.parties if party.has(system, component)]
         if kind in SHARED:
-            here = [party for party in ours if party.name in self.at and self.at[party.name] == address]
+            here = [
+                party for party in ours if party.name in self.at and self.at[party.name] == address
+            ]
             return next(iter([*here, *ours]), None)
-        return next((p for p in ours if kind in p.kinds), next((p for p in ours if not p.kinds), None))
+        return next(
+            (p for p in ours if kind in p.kinds), next((p for p in ours if not p.kinds), None)
+        )
 
-    def _objection(self, party: Party | None, message: Any, kind: str, address: Address, now: float) -> str | None:
+    def _objection(
+        self, party: Party | None, message: Any, kind: str, address: Address, now: float
+    ) -> str | None:
         """Return why a message is not taken, or None."""
         if party is None:
             return f"nobody of this run, which expects {self.expected()}"
-        if party.autopilot is not None and kind == "HEARTBEAT" and message.autopilot != party.autopilot:
-            return f"it is a {autopilot_name(message.autopilot)}, expected is a {autopilot_name(party.autopilot)}"
+        if (
+            party.autopilot is not None
+            and kind == "HEARTBEAT"
+            and message.autopilot != party.autopilot
+        ):
+            return (
+                f"it is a {autopilot_name(message.autopilot)}, expected is a"
+                f" {autopilot_name(party.autopilot)}"
+            )
         if self.at.get(party.name, ...) == address:
             return None
         if party.name in self.at:
             if self.flying:
-                return f"another sender while it flies; the {party.name} speaks from {shown(self.at[party.name])}"
+                return (
+                    f"another sender while it flies; the {party.name} speaks from"
+                    f" {shown(self.at[party.name])}"
+                )
             if now - self.heard[party.name] < SILENT:
                 return f"a second sender; the {party.name} speaks from {shown(self.at[party.name])}"
         first = "HEARTBEAT" if party.autopilot is not None else ", ".join(sorted(party.kinds))
@@ -200,16 +268,22 @@ class Roster:
         return ", ".join(texts) or "anybody"
 
     def addresses(self, message: Any) -> tuple[Address, ...]:
-        """Return where a message of ours goes: what names a target to the autopilot, the rest to all."""
+        """Return where a message of ours goes: what names a target to the autopilot, the rest to
+        all.
+        """
         if hasattr(message, "target_system") and "autopilot" in self.at:
             return (self.at["autopilot"],)
         return tuple(dict.fromkeys(self.at.values()))
 
     def summary(self) -> dict[str, Any]:
         """Return who was heard from where, and what was refused, most first."""
-        refused = sorted(((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS), key=lambda row: -row[0])
+        refused = sorted(
+            ((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS),
+            key=lambda row: -row[0],
+        )
         return {
-            "at": {name: shown(address) for name, address in self.at.items()}, "simulated": self.simulated,
+            "at": {name: shown(address) for name, address in self.at.items()},
+            "simulated": self.simulated,
             "refused": self.refused,
             "refused_most": [{"count": n, "what": seen.text()} for n, seen in refused[:MOST_SAID]],
         }

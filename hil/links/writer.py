@@ -1,4 +1,6 @@
-"""What goes over links, and a run's lines, in files: written by a thread each, so that a slow disk delays no tick."""
+"""What goes over links, and a run's lines, in files: written by a thread each, so that a slow disk
+delays no tick.
+"""
 
 import struct
 import threading
@@ -10,18 +12,32 @@ from typing import Any
 from hil.links.device import Port
 from visthrow.common.errors import StorageError
 
-TLOG, POSES_TLOG, MSP_LOG = "link.tlog", "poses.tlog", "link.msp"  # in a run's folder: of the link, of poses on a port of their own, of MSP
-MOST_WAITING = 100_000  # chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
+TLOG, POSES_TLOG, MSP_LOG = (
+    "link.tlog",
+    "poses.tlog",
+    "link.msp",
+)  # in a run's folder: of the link, of poses on a port of their own, of MSP
+# chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
+MOST_WAITING = 100_000
 
 WRITE_EVERY = 0.1
-"""Between two looks for what is to be written [s]: woken by each chunk, the thread would take the core from the flying one."""
+"""Between two looks for what is to be written [s]: woken by each chunk, the thread would take the
+core from the flying one.
+"""
 
-HEAD = struct.Struct(">QcH")  # of a chunk of MSP: time since 1970 [us], b"<" to the flight controller or b">" from it, number of bytes
+HEAD = struct.Struct(
+    ">QcH"
+    # of a chunk of MSP: time since 1970 [us], b"<" to the flight controller or b">" from it, number
+    # of bytes
+)
 MOST_BYTES = 65535  # length of a chunk of MSP in the file; a longer one is cut
 
 
 class Writer:
-    """A file that is added to; putting never waits nor raises. ``failed`` counts chunks that were not written, ``why`` the first."""
+    """A file that is added to; putting never waits nor raises.
+
+    ``failed`` counts chunks that were not written, ``why`` the first.
+    """
 
     def __init__(self, path: str | Path) -> None:
         """Open the file; raises `StorageError` where it cannot be written."""
@@ -29,7 +45,10 @@ class Writer:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
         except OSError as error:
-            raise StorageError(f"cannot write {path}: {error.strerror}; expected a folder that can be written (--out)") from error
+            raise StorageError(
+                f"cannot write {path}: {error.strerror}; expected a folder that can be written"
+                " (--out)"
+            ) from error
         self._name, self.failed, self.why = Path(path).name, 0, None
         self._waiting: deque[bytes] = deque()
         self._over = threading.Event()

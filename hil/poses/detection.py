@@ -1,8 +1,9 @@
-"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read until the next.
+"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read until
+the next.
 
-A frame counts for a while, then all reads as dropped out; what is not in it at once. To a policy that was trained with the exact
-direction at the edge in place of what is out of view, what was last seen near the edge reads as its direction there.
-"""
+A frame counts for a while, then all reads as dropped out; what is not in it at once. To a policy
+that was trained with the exact direction at the edge in place of what is out of view, what was last
+seen near the edge reads as its direction there."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from hil.poses.pose import Quaternion, Vector
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.observations import rotation_from_quat
 
-NEAR_EDGE = 0.85  # radius in the image beyond which what is not seen any more has left the field of view, of 1
+# radius in the image beyond which what is not seen any more has left the field of view, of 1
+NEAR_EDGE = 0.85
 PATH = 25  # ticks that the vehicle's way is kept for: half a second
 
 PARTS = {"goal": slice(0, GOAL_KEYPOINTS), "ball": slice(GOAL_KEYPOINTS, None)}  # of the keypoints
@@ -31,7 +33,9 @@ class Detection:
 
     stamp: float  # of the exposure, on the runner's clock [s]
     corners: Corners | None  # unit rays to the corners of the goal square, in turn
-    ball: tuple[float, float, float, float] | None  # unit ray to the ball's centre, and half-angle [rad]
+    ball: (
+        tuple[float, float, float, float] | None
+    )  # unit ray to the ball's centre, and half-angle [rad]
 
     def values(self) -> list:
         """Return it as JSON has it."""
@@ -41,7 +45,11 @@ class Detection:
     def of(cls, values: list) -> "Detection":
         """Return the inverse of :meth:`values`."""
         stamp, corners, ball = values
-        return cls(stamp, None if corners is None else tuple(map(tuple, corners)), None if ball is None else tuple(ball))
+        return cls(
+            stamp,
+            None if corners is None else tuple(map(tuple, corners)),
+            None if ball is None else tuple(ball),
+        )
 
     def seen(self) -> Seen:
         """Return it as `camera.detectors.contours` has it."""
@@ -56,14 +64,21 @@ def rotation_of(quat: Quaternion) -> np.ndarray:
 
 
 class Detections:
-    """Keypoints by the detections so far; ``fresh``: stamp [s], keypoints (8, 2) and validity (8,) of the last frame that was taken."""
+    """Keypoints by the detections so far; ``fresh``: stamp [s], keypoints (8, 2) and validity (8,)
+    of the last frame that was taken.
+    """
 
     def __init__(self, camera: KeypointCamera, hold: float) -> None:
-        """Start with nothing seen by the camera of training; ``hold``: for which a frame counts [s]."""
+        """Start with nothing seen by the camera of training; ``hold``: for which a frame counts
+        [s].
+        """
         self._camera, self._hold = camera, hold
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
-        self._times = {"goal": -np.inf, "ball": -np.inf}  # of the last frame, where it holds the thing
+        self._times = {
+            "goal": -np.inf,
+            "ball": -np.inf,
+        }  # of the last frame, where it holds the thing
         self._newest = -np.inf
         self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
         self._scale, self._latency = 0.0, 0.0
@@ -74,14 +89,22 @@ class Detections:
         """Turn rays and carry them forward from now on by what a calibration found."""
         rot_cb = self._camera.rot_cb.double()
         turn = rotation_from_vector(torch.tensor(found.turn_b, dtype=torch.float64))
-        self._turn, self._scale, self._latency = (rot_cb @ turn @ rot_cb.T).numpy(), found.scale, max(found.latency, 0.0)
+        self._turn, self._scale, self._latency = (
+            (rot_cb @ turn @ rot_cb.T).numpy(),
+            found.scale,
+            max(found.latency, 0.0),
+        )
 
     def along(self, now: float, pos: Vector, quat: Quaternion) -> None:
-        """Note where the vehicle is at a tick, as of the poses, for frames that are older than these."""
+        """Note where the vehicle is at a tick, as of the poses, for frames that are older than
+        these.
+        """
         self._path.append((now, np.array(pos), rotation_of(quat)))
 
     def take(self, detection: Detection, quat: Quaternion, aged: float = 0.0) -> None:
-        """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age at a tick [s]."""
+        """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
+        at a tick [s].
+        """
         seen = detection.seen()
         rot_wb = rotation_of(quat)
         if self._turn is not None and self._path:
@@ -97,14 +120,25 @@ class Detections:
                 self._points[part], self._valid[part] = points[part], valid[part]
 
     def problems(self, now: float) -> list[str]:
-        """Return what speaks against a throw at a time [s]: a ball that hangs and a goal that lies in view are seen."""
-        return [f"the pictures show no {name}" for name, stamp in self._times.items() if now - stamp > self._hold]
+        """Return what speaks against a throw at a time [s]: a ball that hangs and a goal that lies
+        in view are seen.
+        """
+        return [
+            f"the pictures show no {name}"
+            for name, stamp in self._times.items()
+            if now - stamp > self._hold
+        ]
 
     def _carried(self, seen: Seen, when: float) -> Seen:
-        """Return what was seen at a time as the camera of training would see it now: the goal lies, the ball goes with the vehicle."""
+        """Return what was seen at a time as the camera of training would see it now: the goal lies,
+        the ball goes with the vehicle.
+        """
         _, pos_now, rot_now = self._path[-1]
         pos, rot = self._pose(when)
-        rot_bc, lens = self._camera.rot_cb.double().numpy().T, self._camera.position_b.double().numpy()
+        rot_bc, lens = (
+            self._camera.rot_cb.double().numpy().T,
+            self._camera.position_b.double().numpy(),
+        )
         turn, ball, goal = self._turn, seen.ball, seen.goal
         if ball is not None:
             ray = rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ self._to_scale(ball.ray_c[None])[0]
@@ -125,7 +159,9 @@ class Detections:
         return rays
 
     def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the place and attitude at a time on the path, by straight lines; its ends beyond them."""
+        """Return the place and attitude at a time on the path, by straight lines; its ends beyond
+        them.
+        """
         path = list(self._path)
         after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
         if after == 0 or path[after][0] <= when:
@@ -136,12 +172,18 @@ class Detections:
         return pos + share * (pos_after - pos), rot @ Rotation.from_rotvec(share * way).as_matrix()
 
     def keypoints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape (1, 8)."""
+        """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape
+        (1, 8).
+        """
         points, valid = self._points.clone(), self._valid.clone()
         for name, part in PARTS.items():
             if now - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)
                 left = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())
-                points[part] = points[part] / radius.clamp(min=1e-6) if left else torch.zeros_like(points[part])
+                points[part] = (
+                    points[part] / radius.clamp(min=1e-6)
+                    if left
+                    else torch.zeros_like(points[part])
+                )
                 valid[part] = False
         return points[None].numpy(), valid[None].numpy()

@@ -1,12 +1,12 @@
 """Velocity and body rate where the source gives none: a causal polynomial fit over the last poses.
 
-Over the N samples of a window of time, whatever the source's rate, a line (order 1) or a parabola (order 2) is fitted by
-least squares, with the samples' own time stamps, and its slope is taken at the newest one. Under constant acceleration a
-line's slope is late by half the window, ``(N - 1) T / 2`` at an even spacing T; a parabola's is not late at all, but noisier.
-For slopes ``v = sum c_i p(t - a_i)`` of samples of age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to
-``p = t^2 / 2`` is ``t`` less the lag), which is what :attr:`SlopeFilter.lag` reports. The slope's noise is ``sqrt(sum c_i^2)``
-times that of a sample.
-"""
+Over the N samples of a window of time, whatever the source's rate, a line (order 1) or a parabola
+(order 2) is fitted by least squares, with the samples' own time stamps, and its slope is taken at
+the newest one. Under constant acceleration a line's slope is late by half the window, ``(N - 1) T /
+2`` at an even spacing T; a parabola's is not late at all, but noisier. For slopes ``v = sum c_i p(t
+- a_i)`` of samples of age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to ``p = t^2 /
+2`` is ``t`` less the lag), which is what :attr:`SlopeFilter.lag` reports. The slope's noise is
+``sqrt(sum c_i^2)`` times that of a sample."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -16,7 +16,9 @@ from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import conjugate, multiply, rotation_vector
 from visthrow.config.bounds import Bound, Bounded
 
-MOST_GAP = 0.1  # a gap longer than this empties the window: what lies before it says nothing of now [s]
+MOST_GAP = (
+    0.1  # a gap longer than this empties the window: what lies before it says nothing of now [s]
+)
 MOST_SAMPLES = 32  # in a window, whatever the source's rate: the fit's cost stays bounded
 
 
@@ -24,15 +26,18 @@ MOST_SAMPLES = 32  # in a window, whatever the source's rate: the fit's cost sta
 class EstimateParams(Bounded):
     """The filter."""
 
-    window: Annotated[float, Bound(0.0, MOST_GAP, "(]")]  # age of the oldest sample, where there are enough younger ones [s]
+    window: Annotated[
+        float, Bound(0.0, MOST_GAP, "(]")
+    ]  # age of the oldest sample, where there are enough younger ones [s]
     order: Annotated[int, Bound(1, 2)]  # 1: line, 2: parabola
 
 
 def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]]:
-    """Return weights c_i of samples of given ages [s], newest first, in the slope at age 0 [1/s], and in the second derivative [1/s^2].
+    """Return weights c_i of samples of given ages [s], newest first, in the slope at age 0 [1/s],
+    and in the second derivative [1/s^2].
 
-    With too few samples for the order the order is lowered; with one sample the slope is 0. The second one of a line is 0.
-    """
+    With too few samples for the order the order is lowered; with one sample the slope is 0. The
+    second one of a line is 0."""
     order, none = min(order, len(ages) - 1), [0.0] * len(ages)
     if order < 1:
         return none, none
@@ -46,7 +51,8 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
     if order == 1:
         det = n * s2 - s1 * s1
         return ([(-n * age - s1) / det for age in ages] if det > 0.0 else none), none
-    # The middle and the last row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3], [s2, s3, s4]].
+    # The middle and the last row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3],
+    # [s2, s3, s4]].
     r0, r1, r2 = s2 * s3 - s1 * s4, n * s4 - s2 * s2, s1 * s2 - n * s3
     det = r0 * s1 + r1 * s2 + r2 * s3
     if not det > 0.0:
@@ -57,10 +63,11 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
 
 
 class SlopeFilter:
-    """Velocity, acceleration and body rate of one body; ``acceleration`` is of the last estimate [m/s^2], world frame, 0 for a line.
+    """Velocity, acceleration and body rate of one body; ``acceleration`` is of the last estimate
+    [m/s^2], world frame, 0 for a line.
 
-    The rate is worked out when it is asked for: many poses may come between two ticks, and a bare ball's is never asked for.
-    """
+    The rate is worked out when it is asked for: many poses may come between two ticks, and a bare
+    ball's is never asked for."""
 
     def __init__(self, params: EstimateParams) -> None:
         self.params = params
@@ -77,7 +84,9 @@ class SlopeFilter:
         self._window.clear()
 
     def update(self, pose: Pose) -> Vector:
-        """Return the velocity, world frame [m/s], at a pose in our frames newer than the last; the source's own where it gives one."""
+        """Return the velocity, world frame [m/s], at a pose in our frames newer than the last; the
+        source's own where it gives one.
+        """
         window, params, stamp = self._window, self.params, pose.stamp
         if window and not 0.0 < stamp - window[0].stamp <= MOST_GAP:
             window.clear()
@@ -92,11 +101,15 @@ class SlopeFilter:
 
     @property
     def rate(self) -> Vector:
-        """Body rate at the last pose, body frame [rad/s]; the source's own where it gives one, 0 without an attitude."""
+        """Body rate at the last pose, body frame [rad/s]; the source's own where it gives one, 0
+        without an attitude.
+        """
         if self._rate is None:
             pose = self._window[0] if self._window else None
             if pose is None or pose.rate is not None or pose.quat is None:
-                self._rate = pose.rate if pose is not None and pose.rate is not None else (0.0, 0.0, 0.0)
+                self._rate = (
+                    pose.rate if pose is not None and pose.rate is not None else (0.0, 0.0, 0.0)
+                )
             else:
                 turns = [_turn(pose.quat, sample.quat) for sample in self._window]
                 self._rate, self._spin = _sum(self._weights, turns), _sum(self._bends, turns)
@@ -104,13 +117,17 @@ class SlopeFilter:
 
     @property
     def spin(self) -> Vector:
-        """Change of the body rate at the last pose, body frame [rad/s^2]; 0 for a line, and where the source gives rates."""
+        """Change of the body rate at the last pose, body frame [rad/s^2]; 0 for a line, and where
+        the source gives rates.
+        """
         _ = self.rate  # works it out along with itself
         return self._spin
 
     @property
     def lag(self) -> float:
-        """Lag of the last estimates under constant acceleration [s]; 0 where the source gave both itself."""
+        """Lag of the last estimates under constant acceleration [s]; 0 where the source gave both
+        itself.
+        """
         if not self._window:
             return 0.0
         pose = self._window[0]
@@ -129,7 +146,9 @@ def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
 
 
 def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
-    """Return the rotation vector from the attitude now to an earlier one, in the body frame of now [rad]."""
+    """Return the rotation vector from the attitude now to an earlier one, in the body frame of now
+    [rad].
+    """
     if then is None:
         return (0.0, 0.0, 0.0)
     return rotation_vector(multiply(conjugate(now), then))

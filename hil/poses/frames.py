@@ -1,12 +1,13 @@
 """Conversion between a pose source's frames and ours: the only place where axes are exchanged.
 
-Ours: world z up, body x forward, y left, z up, quaternions xyzw. A source's axes are described by three signed letters:
-``axes = "y,x,-z"`` says that our world x is the source's y, our y its x, our z its -z. Of the 48 such sets 24 are turns;
-the others mirror the world and are refused. Common sets:
+Ours: world z up, body x forward, y left, z up, quaternions xyzw. A source's axes are described by
+three signed letters: ``axes = "y,x,-z"`` says that our world x is the source's y, our y its x, our
+z its -z. Of the 48 such sets 24 are turns; the others mirror the world and are refused. Common
+sets:
 
 - ``"x,y,z"``: z up already (Vicon, Qualisys, ROS).
-- ``"y,x,-z"``: north, east, down to east, north, up; ``"x,-y,-z"``: forward, right, down to forward, left, up. The two
-  differ by a yaw of 90 deg.
+- ``"y,x,-z"``: north, east, down to east, north, up; ``"x,-y,-z"``: forward, right, down to
+  forward, left, up. The two differ by a yaw of 90 deg.
 - ``"z,x,y"``: y up (OptiTrack), its z forward; ``"x,-z,y"``: y up, its x forward.
 """
 
@@ -25,13 +26,19 @@ from visthrow.logs.axes import turn_of
 
 @dataclass(frozen=True)
 class FrameParams:
-    """How a source describes poses. Every entry is stated; none has a default. Raises `FrameError` for axes that are no turn."""
+    """How a source describes poses.
+
+    Every entry is stated; none has a default. Raises `FrameError` for axes that are no turn.
+    """
 
     axes: str  # our world axes in the source's, for instance "y,x,-z"
-    body_axes: str  # our body axes in those of the source's body, for instance "x,-y,-z" for forward, right, down
+    # our body axes in those of the source's body, for instance "x,-y,-z" for forward, right, down
+    body_axes: str
     quaternion: Literal["xyzw", "wxyz"]  # order of the source's quaternions
     yaw_offset_deg: float  # turn about our world z after the exchange of axes
-    marker_offset_b: tuple[float, float, float]  # of the tracked point from the centre of mass [m], our body frame
+    marker_offset_b: tuple[
+        float, float, float
+    ]  # of the tracked point from the centre of mass [m], our body frame
 
     def __post_init__(self) -> None:
         try:
@@ -43,15 +50,17 @@ class FrameParams:
 class Frames:
     """Converts poses, vectors and rates of one body between a source's frames and ours, both ways.
 
-    Plain floats all along: a batch of one in NumPy costs ten times as much, and the same input gives the same bits.
-    """
+    Plain floats all along: a batch of one in NumPy costs ten times as much, and the same input
+    gives the same bits."""
 
     def __init__(self, params: FrameParams) -> None:
         """Work out the turns; see `FrameParams` for what is refused."""
         self.params = params
         half = math.radians(params.yaw_offset_deg) / 2.0
         yaw = (0.0, 0.0, math.sin(half), math.cos(half))
-        self._world = multiply(yaw, _quaternion(turn_of(params.axes)))  # from the source's world to ours
+        self._world = multiply(
+            yaw, _quaternion(turn_of(params.axes))
+        )  # from the source's world to ours
         self._body = _quaternion(turn_of(params.body_axes))  # from the source's body to ours
         self._offset = tuple(float(x) for x in params.marker_offset_b)
 
@@ -70,7 +79,9 @@ class Frames:
         return multiply(multiply(self._world, quat), conjugate(self._body))
 
     def pose_from_source(self, pose: Pose) -> Pose:
-        """Return a source's pose in our frames, moved from the tracked point to the centre of mass."""
+        """Return a source's pose in our frames, moved from the tracked point to the
+        centre of mass.
+        """
         pos = self.world_from_source(pose.pos)
         quat = None if pose.quat is None else self.quat_from_source(pose.quat)
         vel = None if pose.vel is None else self.world_from_source(pose.vel)
@@ -88,7 +99,11 @@ class Frames:
             pos = _plus(pos, rotate_one(pose.quat, self._offset))
             if vel is not None and pose.rate is not None:
                 vel = _plus(vel, rotate_one(pose.quat, cross_one(pose.rate, self._offset)))
-        quat = None if pose.quat is None else multiply(multiply(conjugate(self._world), pose.quat), self._body)
+        quat = (
+            None
+            if pose.quat is None
+            else multiply(multiply(conjugate(self._world), pose.quat), self._body)
+        )
         if quat is not None and self.params.quaternion == "wxyz":
             quat = (quat[3], *quat[:3])
         rate = None if pose.rate is None else rotate_one(conjugate(self._body), pose.rate)
@@ -97,9 +112,14 @@ class Frames:
 
 
 def _quaternion(matrix: np.ndarray) -> Quaternion:
-    """Return the quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1, exactly, so that "x,y,z" changes no bit."""
+    """Return the quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1,
+    exactly, so that "x,y,z" changes no bit.
+    """
     exact = np.array([0.0, 0.5, math.sqrt(0.5), 1.0])
-    x, y, z, w = (math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v) for v in Rotation.from_matrix(matrix).as_quat())
+    x, y, z, w = (
+        math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v)
+        for v in Rotation.from_matrix(matrix).as_quat()
+    )
     sign = math.copysign(1.0, next(v for v in (w, x, y, z) if v))
     return (sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0)
 

@@ -1,14 +1,17 @@
-"""Gate of a body: refuses wrong poses, and says how old the last new one is (warn, hold, abort: ``[gate]``).
+"""Gate of a body: refuses wrong poses, and says how old the last new one is (warn, hold, abort:
 
-A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged on content: the
-time since a pose last *differed* from the one before. A body that jumps is refused and stays refused: a pose must lie
-where the last accepted one and its velocity put the body, within a room that grows with the time in which *nothing* came,
-not with the time in which wrong poses came. So two bodies that the system has swapped never become right again by waiting;
-their timers run out and the runner ends the throw. Swapped after a gap, which leaves room for both, they are known by the
-cable: of poses off their way, one that fits the body at the cable's other end better is not taken, nor one farther off than the cable
-is long. A body that goes its way is followed, however far: a payload that has come off takes no pose of the vehicle with it.
-Poses that keep coming, but more rarely than ``hold``, are as good as none.
-"""
+``[gate]``).
+
+A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged
+on content: the time since a pose last *differed* from the one before. A body that jumps is refused
+and stays refused: a pose must lie where the last accepted one and its velocity put the body, within
+a room that grows with the time in which *nothing* came, not with the time in which wrong poses
+came. So two bodies that the system has swapped never become right again by waiting; their timers
+run out and the runner ends the throw. Swapped after a gap, which leaves room for both, they are
+known by the cable: of poses off their way, one that fits the body at the cable's other end better
+is not taken, nor one farther off than the cable is long. A body that goes its way is followed,
+however far: a payload that has come off takes no pose of the vehicle with it. Poses that keep
+coming, but more rarely than ``hold``, are as good as none."""
 
 import math
 from dataclasses import dataclass
@@ -37,9 +40,11 @@ class GateParams(Bounded):
     quat_tolerance: Positive  # of a quaternion's norm from 1 [-]
     max_jump: Positive  # from where the last pose and velocity put the body [m]
     max_speed: Positive  # [m/s]
-    max_turn: Positive  # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
+    # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
+    max_turn: Positive
     max_turn_rate: Positive  # [rad/s]
-    clock_step: Positive  # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    clock_step: Positive
     warn: Positive  # content age [s]
     hold: Positive  # content age [s]
     abort: Positive  # content age [s]
@@ -47,12 +52,16 @@ class GateParams(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.warn < self.hold < self.abort:
-            raise ConfigError(f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them ascending")
+            raise ConfigError(
+                f"gate: warn {self.warn}, hold {self.hold}, abort {self.abort} s; expected them"
+                " ascending"
+            )
 
 
 class Gate:
-    """Decides about one body's poses; ``last`` is the accepted one, ``refused`` counts by reason, ``jumped``: the source's reset counter
-    has changed since the last :meth:`restart`."""
+    """Decides about one body's poses; ``last`` is the accepted one, ``refused`` counts by reason,
+    ``jumped``: the source's reset counter has changed since the last :meth:`restart`.
+    """
 
     def __init__(self, params: GateParams) -> None:
         self.params = params
@@ -60,19 +69,25 @@ class Gate:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all: the next good pose is taken wherever it is. On the ground only, at the operator's word."""
+        """Forget all: the next good pose is taken wherever it is.
+
+        On the ground only, at the operator's word.
+        """
         self.last: Pose | None = None
         self.jumped = False
         self._came: Pose | None = None  # last pose in order, accepted or not
         self._changed = -math.inf  # arrival of the last new content [s]
         self._gaps = 0  # longer than hold, in a row
 
-    def check(self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None) -> str | None:
-        """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and the cable's other end, where one hangs.
+    def check(
+        self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None
+    ) -> str | None:
+        """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and
+        the cable's other end, where one hangs.
 
-        Returns why it is refused, or None where it is accepted: "finite", "quaternion", "old" (reordered or doubled), "repeated" (the
-        content of the last one), "swapped", "cable", "jump", "speed", "turn", "reset".
-        """
+        Returns why it is refused, or None where it is accepted: "finite", "quaternion", "old"
+        (reordered or doubled), "repeated" (the content of the last one), "swapped", "cable",
+        "jump", "speed", "turn", "reset"."""
         reason = self._reason(pose, velocity, tether)
         if reason is not None:
             self.refused[reason] = self.refused.get(reason, 0) + 1
@@ -87,7 +102,11 @@ class Gate:
     def stepped(self, pose: Pose) -> bool:
         """Return whether the source's clock was set between the last accepted pose and this one."""
         last = self.last
-        return last is not None and abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival)) > self.params.clock_step
+        return (
+            last is not None
+            and abs((pose.stamp - last.stamp) - (pose.arrival - last.arrival))
+            > self.params.clock_step
+        )
 
     def _reason(self, pose: Pose, velocity: Vector | None, tether: Tether | None) -> str | None:
         last = self.last
@@ -104,13 +123,23 @@ class Gate:
         if pose.pos == last.pos and pose.quat == last.quat:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
-        age, gap = (max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0) for then in (last, came))
+        age, gap = (
+            max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0)
+            for then in (last, came)
+        )
         return self._motion(pose, last, velocity, tether, age, gap)
 
     def _itself(self, pose: Pose) -> str | None:
         """Return what is wrong with a pose, whatever came before."""
         p = self.params
-        numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.quat or ()), *(pose.vel or ()), *(pose.rate or ()))
+        numbers = (
+            pose.stamp,
+            pose.arrival,
+            *pose.pos,
+            *(pose.quat or ()),
+            *(pose.vel or ()),
+            *(pose.rate or ()),
+        )
         if not all(map(math.isfinite, numbers)):
             return "finite"
         if pose.quat is not None and abs(math.hypot(*pose.quat) - 1.0) > p.quat_tolerance:
@@ -119,8 +148,18 @@ class Gate:
             return "speed"
         return None
 
-    def _motion(self, pose: Pose, last: Pose, velocity: Vector | None, tether: Tether | None, age: float, gap: float) -> str | None:
-        """Return what is wrong with the way from the last accepted pose of an age [s], after a gap in which nothing came at all [s]."""
+    def _motion(
+        self,
+        pose: Pose,
+        last: Pose,
+        velocity: Vector | None,
+        tether: Tether | None,
+        age: float,
+        gap: float,
+    ) -> str | None:
+        """Return what is wrong with the way from the last accepted pose of an age [s], after a gap
+        in which nothing came at all [s].
+        """
         p = self.params
         expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
         off = math.dist(pose.pos, expected)
@@ -145,7 +184,9 @@ class Gate:
         return now - self._changed
 
     def level(self, now: float) -> int:
-        """Return :data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age; ABORT where content is rare."""
+        """Return :data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age;
+        ABORT where content is rare.
+        """
         if self._gaps >= RARE:
             return ABORT
         age = self.age(now)

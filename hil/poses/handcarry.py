@@ -1,9 +1,10 @@
-"""The hand-carry check: the vehicle is carried about in a stated order, and its poses tell which axes the source really has.
+"""The hand-carry check: the vehicle is carried about in a stated order, and its poses tell which
+axes the source really has.
 
-Nose along our x and level at first, a second of rest before and after each move. Three moves of the place tell the world's axes,
-three turns those of the body and the quaternion's order: of the 24 axis cases each (and the two orders) the one under which every
-move went where it was meant to is named.
-"""
+Nose along our x and level at first, a second of rest before and after each move. Three moves of the
+place tell the world's axes, three turns those of the body and the quaternion's order: of the 24
+axis cases each (and the two orders) the one under which every move went where it was meant to is
+named."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,7 +22,10 @@ from hil.poses.sources.base import Source
 from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
 from visthrow.logs.axes import OURS, TURNS, turn_of
 
-SPEED, RATE = 0.06, 0.25  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
+SPEED, RATE = (
+    0.06,
+    0.25,
+)  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
 SPAN = 0.2  # over which speed and rate are taken [s]
 REST = 0.5  # the vehicle rests only after it has for this long [s]
 LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)  # smaller moves than these are no moves [m], [rad]
@@ -35,7 +39,10 @@ class Move:
 
     text: str  # for the operator
     turn: bool  # of the attitude, else of the place
-    axis: int | None  # of our axes along or about which it goes; None for the way back, which is not judged
+    axis: (
+        int | None
+    )  # of our axes along or about which it goes; None for the way back, which is not judged
+
 
 MOVES = (
     Move("carry it forward, along our x, by half a metre", False, 0),
@@ -69,7 +76,10 @@ class Step:
     def turns(self, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
         """Return the rotation vectors [rad] of the change of attitude in our world and body."""
         first, second = (frames.quat_from_source(pose.quat) for pose in (self.before, self.after))
-        return tuple(np.array(rotation_vector(q)) for q in (multiply(second, conjugate(first)), multiply(conjugate(first), second)))
+        return tuple(
+            np.array(rotation_vector(q))
+            for q in (multiply(second, conjugate(first)), multiply(conjugate(first), second))
+        )
 
 
 Line = tuple[str, bool]  # judgement of one move: in words, and whether it passed
@@ -81,17 +91,27 @@ class Finding:
 
     lines: tuple[Line, ...]
     fitting: FrameParams  # under which the moves fit best
-    mirrored: bool  # a left-handed source would fit better: left and right exchanged, or the axes are
+    mirrored: (
+        bool  # a left-handed source would fit better: left and right exchanged, or the axes are
+    )
     passed: bool
 
 
 def find_steps(poses: Sequence[Pose]) -> list[Step]:
-    """Return moves between rests, of raw poses of the vehicle in order; raises `RunError` for one without attitude."""
+    """Return moves between rests, of raw poses of the vehicle in order; raises `RunError` for one
+    without attitude.
+    """
     if any(pose.quat is None for pose in poses):
-        raise RunError("hand-carry: the vehicle's source gives no attitude; expected a rigid body, not a marker")
+        raise RunError(
+            "hand-carry: the vehicle's source gives no attitude; expected a rigid body, not a"
+            " marker"
+        )
     good = [p for p in poses if np.isfinite([*p.pos, *p.quat]).all() and math.hypot(*p.quat) > 0.5]
     rests = _rests(good)
-    steps = [Step(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b)) for a, b in pairwise(rests)]
+    steps = [
+        Step(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b))
+        for a, b in pairwise(rests)
+    ]
     return [s for s in steps if np.linalg.norm(s.way) > LEAST_WAY or s.turn > LEAST_TURN]
 
 
@@ -106,7 +126,9 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     cosine = np.abs(np.sum(quat[late] * quat[early], axis=1)) / np.linalg.norm(quat[late], axis=1)
     rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
     still = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
-    return [s for (s,) in find_objects(label(still)[0]) if times[s.stop - 1] - times[s.start] >= REST]
+    return [
+        s for (s,) in find_objects(label(still)[0]) if times[s.stop - 1] - times[s.start] >= REST
+    ]
 
 
 def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
@@ -120,27 +142,48 @@ def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
 
 
 def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
-    """Say of each move whether it went where it was meant to by the config's frames, and which frames would fit; raises `RunError` for
-    another number of moves than `MOVES`."""
+    """Say of each move whether it went where it was meant to by the config's frames, and which
+    frames would fit; raises `RunError` for another number of moves than `MOVES`.
+    """
     if len(steps) != len(MOVES):
         seen = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
-        raise RunError(f"hand-carry: {len(steps)} moves between rests; expected {len(MOVES)}, a second of rest around each: {seen}")
+        raise RunError(
+            f"hand-carry: {len(steps)} moves between rests; expected {len(MOVES)}, a second of rest"
+            f" around each: {seen}"
+        )
     pairs = [(move, step) for move, step in zip(MOVES, steps) if move.axis is not None]
     ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
     turns = [(move.axis, step) for move, step in pairs if move.turn]
     world = max(TURNS, key=lambda axes: _agreement([(i, turn_of(axes) @ way) for i, way in ways]))
 
-    known = {order: Frames(replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)) for order in ("xyzw", "wxyz")}
+    known = {
+        order: Frames(
+            replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)
+        )
+        for order in ("xyzw", "wxyz")
+    }
     vectors = {order: [(i, step.turns(ours)) for i, step in turns] for order, ours in known.items()}
 
     def fits(order: str, body: str) -> float:
-        both = [(i, v) for i, (in_world, in_body) in vectors[order] for v in (in_world, turn_of(body) @ in_body)]
+        both = [
+            (i, v)
+            for i, (in_world, in_body) in vectors[order]
+            for v in (in_world, turn_of(body) @ in_body)
+        ]
         return round(_agreement(both), 9)
 
     order, body = max(product(vectors, TURNS), key=lambda case: fits(*case))
-    fitting = replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=_yaw(ways, turn_of(world)))
+    fitting = replace(
+        frames,
+        axes=world,
+        body_axes=body,
+        quaternion=order,
+        yaw_offset_deg=_yaw(ways, turn_of(world)),
+    )
     lines = [*(_line(move, step, frames) for move, step in pairs), _start(steps[0].before, frames)]
-    mirrored = bool(np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5)
+    mirrored = bool(
+        np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5
+    )
     return Finding(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
@@ -150,7 +193,9 @@ def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
 
 
 def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
-    """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be the walker's."""
+    """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be
+    the walker's.
+    """
     forward, left = (world @ ways[i][1] for i in (0, 1))
     off = math.degrees(math.atan2(-forward[1] + left[0], forward[0] + left[1]))
     return round(off, 0) if abs(off) > 10.0 else 0.0
@@ -164,34 +209,51 @@ def _line(move: Move, step: Step, frames: FrameParams) -> Line:
     off = math.acos(max(-1.0, min(1.0, went[move.axis] / max(length, 1e-12))))
     passed = off <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
     told = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", went))
-    return f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off", passed
+    return (
+        f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off",
+        passed,
+    )
 
 
 def _start(pose: Pose, frames: FrameParams) -> Line:
     """Return the attitude at first, which is to be level with the nose along our x."""
     tilt, heading = tilt_and_heading(Frames(frames).quat_from_source(pose.quat))
     return (
-        f"at first: tilted by {math.degrees(tilt):.0f} deg, nose {math.degrees(heading):+.0f} deg from our x (if the moves pass "
-        "and this does not, define the rigid body anew, level and with its nose along x)",
+        (
+            f"at first: tilted by {math.degrees(tilt):.0f} deg, nose {math.degrees(heading):+.0f}"
+            " deg from our x (if the moves pass and this does not, define the rigid body anew,"
+            " level and with its nose along x)"
+        ),
         max(tilt, abs(heading)) <= TOLERANCE,
     )
 
 
 def collect(
-    source: Source, clock: Clock, seconds: float, tell: Callable[[str], None] = lambda text: None, recorded: bool = False
+    source: Source,
+    clock: Clock,
+    seconds: float,
+    tell: Callable[[str], None] = lambda text: None,
+    recorded: bool = False,
 ) -> list[Step]:
-    """Take in the vehicle's poses until all moves were made, or for a time [s]; a recording to its end. ``tell`` hears each move."""
+    """Take in the vehicle's poses until all moves were made, or for a time [s]; a recording to its
+    end. ``tell`` hears each move.
+    """
     poses: list[Pose] = []
     steps: list[Step] = []
     begin, told = clock.now(), -1
-    while not source.ended and len(steps) < len(MOVES) and (recorded or clock.now() - begin < seconds):
+    while (
+        not source.ended and len(steps) < len(MOVES) and (recorded or clock.now() - begin < seconds)
+    ):
         source.wait(clock, clock.now() + LOOK)
         poses += [pose for pose in source.poll(clock.now()) if pose.body == VEHICLE]
         if not recorded:
             steps = find_steps(poses)
             if len(steps) != told and len(steps) < len(MOVES):
                 told = len(steps)
-                tell(f"{told + 1} of {len(MOVES)}: {MOVES[told].text}; then hold it still for a second")
+                tell(
+                    f"{told + 1} of {len(MOVES)}: {MOVES[told].text}; then hold it still for a"
+                    " second"
+                )
     return find_steps(poses)
 
 
@@ -200,10 +262,14 @@ def summary_text(finding: Finding, frames: FrameParams) -> str:
     lines = [f"{'PASS' if passed else 'FAIL'}  {text}" for text, passed in finding.lines]
     if finding.mirrored:
         lines.append(
-            "the moves fit a mirrored world: it was not carried forward, left and up in this order, or the source is left-handed"
+            "the moves fit a mirrored world: it was not carried forward, left and up in this order,"
+            " or the source is left-handed"
         )
     for name in ("axes", "body_axes", "quaternion", "yaw_offset_deg"):
         was, fits = getattr(frames, name), getattr(finding.fitting, name)
         if was != fits and not finding.passed:
-            lines.append(f"would fit: {name} = {fits!r}".replace("'", '"') + f"  (config: {was!r})".replace("'", '"'))
+            lines.append(
+                f"would fit: {name} = {fits!r}".replace("'", '"')
+                + f"  (config: {was!r})".replace("'", '"')
+            )
     return "\n".join(lines)

@@ -1,4 +1,7 @@
-"""One measured pose: what every source hands on and the runner reads. Plain floats, so that it is recorded exactly."""
+"""One measured pose: what every source hands on and the runner reads.
+
+Plain floats, so that it is recorded exactly.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,13 +16,18 @@ BODIES = (VEHICLE, PAYLOAD, GOAL)
 
 @dataclass(frozen=True)
 class Pose:
-    """A pose of one body: as its source says it until `hil.poses.frames` has converted it, then in our world."""
+    """A pose of one body: as its source says it until `hil.poses.frames` has converted it, then in
+    our world.
+    """
 
     stamp: float  # on the source's clock [s]
     arrival: float  # on the runner's monotonic clock [s]
     body: str  # of :data:`BODIES`
     pos: Vector  # [m]
-    quat: Quaternion | None = None  # attitude, body to world, in the order of the source (ours is xyzw); None for a bare marker
+    quat: Quaternion | None = (
+        # attitude, body to world, in the order of the source (ours is xyzw); None for a bare marker
+        None
+    )
     vel: Vector | None = None  # [m/s], world frame; None where the source gives none
     rate: Vector | None = None  # [rad/s], body frame; None where the source gives none
     reset: int = 0  # counter of the source's estimator; a change says that it jumped

@@ -10,14 +10,20 @@ from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import multiply
 
-MOST_PREDICTION = 0.1  # poses are carried forward by no more than this [s]; older ones are the timers' affair
+MOST_PREDICTION = (
+    0.1  # poses are carried forward by no more than this [s]; older ones are the timers' affair
+)
 
 TRUST = 0.5
-"""Share of the estimated accelerations that velocity and rate are carried forward with: they are about as noisy as they are right.
-In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg, 100 Hz) state and vision policy landed 0.029 and 0.028 m off with it,
-0.043 and 0.035 m with all of the linear and none of the angular acceleration."""
+"""Share of the estimated accelerations that velocity and rate are carried forward with: they are
+about as noisy as they are right. In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg, 100
+Hz) state and vision policy landed 0.029 and 0.028 m off with it, 0.043 and 0.035 m with all of the
+linear and none of the angular acceleration.
+"""
 
-CALM_SAMPLES = 20  # poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not count as motion
+# poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not
+# count as motion
+CALM_SAMPLES = 20
 
 
 @dataclass(frozen=True)
@@ -32,17 +38,24 @@ class BodyState:
 
 
 class Track:
-    """Follows one body with a ``gate``, which counts what was refused, and a ``filter``; ``accepted`` counts poses taken."""
+    """Follows one body with a ``gate``, which counts what was refused, and a ``filter``;
+    ``accepted`` counts poses taken.
+    """
 
-    def __init__(self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True) -> None:
-        """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does without."""
+    def __init__(
+        self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True
+    ) -> None:
+        """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does
+        without.
+        """
         self._turns = turns
         self.frames, self.gate, self.filter = Frames(frames), Gate(gate), SlopeFilter(estimate)
         self.accepted = 0
         self._pose: Pose | None = None
         self._vel: Vector = (0.0, 0.0, 0.0)
         self._slow: deque[tuple[float, Vector]] = deque(maxlen=CALM_SAMPLES)
-        self._shift = 0.0  # added to the stamps, so that a step of the source's clock leaves the filter's window whole
+        # added to the stamps, so that a step of the source's clock leaves the filter's window whole
+        self._shift = 0.0
 
     def restart(self) -> None:
         """Forget all; see `hil.poses.gate.Gate.restart`."""
@@ -52,7 +65,10 @@ class Track:
         self._pose = None
 
     def update(self, raw: Pose, tether: Tether | None = None) -> str | None:
-        """Take a raw pose; why it was refused, or None. ``tether``: the cable's other end, where one hangs."""
+        """Take a raw pose; why it was refused, or None.
+
+        ``tether``: the cable's other end, where one hangs.
+        """
         pose = self.frames.pose_from_source(raw)
         before, stepped = self.gate.last, self.gate.stepped(pose)
         reason = self.gate.check(pose, self._vel if self._pose is not None else None, tether)
@@ -61,7 +77,9 @@ class Track:
         if stepped and before is not None:
             self._shift -= (pose.stamp - before.stamp) - (pose.arrival - before.arrival)
         self.accepted += 1
-        self._vel = self.filter.update(replace(pose, stamp=pose.stamp + self._shift) if self._shift else pose)
+        self._vel = self.filter.update(
+            replace(pose, stamp=pose.stamp + self._shift) if self._shift else pose
+        )
         self._pose = pose
         self._slow.appendleft((pose.arrival, pose.pos))
         return None
@@ -72,7 +90,9 @@ class Track:
             _ = self.filter.rate
 
     def expected(self, time: float) -> Vector | None:
-        """Return where the last pose and velocity put the body at a time of arrival [s]; None before the first pose."""
+        """Return where the last pose and velocity put the body at a time of arrival [s]; None
+        before the first pose.
+        """
         pose = self._pose
         if pose is None:
             return None
@@ -80,21 +100,33 @@ class Track:
         return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
-        """Return the last pose, its stamp freed of clock steps, with velocity and body rate; raises `ValueError` where there is none."""
+        """Return the last pose, its stamp freed of clock steps, with velocity and body rate; raises
+        `ValueError` where there is none.
+        """
         if self._pose is None:
             raise ValueError("no pose was taken yet; sample() is for after the first one")
-        return replace(self._pose, stamp=self._pose.stamp + self._shift), self._vel, self.filter.rate
+        return (
+            replace(self._pose, stamp=self._pose.stamp + self._shift),
+            self._vel,
+            self.filter.rate,
+        )
 
     def calm_speed(self) -> float:
-        """Return the speed by a line through the last poses [m/s]: late, but free of noise; infinite with too few of them."""
+        """Return the speed by a line through the last poses [m/s]: late, but free of noise;
+        infinite with too few of them.
+        """
         if len(self._slow) < CALM_SAMPLES:
             return math.inf
         newest = self._slow[0][0]
         weights = fit_weights([newest - time for time, _ in self._slow], 1)[0]
-        return math.hypot(*(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3)))
+        return math.hypot(
+            *(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3))
+        )
 
     def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
-        """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of what is known of its accelerations."""
+        """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of
+        what is known of its accelerations.
+        """
         pose = self._pose
         if pose is None:
             return None

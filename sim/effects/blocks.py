@@ -1,4 +1,6 @@
-"""Named functions of a setting that the tables of ``configs/effects`` refer to: which blocks it has, and it with another block."""
+"""Named functions of a setting that the tables of ``configs/effects`` refer to: which blocks it
+has, and it with another block.
+"""
 
 import dataclasses
 import math
@@ -9,13 +11,20 @@ from sim.effects.setting import AERODYNAMICS, Setting
 from sim.params import GRAVITY
 
 SEGMENTS = 15  # segments of a rope that turns out to be flexible (the paper, Sec. III-B)
-RELAX = 1.0 / (2.0 * math.pi * 15.0)  # time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
-LONGEST_OFFSET = 0.12  # length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves something
+RELAX = 1.0 / (
+    2.0 * math.pi * 15.0
+)  # time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
+# length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves
+# something
+LONGEST_OFFSET = 0.12
 
 
 def _vehicle(setting: Setting, **parts: dict[str, Any]) -> Setting:
     vehicle = setting.plant.vehicle
-    changed = {name: dataclasses.replace(getattr(vehicle, name), **values) for name, values in parts.items()}
+    changed = {
+        name: dataclasses.replace(getattr(vehicle, name), **values)
+        for name, values in parts.items()
+    }
     plant = dataclasses.replace(setting.plant, vehicle=dataclasses.replace(vehicle, **changed))
     return dataclasses.replace(setting, plant=plant)
 
@@ -39,18 +48,28 @@ def _mixes_motors(setting: Setting) -> bool:
 
 
 def _motor_mixing(setting: Setting) -> Setting:
-    """With the same gains in hover, iterm_relax of 15 Hz in place of the set-point's filter, the feed-forward off."""
+    """With the same gains in hover, iterm_relax of 15 Hz in place of the set-point's filter, the
+    feed-forward off.
+    """
     plant = setting.plant
-    return _vehicle(setting, controller={
-        "kind": "motor_mixing", "mix_thrust": 0.25 * plant.total_mass * GRAVITY, "setpoint_time_constant": RELAX,
-        "feedforward_gain": (0.0, 0.0, 0.0), "calibration_voltage": plant.vehicle.battery.reference_voltage,
-    })  # fmt: skip
+    return _vehicle(
+        setting,
+        controller={
+            "kind": "motor_mixing",
+            "mix_thrust": 0.25 * plant.total_mass * GRAVITY,
+            "setpoint_time_constant": RELAX,
+            "feedforward_gain": (0.0, 0.0, 0.0),
+            "calibration_voltage": plant.vehicle.battery.reference_voltage,
+        },
+    )
 
 
 CONDITIONS: dict[str, Callable[[Setting], bool]] = {
     "always": lambda s: True,
     "aerodynamics": lambda s: s.plant.vehicle.aero.kind != "none",
-    "no aerodynamics": lambda s: not any(getattr(s.plant.vehicle.aero, name) for name in AERODYNAMICS),
+    "no aerodynamics": lambda s: (
+        not any(getattr(s.plant.vehicle.aero, name) for name in AERODYNAMICS)
+    ),
     "PID controller": _pid,
     "proportional controller": lambda s: not _pid(s),
     "thrust mixing": lambda s: _pid(s) and not _mixes_motors(s),

@@ -1,8 +1,9 @@
-"""Effects: what reality may have and the simulator lacks, and what each changes in the description of a simulated flight.
+"""Effects: what reality may have and the simulator lacks, and what each changes in the description
+of a simulated flight.
 
-The equation of an effect stands in the block of :mod:`sim` that it extends (or in :mod:`sim.kernels.replay.sampling`); its table in
-``configs/effects`` names the numbers of a :class:`sim.effects.setting.Setting` that it changes, nothing more.
-"""
+The equation of an effect stands in the block of :mod:`sim` that it extends (or in
+:mod:`sim.kernels.replay.sampling`); its table in ``configs/effects`` names the numbers of a
+:class:`sim.effects.setting.Setting` that it changes, nothing more."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -27,12 +28,15 @@ class Effect:
     block: str  # block of the simulator that holds the equation, such as rope, motor, sensing
     bounds: tuple[float, float]  # physically possible values of theta
     prior_sd: float  # spread of theta where the effect is present
-    floor: float  # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise
+    # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise
+    floor: float
     channels: tuple[str, ...]  # channels of the log without which it cannot be seen
     source: str  # of equation and prior
     confused_with: tuple[str, ...] = ()  # effects that look alike in ordinary flights
     manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from those
-    switch: str = ""  # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says little
+    # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says
+    # little
+    switch: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,12 +71,16 @@ def _read(setting: Any, path: str) -> Any:
 def _replaced(owner: Any, names: list[str], new: Any) -> Any:
     if len(names) == 1:
         return dataclasses.replace(owner, **{names[0]: new})
-    return dataclasses.replace(owner, **{names[0]: _replaced(getattr(owner, names[0]), names[1:], new)})
+    return dataclasses.replace(
+        owner, **{names[0]: _replaced(getattr(owner, names[0]), names[1:], new)}
+    )
 
 
 @dataclass(frozen=True)
 class Lowest:
-    """How low a number of the setting may come: theta is at least ``least - share * number / factor``."""
+    """How low a number of the setting may come: theta is at least ``least - share * number /
+    factor``.
+    """
 
     path: str
     share: float = 1.0  # of the number that may go
@@ -84,13 +92,15 @@ class Lowest:
 class SettingEffect(Effect):
     """An effect as a change of a setting; a table of ``configs/effects``.
 
-    Raises ValueError: a condition or a kind of block that does not exist, or neither or both of changes and switch.
-    """
+    Raises ValueError: a condition or a kind of block that does not exist, or neither or both of
+    changes and switch."""
 
     changes: tuple[Change, ...] = ()
     step: float = 0.25  # of theta for derivatives, in floors
     needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
-    simpler: bool = False  # a switch to a simpler block: left out unless asked for, as each compiles a kernel
+    simpler: bool = (
+        False  # a switch to a simpler block: left out unless asked for, as each compiles a kernel
+    )
     lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
 
     def __post_init__(self) -> None:
@@ -145,7 +155,9 @@ class EffectTables:
     random_effects: dict[str, RandomEffect] = field(default_factory=dict)
 
 
-def apply(effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]) -> Setting:
+def apply(
+    effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]
+) -> Setting:
     """Return the setting with effects of these sizes. Raises KeyError: no effect of that name."""
     for name, size in theta.items():
         effect = effects[name]

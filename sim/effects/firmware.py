@@ -1,8 +1,9 @@
-"""The rate controller of Betaflight's firmware as a block of ours, from its settings as its blackbox names them.
+"""The rate controller of Betaflight's firmware as a block of ours, from its settings as its
+blackbox names them.
 
-Source: betaflight 4.6, src/main/flight/pid.h (PTERM_SCALE, ITERM_SCALE, DTERM_SCALE, FEEDFORWARD_SCALE, PID_MIXER_SCALING),
-pid.c (applyItermRelax), pid_init.c, mixer.c (applyMixToMotors), src/main/blackbox/blackbox.c (names and units of the header).
-"""
+Source: betaflight 4.6, src/main/flight/pid.h (PTERM_SCALE, ITERM_SCALE, DTERM_SCALE,
+FEEDFORWARD_SCALE, PID_MIXER_SCALING), pid.c (applyItermRelax), pid_init.c, mixer.c
+(applyMixToMotors), src/main/blackbox/blackbox.c (names and units of the header)."""
 
 import dataclasses
 import math
@@ -11,20 +12,29 @@ from collections.abc import Mapping
 from sim.params import ControllerParams, VehicleParams
 
 P_SCALE, I_SCALE, D_SCALE, F_SCALE, MIXER_SCALE = 0.032029, 0.244381, 0.000529, 0.013754, 1000.0
-"""Output of a gain of 1 for an error of 1 deg/s, 1 deg, 1 deg/s^2, feedforward of 1 deg/s^2; output that is all of a motor's command."""
+"""Output of a gain of 1 for an error of 1 deg/s, 1 deg, 1 deg/s^2, feedforward of 1 deg/s^2; output
+that is all of a motor's command.
+"""
 
 YAW_I = 2.5  # times the setting, about yaw (pid_init.c, pidInitConfig)
 
 DEGREE = math.degrees(1.0)
 
 NOT_SAID = {
-    "rc_smoothing": "smooths the set-point by three low-passes", "tpa_rate": "takes D back with the throttle",
-    "anti_gravity_gain": "adds to P and I where the throttle moves", "throttle_boost": "adds to the throttle where it moves",
-    "gyro_lpf1_dyn_hz": "opens the gyro's filter with the throttle", "dterm_lpf1_dyn_hz": "opens the filter of D with the throttle",
-    "d_max": "raises D in fast moves", "thrust_linear": "bends the mixer's output",
-    "vbat_sag_compensation": "raises the output as the battery sags", "dshot_bidir": "idles by the rotors' speed",
-    "yaw_lowpass_hz": "smooths P of yaw: of the gyro's part the block has the lag, of the command's none",
-}  # fmt: skip
+    "rc_smoothing": "smooths the set-point by three low-passes",
+    "tpa_rate": "takes D back with the throttle",
+    "anti_gravity_gain": "adds to P and I where the throttle moves",
+    "throttle_boost": "adds to the throttle where it moves",
+    "gyro_lpf1_dyn_hz": "opens the gyro's filter with the throttle",
+    "dterm_lpf1_dyn_hz": "opens the filter of D with the throttle",
+    "d_max": "raises D in fast moves",
+    "thrust_linear": "bends the mixer's output",
+    "vbat_sag_compensation": "raises the output as the battery sags",
+    "dshot_bidir": "idles by the rotors' speed",
+    "yaw_lowpass_hz": (
+        "smooths P of yaw: of the gyro's part the block has the lag, of the command's none"
+    ),
+}
 """Settings that the block has no number for, and what they do where they are not 0."""
 
 
@@ -39,42 +49,72 @@ def left_out(settings: Mapping[str, str]) -> list[str]:
     for name, does in NOT_SAID.items():
         values = numbers(settings, name)
         plain = numbers(settings, "rollPID")[2:] + numbers(settings, "pitchPID")[2:]
-        more = values[:2] != plain if name == "d_max" and any(values) else name != "d_max" and values[0] > 0.0
+        more = (
+            values[:2] != plain
+            if name == "d_max" and any(values)
+            else name != "d_max" and values[0] > 0.0
+        )
         told += [f"{name} {settings[name]}: {does}"] if more else []
     return told
 
 
-def calibrated_voltage(vehicle: VehicleParams, settings: Mapping[str, str], weight: float, hover: float) -> float:
-    """Voltage [V] at which a share of throttle, 0 to 1, makes a motor carry a weight [N], by the vehicle's own thrust."""
+def calibrated_voltage(
+    vehicle: VehicleParams, settings: Mapping[str, str], weight: float, hover: float
+) -> float:
+    """Voltage [V] at which a share of throttle, 0 to 1, makes a motor carry a weight [N], by the
+    vehicle's own thrust.
+    """
     idle = numbers(settings, "motor_idle")[0] * 1e-4
     full = weight / (idle + (1.0 - idle) * hover) ** 2
     return vehicle.battery.reference_voltage * math.sqrt(full / vehicle.controller.max_thrust)
 
 
-def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float) -> ControllerParams:
+def controller_of(
+    vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float
+) -> ControllerParams:
     """Numbers of the block ``motor_mixing``. Raises ValueError: a setting is missing.
 
     Args:
-        vehicle: whose rotors the firmware drives; its ``max_thrust`` is at the battery's reference voltage.
-        settings: by their names in the blackbox's header: rollPID, pitchPID, yawPID, ff_weight, iterm_relax_cutoff, motor_idle,
-            gyro_lpf1_static_hz, gyro_lpf2_static_hz, dterm_lpf1_static_hz, dterm_lpf2_static_hz, yaw_lowpass_hz, pidsum_limit,
-            iterm_windup.
+        vehicle: whose rotors the firmware drives; its ``max_thrust`` is at the battery's reference
+            voltage.
+        settings: by their names in the blackbox's header: rollPID, pitchPID, yawPID, ff_weight,
+            iterm_relax_cutoff, motor_idle, gyro_lpf1_static_hz, gyro_lpf2_static_hz,
+            dterm_lpf1_static_hz, dterm_lpf2_static_hz, yaw_lowpass_hz, pidsum_limit, iterm_windup.
         mix_thrust: of a motor in hover [N].
         voltage: at which the throttle was calibrated [V].
     """
-    lists = ("rollPID", "pitchPID", "yawPID", "ff_weight", "iterm_relax_cutoff", "motor_idle", "pidsum_limit", "iterm_windup")
+    lists = (
+        "rollPID",
+        "pitchPID",
+        "yawPID",
+        "ff_weight",
+        "iterm_relax_cutoff",
+        "motor_idle",
+        "pidsum_limit",
+        "iterm_windup",
+    )
     missing = [name for name in lists if name not in settings]
     if missing:
-        raise ValueError(f"settings without {', '.join(missing)}; expected those of a blackbox's header, such as rollPID:45,80,40")
+        raise ValueError(
+            f"settings without {', '.join(missing)}; expected those of a blackbox's header, such as"
+            " rollPID:45,80,40"
+        )
     c, rotors = vehicle.controller, vehicle.rotors
     full = c.max_thrust * (voltage / vehicle.battery.reference_voltage) ** 2
     idle = numbers(settings, "motor_idle")[0] * 1e-4
-    thrust = 2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)  # of a motor for a mixer output of 1 [N]
+    thrust = (
+        2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)
+    )  # of a motor for a mixer output of 1 [N]
     arms = (sum(map(abs, rotors.y)), sum(map(abs, rotors.x)), 4.0 * vehicle.thrust.torque_ratio)
-    torques = [arm * thrust / MIXER_SCALE * DEGREE for arm in arms]  # for an output of 1 a degree [N m]
+    torques = [
+        arm * thrust / MIXER_SCALE * DEGREE for arm in arms
+    ]  # for an output of 1 a degree [N m]
     axes = [numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")]
     forward = numbers(settings, "ff_weight")
-    most = [numbers(settings, name, settings["pidsum_limit"])[0] for name in ("pidsum_limit", "pidsum_limit", "pidsum_limit_yaw")]
+    most = [
+        numbers(settings, name, settings["pidsum_limit"])[0]
+        for name in ("pidsum_limit", "pidsum_limit", "pidsum_limit_yaw")
+    ]
     windup = 0.01 * numbers(settings, "iterm_windup")[0] / DEGREE
 
     def gains(scale: float, values: list[float]) -> tuple[float, float, float]:
@@ -83,16 +123,30 @@ def controller_of(vehicle: VehicleParams, settings: Mapping[str, str], mix_thrus
 
     def lag(*names: str) -> float:
         """Return the delay of low-passes one after the other [s]; 0 Hz are none."""
-        return sum(1.0 / (2.0 * math.pi * hz) for name in names if (hz := numbers(settings, name)[0]) > 0.0)
+        return sum(
+            1.0 / (2.0 * math.pi * hz) for name in names if (hz := numbers(settings, name)[0]) > 0.0
+        )
 
     gyro = lag("gyro_lpf1_static_hz", "gyro_lpf2_static_hz")
     whole = gyro + lag("dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
-    share, yaw_share = ((gyro + more) / whole if whole > 0.0 else 1.0 for more in (0.0, lag("yaw_lowpass_hz")))
+    share, yaw_share = (
+        (gyro + more) / whole if whole > 0.0 else 1.0 for more in (0.0, lag("yaw_lowpass_hz"))
+    )
     x, y, z = (windup * limit * torque for limit, torque in zip(most, torques, strict=True))
     return dataclasses.replace(
-        c, kind="motor_mixing", p_gain=gains(P_SCALE, [a[0] for a in axes]),
+        c,
+        kind="motor_mixing",
+        p_gain=gains(P_SCALE, [a[0] for a in axes]),
         i_gain=gains(I_SCALE, [times * a[1] for times, a in zip((1.0, 1.0, YAW_I), axes)]),
-        d_gain=gains(D_SCALE, [a[2] for a in axes]), feedforward_gain=gains(F_SCALE, forward), integral_limit=(x, y, z),
-        setpoint_time_constant=lag("iterm_relax_cutoff"), gyro_time_constant=whole, gyro_share=(share, share, yaw_share),
-        min_thrust=full * idle**2, max_thrust=full, voltage_compensation=0.0, mix_thrust=mix_thrust, calibration_voltage=voltage,
-    )  # fmt: skip
+        d_gain=gains(D_SCALE, [a[2] for a in axes]),
+        feedforward_gain=gains(F_SCALE, forward),
+        integral_limit=(x, y, z),
+        setpoint_time_constant=lag("iterm_relax_cutoff"),
+        gyro_time_constant=whole,
+        gyro_share=(share, share, yaw_share),
+        min_thrust=full * idle**2,
+        max_thrust=full,
+        voltage_compensation=0.0,
+        mix_thrust=mix_thrust,
+        calibration_voltage=voltage,
+    )

@@ -1,12 +1,14 @@
-"""Laws that a diagnosis found, as blocks of the fused kernel: coefficient times up to two scalars times one vector.
+"""Laws that a diagnosis found, as blocks of the fused kernel: coefficient times up to two scalars
+times one vector.
 
-A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of its factors into the kernel that
-is built for it; its coefficient is a number of the run, so that one kernel serves every size of a law. The names are those of
-``visthrow.diagnose.models.laws``. A law's force is taken at the start of an integration step and held over it.
+A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of
+its factors into the kernel that is built for it; its coefficient is a number of the run, so that
+one kernel serves every size of a law. The names are those of ``visthrow.diagnose.models.laws``. A
+law's force is taken at the start of an integration step and held over it.
 
-A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that does the same to a straight rope
-of the length l in direction n, (-M x n) / l on the payload and its opposite at the mount. Momentum is conserved.
-"""
+A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that
+does the same to a straight rope of the length l in direction n, (-M x n) / l on the payload and its
+opposite at the mount. Momentum is conserved."""
 
 from types import SimpleNamespace
 
@@ -21,7 +23,9 @@ BLOCKS = ("vehicle force", "vehicle torque", "payload force", "rope joint")
 
 
 def _factors(t: Types, Around: type) -> tuple[dict, dict]:
-    """Warp functions of the scalars, and of the vectors by block; forces in the world frame, torques in the body's."""
+    """Warp functions of the scalars, and of the vectors by block; forces in the world frame,
+    torques in the body's.
+    """
     vec3, real = t.vec3, t.real
 
     def axis(x: float, y: float, z: float):
@@ -136,33 +140,69 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
 
     @wp.func
     def friction(a: Around):
-        return joint_rate(a) / wp.sqrt(wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST))
+        return joint_rate(a) / wp.sqrt(
+            wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST)
+        )
 
     vel_body, cable_body, swing_body = turned_back(vel), turned_back(cable), turned_back(swing)
     scalars = {
-        "thrust": thrust, "thrust_rate": thrust_rate, "abs_thrust_rate": abs_thrust_rate, "speed": size(vel),
-        "speed_across": size(across), "speed_across_squared": speed_across_squared, "speed_along": along, "rate": size(rate),
-        "rate_yaw": rate_yaw, "inverse_height": inverse_height, "tension": tension, "payload_speed": size(payload_vel),
-        "swing_speed": size(swing), "cable_under_rotors": under, "joint_rate": size(joint_rate),
-    }  # fmt: skip
+        "thrust": thrust,
+        "thrust_rate": thrust_rate,
+        "abs_thrust_rate": abs_thrust_rate,
+        "speed": size(vel),
+        "speed_across": size(across),
+        "speed_across_squared": speed_across_squared,
+        "speed_along": along,
+        "rate": size(rate),
+        "rate_yaw": rate_yaw,
+        "inverse_height": inverse_height,
+        "tension": tension,
+        "payload_speed": size(payload_vel),
+        "swing_speed": size(swing),
+        "cable_under_rotors": under,
+        "joint_rate": size(joint_rate),
+    }
     vectors = {
         "vehicle force": {
-            "body_z": up, "body_x": turned(body_x), "body_y": turned(body_y), "world_z": vertical, "vel": vel, "vel_across": across,
-            "axis_cross_vel": crossed(up, vel), "rate_cross_vel": crossed(turned(rate), vel), "cable": cable, "swing_vel": swing,
+            "body_z": up,
+            "body_x": turned(body_x),
+            "body_y": turned(body_y),
+            "world_z": vertical,
+            "vel": vel,
+            "vel_across": across,
+            "axis_cross_vel": crossed(up, vel),
+            "rate_cross_vel": crossed(turned(rate), vel),
+            "cable": cable,
+            "swing_vel": swing,
         },
         "vehicle torque": {
-            "body_x": body_x, "body_y": body_y, "body_z": vertical, "rate": rate, "axis_cross_rate": crossed(vertical, rate),
-            "vel": vel_body, "axis_cross_vel": crossed(vertical, vel_body),
-            "axis_cross_cable": crossed(vertical, cable_body), "axis_cross_swing": crossed(vertical, swing_body),
+            "body_x": body_x,
+            "body_y": body_y,
+            "body_z": vertical,
+            "rate": rate,
+            "axis_cross_rate": crossed(vertical, rate),
+            "vel": vel_body,
+            "axis_cross_vel": crossed(vertical, vel_body),
+            "axis_cross_cable": crossed(vertical, cable_body),
+            "axis_cross_swing": crossed(vertical, swing_body),
         },
         "payload force": {
-            "payload_vel": payload_vel, "vertical_cross_vel": crossed(vertical, payload_vel), "world_z": vertical, "body_z": up,
-            "cable": cable, "swing_vel": swing, "cable_cross_swing": crossed(cable, swing), "vel": vel, "sideways": aside,
+            "payload_vel": payload_vel,
+            "vertical_cross_vel": crossed(vertical, payload_vel),
+            "world_z": vertical,
+            "body_z": up,
+            "cable": cable,
+            "swing_vel": swing,
+            "cable_cross_swing": crossed(cable, swing),
+            "vel": vel,
+            "sideways": aside,
         },
         "rope joint": {
-            "joint_rate": joint_rate, "friction": friction, "axis_cross_cable": crossed(vertical, cable_body),
+            "joint_rate": joint_rate,
+            "friction": friction,
+            "axis_cross_cable": crossed(vertical, cable_body),
         },
-    }  # fmt: skip
+    }
     return scalars, vectors
 
 
@@ -175,9 +215,18 @@ def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
 
 def _around(t: Types) -> dict[str, type]:
     return {
-        "pos_w": t.vec3, "vel_w": t.vec3, "rate_b": t.vec3, "quat_wb": t.quat, "payload_pos_w": t.vec3, "payload_vel_w": t.vec3,
-        "cable_dir_w": t.vec3, "mount_b": t.vec3, "thrust": t.real, "thrust_rate": t.real, "tension": t.real,
-    }  # fmt: skip
+        "pos_w": t.vec3,
+        "vel_w": t.vec3,
+        "rate_b": t.vec3,
+        "quat_wb": t.quat,
+        "payload_pos_w": t.vec3,
+        "payload_vel_w": t.vec3,
+        "cable_dir_w": t.vec3,
+        "mount_b": t.vec3,
+        "thrust": t.real,
+        "thrust_rate": t.real,
+        "tension": t.real,
+    }
 
 
 def structure(laws: tuple[LawParams, ...]) -> tuple:
@@ -192,26 +241,49 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
         raise ValueError(f"{len(laws)} laws; expected at most {MOST_LAWS}")
     for law in laws:
         unknown = [name for name in law.factors if name not in scalars]
-        if law.block not in BLOCKS or unknown or law.vector not in vectors[law.block] or len(law.factors) > 2:
+        if (
+            law.block not in BLOCKS
+            or unknown
+            or law.vector not in vectors[law.block]
+            or len(law.factors) > 2
+        ):
             raise ValueError(
-                f"law {law}; expected a block of {BLOCKS}, up to two factors of {scalars}, and a vector of {vectors.get(law.block, BLOCKS)}"
+                f"law {law}; expected a block of {BLOCKS}, up to two factors of {scalars}, and a"
+                f" vector of {vectors.get(law.block, BLOCKS)}"
             )
 
 
-def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity) -> SimpleNamespace:
+def build_laws(
+    t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity
+) -> SimpleNamespace:
     """Compose the laws of a plant.
 
-    Returns a namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command, attached)`` -> air whose pushes hold the laws'
-    forces besides its own, and ``in_flight(air, vel_w)`` [N] on a payload that has left. Without laws both do nothing.
-    """
-    vec3, vec4, real, Vehicle, Rope, Air, QuadState = t.vec3, t.vec4, t.real, t.Vehicle, t.Rope, t.Air, t.QuadState
+    Returns a namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command,
+    attached)`` -> air whose pushes hold the laws' forces besides its own, and ``in_flight(air,
+    vel_w)`` [N] on a payload that has left. Without laws both do nothing."""
+    vec3, vec4, real, Vehicle, Rope, Air, QuadState = (
+        t.vec3,
+        t.vec4,
+        t.real,
+        t.Vehicle,
+        t.Rope,
+        t.Air,
+        t.QuadState,
+    )
     if not laws:  # their factors take a seventh of the time in which a kernel is composed
 
         @wp.func
         def nothing(
-            p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-            stiffness: wp.array(dtype=real), command: vec4, attached: int,
-        ):  # fmt: skip
+            p: Vehicle,
+            rope: Rope,
+            air: Air,
+            s: QuadState,
+            n: wp.array(dtype=vec3),
+            u: wp.array(dtype=vec3),
+            stiffness: wp.array(dtype=real),
+            command: vec4,
+            attached: int,
+        ):
             return air
 
         @wp.func
@@ -255,14 +327,23 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocit
         pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), reach) / wp.dot(reach, reach)
         out.payload_push_w = air.payload_push_w + pair
         out.push_w = air.push_w - pair
-        out.twist_b = air.twist_b + on_vehicle - wp.cross(a.mount_b, wp.quat_rotate_inv(a.quat_wb, pair))
+        out.twist_b = (
+            air.twist_b + on_vehicle - wp.cross(a.mount_b, wp.quat_rotate_inv(a.quat_wb, pair))
+        )
         return out
 
     @wp.func
     def on(
-        p: Vehicle, rope: Rope, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real), command: vec4, attached: int,
-    ):  # fmt: skip
+        p: Vehicle,
+        rope: Rope,
+        air: Air,
+        s: QuadState,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        command: vec4,
+        attached: int,
+    ):
         a = Around()
         a.pos_w = s.pos_w
         a.vel_w = s.vel_w

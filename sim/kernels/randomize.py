@@ -1,8 +1,9 @@
-"""Start of an episode on the device: placing a plant at rest in its actuators, and the paper's randomisation.
+"""Start of an episode on the device: placing a plant at rest in its actuators, and the paper's
+randomisation.
 
-Random numbers are counter-based: they depend on the seed, the environment and how often it was reset, so a masked reset
-leaves all others untouched and a batch draws what its members alone would draw.
-"""
+Random numbers are counter-based: they depend on the seed, the environment and how often it was
+reset, so a masked reset leaves all others untouched and a batch draws what its members alone would
+draw."""
 
 from dataclasses import dataclass
 
@@ -38,7 +39,9 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
         hanging = rope.last_mass
         for step in range(L - 1):
             i = L - 2 - step
-            state.stiffness[i, env] = (hanging + real(0.5) * rope.segment_mass) * rope.segment_length * gravity
+            state.stiffness[i, env] = (
+                (hanging + real(0.5) * rope.segment_mass) * rope.segment_length * gravity
+            )
             hanging += rope.segment_mass
         state.release_timer[env] = real(-1.0)
         state.attached[env] = 1

@@ -1,8 +1,7 @@
 """State of a batch of plants as Warp arrays, and what one control step puts out.
 
-Shapes use E environments and L rope segments. Rope arrays stand segment first, (L, E), so that neighbouring threads
-read neighbouring memory.
-"""
+Shapes use E environments and L rope segments. Rope arrays stand segment first, (L, E), so that
+neighbouring threads read neighbouring memory."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,13 +14,17 @@ from sim.kernels.structs import QUAD_STATE, Types, make_struct
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])  # attitude of a level vehicle, xyzw
 
 NONFINITE = 1
-"""Status bit: a state became non-finite or faster than any physical one; the environment was put back to its last good state.
-Or the command was not finite, and the last one was held."""
-FALLBACK = 2  # status bit: a rod turned faster than a substep resolves; the first-order stage was kept there
+"""Status bit: a state became non-finite or faster than any physical one; the environment was put
+back to its last good state. Or the command was not finite, and the last one was held.
+"""
+# status bit: a rod turned faster than a substep resolves; the first-order stage was kept there
+FALLBACK = 2
 COLLISION = 4  # status bit: the payload came closer to the vehicle than both radii
 ROPE_IN_ROTOR = 8  # status bit: a joint of the rope passed through a propeller disc
 
-QUAD_FIELDS = {name: (kind, False) for name, kind in QUAD_STATE.items()}  # name: (type, also by row)
+QUAD_FIELDS = {
+    name: (kind, False) for name, kind in QUAD_STATE.items()
+}  # name: (type, also by row)
 
 STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
     "mass_scale": ("real", False),
@@ -49,10 +52,23 @@ OUTPUT_FIELDS = {
 def array_struct(t: Types, name: str, fields: dict[str, tuple[str, bool]]) -> type:
     """Warp struct that holds one array per field."""
     scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
-    return make_struct(name, {k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1) for k, (kind, rows) in fields.items()})
+    return make_struct(
+        name,
+        {
+            k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1)
+            for k, (kind, rows) in fields.items()
+        },
+    )
 
 
-def allocate(t: Types, struct: type, fields: dict[str, tuple[str, bool]], count: int, rows: dict[str, int], device: str):
+def allocate(
+    t: Types,
+    struct: type,
+    fields: dict[str, tuple[str, bool]],
+    count: int,
+    rows: dict[str, int],
+    device: str,
+):
     """Zeroed arrays of shape (E,), or (rows[name], E), in an instance of ``struct``."""
     scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
     out = struct()
@@ -62,23 +78,35 @@ def allocate(t: Types, struct: type, fields: dict[str, tuple[str, bool]], count:
     return out
 
 
-def put(t: Types, struct, given: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int) -> None:
-    """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment first.
+def put(
+    t: Types, struct, given: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int
+) -> None:
+    """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment
+    first.
 
     Raises ValueError: values of another shape.
 
     Args:
         t: types of the arrays.
         struct: of :func:`allocate`, or anything with arrays of these names.
-        given: name -> values, shape (E, ...), or None for every environment's default; and that default, shape (...).
+        given: name -> values, shape (E, ...), or None for every environment's default; and that
+            default, shape (...).
         count: E.
     """
     real = np.float32 if t.real is wp.float32 else np.float64
     for name, (value, default) in given.items():
-        value = np.broadcast_to(default, (count, *np.shape(default))) if value is None else np.asarray(value, dtype=float)
+        value = (
+            np.broadcast_to(default, (count, *np.shape(default)))
+            if value is None
+            else np.asarray(value, dtype=float)
+        )
         if value.shape != (count, *np.shape(default)):
-            raise ValueError(f"{name} of shape {value.shape}; expected {(count, *np.shape(default))}")
-        getattr(struct, name).assign((np.swapaxes(value, 0, 1) if value.ndim == 3 else value).astype(real))
+            raise ValueError(
+                f"{name} of shape {value.shape}; expected {(count, *np.shape(default))}"
+            )
+        getattr(struct, name).assign(
+            (np.swapaxes(value, 0, 1) if value.ndim == 3 else value).astype(real)
+        )
 
 
 def fetched(array: wp.array, rows: bool) -> np.ndarray:
@@ -92,15 +120,27 @@ SPEED_LIMIT = 1000.0  # of `size` [m/s], [rad/s]: beyond it a state is broken, n
 
 @wp.func
 def size(s: Any):
-    """Sum of the sizes of a vehicle's state, which is not below any limit where a part of it is NaN."""
+    """Sum of the sizes of a vehicle's state, which is not below any limit where a part of it is
+    NaN.
+    """
     milli = type(s.voltage)(1.0e-3)
-    total = wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * milli
+    total = (
+        wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * milli
+    )
     total += wp.abs(s.voltage) + wp.length(s.motor_speed) * milli
-    return total + wp.length(s.setpoint) + wp.length(s.gyro) + wp.length(s.integral) + wp.abs(s.charge_used)
+    return (
+        total
+        + wp.length(s.setpoint)
+        + wp.length(s.gyro)
+        + wp.length(s.integral)
+        + wp.abs(s.charge_used)
+    )
 
 
 def build_access(t: Types, State: type):
-    """Return Warp functions ``load(state, env) -> t.QuadState`` and ``store(state, env, s)`` for a struct of arrays."""
+    """Return Warp functions ``load(state, env) -> t.QuadState`` and ``store(state, env, s)`` for a
+    struct of arrays.
+    """
     QuadState = t.QuadState
 
     @wp.func

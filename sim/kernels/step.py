@@ -1,8 +1,9 @@
-"""The fused control step: command queue, blocks, chain, release and checks of one control period in one kernel.
+"""The fused control step: command queue, blocks, chain, release and checks of one control period in
+one kernel.
 
-``build_step`` composes the functions of one choice of blocks into one kernel. One thread an environment, no atomics,
-nothing else is launched; the same kernel runs on the CPU, all at once or some from ``first`` on, and on CUDA.
-"""
+``build_step`` composes the functions of one choice of blocks into one kernel. One thread an
+environment, no atomics, nothing else is launched; the same kernel runs on the CPU, all at once or
+some from ``first`` on, and on CUDA."""
 
 from dataclasses import dataclass
 
@@ -32,21 +33,32 @@ class StepKernels:
 
 
 def build_step(
-    t: Types, params: PlantParams, direct: bool = False, extensions: frozenset[str] = frozenset(), motors: bool = False
+    t: Types,
+    params: PlantParams,
+    direct: bool = False,
+    extensions: frozenset[str] = frozenset(),
+    motors: bool = False,
 ) -> StepKernels:
     """Compose the kernel for the kinds and the number of segments of ``params``.
 
     Args:
         t: types of the wanted precision.
-        params: kinds and segment count are read here; all numbers are read by the kernel at run time.
+        params: kinds and segment count are read here; all numbers are read by the kernel at run
+            time.
         direct: by-pass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
-        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost nothing.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost
+            nothing.
         motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
     """
     real, vec3, vec4 = t.real, t.vec3, t.vec4
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = params.rope.segments
-    nonfinite, fallback, collision, in_rotor = st.NONFINITE, st.FALLBACK, st.COLLISION, st.ROPE_IN_ROTOR
+    nonfinite, fallback, collision, in_rotor = (
+        st.NONFINITE,
+        st.FALLBACK,
+        st.COLLISION,
+        st.ROPE_IN_ROTOR,
+    )
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
     flow, rate, motor_advance = build_flow(t, params.vehicle, extensions, motors)
@@ -56,7 +68,9 @@ def build_step(
     payload = build_payload(t, extensions)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
     laws = build_laws(t, params.laws, flow, chain, coupled.mount_velocity)
-    through_air = bool({"payload_drag", "payload_spin"} & extensions) or any(law.block == "payload force" for law in params.laws)
+    through_air = bool({"payload_drag", "payload_spin"} & extensions) or any(
+        law.block == "payload force" for law in params.laws
+    )
     ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
     leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
@@ -72,8 +86,12 @@ def build_step(
 
     @wp.func
     def load_rope(
-        state: State, env: int, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
-    ):  # fmt: skip
+        state: State,
+        env: int,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+    ):
         for i in range(L):
             n[i] = state.cable_dir_w[i, env]
             u[i] = state.cable_vel_w[i, env]
@@ -96,21 +114,34 @@ def build_step(
 
     @wp.func
     def separate(
-        p: Vehicle, rope: Rope, r: Release, air: Air, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-        gravity: real, out: Output, env: int, elapsed: real,
-    ):  # fmt: skip
+        p: Vehicle,
+        rope: Rope,
+        r: Release,
+        air: Air,
+        s: QuadState,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        gravity: real,
+        out: Output,
+        env: int,
+        elapsed: real,
+    ):
         """Write what follows from the payload's state at separation."""
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
         mount_vel = coupled.mount_velocity(rope, s)
         pos, vel = chain.payload(rope, mount, mount_vel, n, u)
-        vel = leaving.kick(r, leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u)), n[L - 1])
+        vel = leaving.kick(
+            r, leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u)), n[L - 1]
+        )
         time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos
         out.payload_vel_w[env] = vel
         out.separated[env] = 1
         out.landing_w[env] = ballistic.after(rope, air, pos, vel, gravity, time)
         out.time_to_impact[env] = time
-        out.clearance[env] = ballistic.clearance(rope, air, pos, vel, gravity, time, s.pos_w, r.clearance_samples)
+        out.clearance[env] = ballistic.clearance(
+            rope, air, pos, vel, gravity, time, s.pos_w, r.clearance_samples
+        )
         out.separation_time[env] = elapsed
         out.release_pos_w[env] = s.pos_w
 
@@ -180,7 +211,9 @@ def build_step(
                     rope = chain.stretched(natural, rope, stiffness, u, h)
                 now = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
-                    s, total, fell_back = coupled.step(p, rope, now, s, total, active, n, u, stiffness, g, gamma, max_turn, h)
+                    s, total, fell_back = coupled.step(
+                        p, rope, now, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                    )
                     if fell_back:
                         status = status | fallback
                 else:
@@ -260,6 +293,18 @@ def build_step(
         load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
         r = releases[env % releases.shape[0]]
-        separate(p, rope, r, airs[env % airs.shape[0]], load(state, env), n, u, gravity, out, env, real(0.0))
+        separate(
+            p,
+            rope,
+            r,
+            airs[env % airs.shape[0]],
+            load(state, env),
+            n,
+            u,
+            gravity,
+            out,
+            env,
+            real(0.0),
+        )
 
     return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output)

@@ -1,8 +1,8 @@
 """Warp structs of the parameters and of the vehicle's state, made for one floating-point precision.
 
-The dataclasses of :mod:`sim.params` are the only place where a parameter is declared: :class:`Types` derives the Warp
-struct of each from its annotations, so a field added there reaches the kernels under the same name.
-"""
+The dataclasses of :mod:`sim.params` are the only place where a parameter is declared:
+:class:`Types` derives the Warp struct of each from its annotations, so a field added there reaches
+the kernels under the same name."""
 
 import dataclasses
 import typing
@@ -20,22 +20,56 @@ def make_struct(name: str, fields: dict[str, type]) -> type:
 
 
 ROPE_NUMBERS = (
-    "segment_length", "segment_mass", "segment_inertia", "last_mass", "last_center", "last_inertia",
-    "payload_offset", "payload_radius", "payload_arm", "payload_mass", "payload_drag",
-    "joint_damping", "mount_damping", "swing_damping", "downwash", "payload_side", "payload_lift", "compliance",
+    "segment_length",
+    "segment_mass",
+    "segment_inertia",
+    "last_mass",
+    "last_center",
+    "last_inertia",
+    "payload_offset",
+    "payload_radius",
+    "payload_arm",
+    "payload_mass",
+    "payload_drag",
+    "joint_damping",
+    "mount_damping",
+    "swing_damping",
+    "downwash",
+    "payload_side",
+    "payload_lift",
+    "compliance",
     "strain",  # of a rope that gives, as it stands
     "strain_rate",  # [1/s]
     "stretched_share",  # of the last rod: how much of its lengthening its centre follows
     "total_mass",
-)  # fmt: skip
+)
 """Scalars of the device's rope, beside its mount."""
 
 
-QUAD_STATE = {"pos_w": "vec3", "quat_wb": "quat", "vel_w": "vec3", "rate_b": "vec3", "motor_speed": "vec4", "integral": "vec3",
-              "setpoint": "vec3", "gyro": "vec3", "charge_used": "real", "voltage": "real"}  # fmt: skip
+QUAD_STATE = {
+    "pos_w": "vec3",
+    "quat_wb": "quat",
+    "vel_w": "vec3",
+    "rate_b": "vec3",
+    "motor_speed": "vec4",
+    "integral": "vec3",
+    "setpoint": "vec3",
+    "gyro": "vec3",
+    "charge_used": "real",
+    "voltage": "real",
+}
 """State of a quadrotor: name -> type."""
-FLOW = {"force_b": "vec3", "torque_b": "vec3", "motor_speed": "vec4", "motor_rate": "vec4", "integral_rate": "vec3",
-        "setpoint_rate": "vec3", "gyro_rate": "vec3", "charge_rate": "real", "voltage_rate": "real"}  # fmt: skip
+FLOW = {
+    "force_b": "vec3",
+    "torque_b": "vec3",
+    "motor_speed": "vec4",
+    "motor_rate": "vec4",
+    "integral_rate": "vec3",
+    "setpoint_rate": "vec3",
+    "gyro_rate": "vec3",
+    "charge_rate": "real",
+    "voltage_rate": "real",
+}
 """What the blocks make of it: wrench and derivatives of their own states."""
 
 
@@ -44,10 +78,14 @@ class Types:
 
     Attributes:
         real, vec3, vec4, mat33, quat: Warp types.
-        Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under ``mixer``.
-        Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``, ``segment_mass``, ...).
-        Air: struct of :class:`sim.params.AirParams`, the coefficients of the plant's ``laws``, and what pushes from outside
-            during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of mass, ``payload_push_w`` [N].
+        Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under
+            ``mixer``.
+        Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``,
+            ``segment_mass``, ...).
+        Air: struct of :class:`sim.params.AirParams`, the coefficients of the plant's ``laws``, and
+            what pushes from outside
+            during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of
+                mass, ``payload_push_w`` [N].
         QuadState, QuadRate: state of the quadrotor alone and its time derivative.
     """
 
@@ -61,12 +99,21 @@ class Types:
         self.Vehicle = self.from_dataclass(P.VehicleParams, {"mixer": self.Mixer})
         self.Release = self.from_dataclass(P.ReleaseParams, {})
         self.Randomization = self.from_dataclass(P.RandomizationParams, {})
-        pushes = {"laws": self.vec4, "push_w": self.vec3, "twist_b": self.vec3, "payload_push_w": self.vec3}
+        pushes = {
+            "laws": self.vec4,
+            "push_w": self.vec3,
+            "twist_b": self.vec3,
+            "payload_push_w": self.vec3,
+        }
         self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct("Rope", {"mount": self.vec3, **dict.fromkeys(ROPE_NUMBERS, real)})
         self.QuadState, self.QuadRate, self.Flow = (
             make_struct(name, {k: getattr(self, kind) for k, kind in fields.items()})
-            for name, fields in (("QuadState", QUAD_STATE), ("QuadRate", QUAD_STATE), ("Flow", FLOW))
+            for name, fields in (
+                ("QuadState", QUAD_STATE),
+                ("QuadRate", QUAD_STATE),
+                ("Flow", FLOW),
+            )
         )
 
     def _field_type(self, annotation) -> type | None:
@@ -83,12 +130,16 @@ class Types:
     def from_dataclass(self, schema: type, extra: dict[str, type]) -> type:
         hints = typing.get_type_hints(schema)
         fields = {f.name: self._field_type(hints[f.name]) for f in dataclasses.fields(schema)}
-        return make_struct(schema.__name__, {k: v for k, v in fields.items() if v is not None} | extra)
+        return make_struct(
+            schema.__name__, {k: v for k, v in fields.items() if v is not None} | extra
+        )
 
 
 @lru_cache
 def types(precision: str) -> Types:
-    """Types of ``"float32"`` or ``"float64"``; made once, so that kernels of one precision share their structs."""
+    """Types of ``"float32"`` or ``"float64"``; made once, so that kernels of one precision share
+    their structs.
+    """
     if precision not in ("float32", "float64"):
         raise ValueError(f"precision {precision!r}; expected 'float32' or 'float64'")
     return Types(wp.float32 if precision == "float32" else wp.float64)
@@ -145,7 +196,9 @@ def extensions_of(
     releases: Iterable[P.ReleaseParams] = (),
     laws: Iterable[P.LawParams] = (),
 ) -> frozenset[str]:
-    """Names of :data:`EXTENSIONS` without which one of these plants would not be simulated in full."""
+    """Names of :data:`EXTENSIONS` without which one of these plants would not be
+    simulated in full.
+    """
     needed = {"push"} if any(True for _ in laws) else set()
     for v in vehicles:
         needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
@@ -153,29 +206,42 @@ def extensions_of(
         needed |= {name for name in ROPE_EXTENSIONS if getattr(r, name) != 0.0}
         needed |= {"payload_spin"} if r.payload_side or r.payload_lift else set()
     for a in airs:
-        needed |= ({"wind"} if any(a.wind_w) else set()) | ({"ground_effect"} if a.ground_effect else set())
+        needed |= ({"wind"} if any(a.wind_w) else set()) | (
+            {"ground_effect"} if a.ground_effect else set()
+        )
     for x in releases:
         needed |= {name for name in ("lag_tension", "rope_tail") if getattr(x, name) != 0.0}
         needed |= {"kick"} if any(x.kick_w) or x.kick_along else set()
     return frozenset(needed)
 
 
-def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]) -> np.ndarray:
-    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``, for a kernel of blocks of these kinds.
+def pack_vehicle(
+    t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]
+) -> np.ndarray:
+    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``, for a kernel of
+    blocks of these kinds.
 
-    Raises ValueError: other kinds of blocks, or rotors without torque, which no mixer can command yaw with.
-    """
+    Raises ValueError: other kinds of blocks, or rotors without torque, which no mixer can command
+    yaw with."""
     rows = pack(t.Vehicle, *vehicles)
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
-            raise ValueError(f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same blocks")
+            raise ValueError(
+                f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same"
+                " blocks"
+            )
         rotors, thrust = vehicle.rotors, vehicle.thrust
         P.require("vehicle.thrust", thrust, positive="torque_ratio")  # the mixer divides by it
-        # Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each of shape (4,).
+        # Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each
+        # of shape (4,).
         x, y, spin = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
-        row["mixer"]["roll"], row["mixer"]["pitch"] = y / (4 * np.mean(y**2)), -x / (4 * np.mean(x**2))
+        row["mixer"]["roll"], row["mixer"]["pitch"] = (
+            y / (4 * np.mean(y**2)),
+            -x / (4 * np.mean(x**2)),
+        )
         row["mixer"]["yaw"] = spin / (4 * thrust.torque_ratio)
-        # Arms about the centre of mass, and the drag torque as the rotors have it, not as the controller knows it.
+        # Arms about the centre of mass, and the drag torque as the rotors have it, not as the
+        # controller knows it.
         for name, com in zip("xyz", vehicle.body.com, strict=True):
             row["rotors"][name] = np.asarray(getattr(rotors, name)) - com
         row["thrust"]["torque_ratio"] = thrust.torque_ratio * thrust.torque_gain
@@ -183,7 +249,9 @@ def pack_vehicle(t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, st
 
 
 def pack(struct: type, *values) -> np.ndarray:
-    """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it was derived from."""
+    """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it
+    was derived from.
+    """
     rows = np.zeros(len(values), dtype=_numpy_type(struct))
     for row, value in zip(rows, values, strict=True):
         _fill(row, value)
@@ -191,7 +259,9 @@ def pack(struct: type, *values) -> np.ndarray:
 
 
 def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ...]]) -> np.ndarray:
-    """Structured array for ``wp.array(dtype=t.Air)``: a row for each air, with the coefficients of its plant's laws."""
+    """Structured array for ``wp.array(dtype=t.Air)``: a row for each air, with the coefficients of
+    its plant's laws.
+    """
     rows = pack(t.Air, *airs)
     for row, own in zip(rows, laws, strict=True):
         row["laws"][: len(own)] = [law.coefficient for law in own]
@@ -201,30 +271,46 @@ def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ..
 def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list[P.RopeParams]:
     """The ropes with their mounts stated from the centre of mass of the vehicle that each hangs on.
 
-    Raises ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with them.
-    """
+    Raises ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with
+    them."""
     coms = [v.body.com for v in vehicles]
     if len(set(coms)) > 1:
         if len(ropes) not in (1, len(vehicles)):
-            raise ValueError(f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass; expected one rope, or one each")
+            raise ValueError(
+                f"{len(ropes)} ropes on {len(vehicles)} vehicles of different centres of mass;"
+                " expected one rope, or one each"
+            )
         ropes = ropes * len(vehicles) if len(ropes) == 1 else ropes
     else:
         coms = coms[:1] * len(ropes)
-    return [dataclasses.replace(rope, mount=tuple(m - c for m, c in zip(rope.mount, com))) for rope, com in zip(ropes, coms, strict=True)]
+    return [
+        dataclasses.replace(rope, mount=tuple(m - c for m, c in zip(rope.mount, com)))
+        for rope, com in zip(ropes, coms, strict=True)
+    ]
 
 
 def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
 
-    The last rod carries the payload: its mass, centre and transverse inertia about its upper joint are combined here.
-    """
+    The last rod carries the payload: its mass, centre and transverse inertia about its upper joint
+    are combined here."""
     rows = pack(t.Rope, *ropes)
     for row, rope in zip(rows, ropes, strict=True):
         length, mass = rope.segment_length, rope.segment_mass
         ball, last_mass = length + rope.payload_offset, mass + rope.payload_mass
-        row["segment_length"], row["segment_mass"], row["segment_inertia"] = length, mass, mass * length**2 / 3
-        row["last_mass"], row["last_center"] = last_mass, (mass * length / 2 + rope.payload_mass * ball) / last_mass
-        row["last_inertia"], row["payload_arm"] = mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2, ball
+        row["segment_length"], row["segment_mass"], row["segment_inertia"] = (
+            length,
+            mass,
+            mass * length**2 / 3,
+        )
+        row["last_mass"], row["last_center"] = (
+            last_mass,
+            (mass * length / 2 + rope.payload_mass * ball) / last_mass,
+        )
+        row["last_inertia"], row["payload_arm"] = (
+            mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2,
+            ball,
+        )
         row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
         row["total_mass"] = rope.hanging_mass
     return rows

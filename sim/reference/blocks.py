@@ -1,8 +1,9 @@
-"""The blocks of the vehicle and of the release in float64 NumPy, from the equations in the docstrings of ``sim.params``.
+"""The blocks of the vehicle and of the release in float64 NumPy, from the equations in the
+docstrings of ``sim.params``.
 
-Every function is pure and takes E environments at once. Body frame x forward, y left, z up; SI units. Suffix ``_dot``
-is a time derivative. Written apart from the training simulator on purpose: it shares the equations, not the code.
-"""
+Every function is pure and takes E environments at once. Body frame x forward, y left, z up; SI
+units. Suffix ``_dot`` is a time derivative. Written apart from the training simulator on purpose:
+it shares the equations, not the code."""
 
 from functools import lru_cache
 
@@ -22,16 +23,20 @@ from sim.params import (
 )
 from sim.reference.rotations import cross, length
 
-_QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # of a row vector about z, without its z
+_QUARTER_TURN = np.array(
+    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+)  # of a row vector about z, without its z
 
-TIME_TOLERANCE = 1e-10  # times closer than this are one event [s]; a control period of 20 ms has no finer structure
+# times closer than this are one event [s]; a control period of 20 ms has no finer structure
+TIME_TOLERANCE = 1e-10
 
 
 def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> np.ndarray:
     """Return the command that acts at ``now``: the latest whose time has come.
 
     Args:
-        times: when each command starts to act [s], shape (K, E), ascending along K; the first long before ``now``.
+        times: when each command starts to act [s], shape (K, E), ascending along K; the first long
+            before ``now``.
         commands: collective thrust [N] and body rates [rad/s], shape (K, E, 4).
         now: [s], shape (E,).
     """
@@ -41,21 +46,36 @@ def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> n
 
 @lru_cache(maxsize=8)
 def _layout(rotors: RotorParams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4); spins; motors that turn clockwise, and the others."""
+    """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4); spins; motors that
+    turn clockwise, and the others.
+    """
     x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
-    return np.stack((y / np.sum(y**2), -x / np.sum(x**2))), spin, np.flatnonzero(spin > 0.0), np.flatnonzero(spin < 0.0)
+    return (
+        np.stack((y / np.sum(y**2), -x / np.sum(x**2))),
+        spin,
+        np.flatnonzero(spin > 0.0),
+        np.flatnonzero(spin < 0.0),
+    )
 
 
-def _motor_shares(torque: np.ndarray, rotors: RotorParams, torque_ratio: float) -> tuple[np.ndarray, np.ndarray]:
+def _motor_shares(
+    torque: np.ndarray, rotors: RotorParams, torque_ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Thrust of each motor for roll and pitch, and for yaw [N], shapes (E, 4)."""
     tilting, spin, _, _ = _layout(rotors)
     return torque[:, :2] @ tilting, torque[:, 2:] * (spin / (4.0 * torque_ratio))
 
 
 def mixer(
-    thrust: np.ndarray, torque: np.ndarray, rotors: RotorParams, torque_ratio: float, f_min: float, f_max: np.ndarray
+    thrust: np.ndarray,
+    torque: np.ndarray,
+    rotors: RotorParams,
+    torque_ratio: float,
+    f_min: float,
+    f_max: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share collective thrust and torque out to the motors; yaw gives way first, then roll and pitch.
+    """Share collective thrust and torque out to the motors; yaw gives way first, then roll and
+    pitch.
 
     Args:
         thrust: [N], shape (E,).
@@ -66,17 +86,19 @@ def mixer(
         f_max: largest thrust a motor [N], shape (E,).
 
     Returns:
-        Thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes (E,).
+        Thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes
+        (E,).
 
-    Convention: yaw takes the largest part of what is asked for that keeps the spread of the four within the limits.
-    """
+    Convention: yaw takes the largest part of what is asked for that keeps the spread of the four
+    within the limits."""
     tilting, spin, clockwise, other = _layout(rotors)
     tilt = torque[:, :2] @ tilting
     room = f_max - f_min
     extent = tilt.max(axis=1) - tilt.min(axis=1)
     scale = np.minimum(room / np.maximum(extent, 1e-300), 1.0)
     tilt = tilt * scale[:, None]
-    # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between the two kinds only.
+    # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between
+    # the two kinds only.
     rising, falling = tilt.take(clockwise, 1), tilt.take(other, 1)
     most = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
     least = -(room - (falling.max(axis=1) - rising.min(axis=1))) / 2.0
@@ -86,7 +108,9 @@ def mixer(
     wanted = thrust[:, None] / 4.0 + tilt + clipped_yaw
     raise_by = np.maximum(f_min - wanted.min(axis=1), 0.0)
     lower_by = np.maximum(wanted.max(axis=1) - f_max, 0.0)
-    yaw_share = np.where(clipped == amount, 1.0, np.abs(clipped) / np.maximum(np.abs(amount), 1e-300))
+    yaw_share = np.where(
+        clipped == amount, 1.0, np.abs(clipped) / np.maximum(np.abs(amount), 1e-300)
+    )
     return wanted + (raise_by - lower_by)[:, None], scale, yaw_share
 
 
@@ -99,7 +123,8 @@ def betaflight(
     rate: np.ndarray,
     voltage: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro, feed-forward and mixer.
+    """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro,
+    feed-forward and mixer.
 
     Args:
         vehicle: parameters.
@@ -111,29 +136,44 @@ def betaflight(
         voltage: of the battery [V], shape (E,).
 
     Returns:
-        Motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro and integral.
+        Motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro
+        and integral.
     """
     gains: ControllerParams = vehicle.controller
     setpoint_dot = (command[:, 1:] - setpoint) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
     torque = np.array(gains.p_gain) * (setpoint - rate) + integral
-    torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * setpoint_dot
+    torque = (
+        torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * setpoint_dot
+    )
     relative = voltage / vehicle.battery.reference_voltage
     f_max = gains.max_thrust * relative**2
-    thrusts, tilt_share, yaw_share = mixer(command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max)
+    thrusts, tilt_share, yaw_share = mixer(
+        command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
+    )
     integral_dot = np.array(gains.i_gain) * (setpoint - rate)
     growing = integral_dot * integral > 0.0
     full = np.abs(integral) >= np.array(gains.integral_limit)
     delivered = np.where(full, 0.0, np.array((tilt_share, tilt_share, yaw_share)).T)
     integral_dot = np.where(growing, delivered * integral_dot, integral_dot)
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
-    return np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None], setpoint_dot, gyro_dot, integral_dot
+    return (
+        np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None],
+        setpoint_dot,
+        gyro_dot,
+        integral_dot,
+    )
 
 
 def motor_mixing(
-    vehicle: VehicleParams, filters: np.ndarray, command: np.ndarray, rate: np.ndarray, voltage: np.ndarray
+    vehicle: VehicleParams,
+    filters: np.ndarray,
+    command: np.ndarray,
+    rate: np.ndarray,
+    voltage: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rate controller that mixes motor commands and relaxes its integral; arguments and result as of :func:`betaflight`.
+    """Rate controller that mixes motor commands and relaxes its integral; arguments and result as
+    of :func:`betaflight`.
 
     ``filters`` are low-pass of the command, of the gyro, and integral, shape (E, 9).
     """
@@ -154,10 +194,20 @@ def motor_mixing(
     idle = np.sqrt(gains.min_thrust / gains.max_thrust)
     added = added / np.maximum(np.ptp(added, axis=1) / (1.0 - idle), 1.0)[:, None]
     throttle = np.sqrt(np.maximum(command[:, :1], 0.0) / 4.0 / gains.max_thrust)
-    throttle = np.maximum(np.minimum(throttle, 1.0 - added.max(axis=1, keepdims=True)), idle - added.min(axis=1, keepdims=True))
+    throttle = np.maximum(
+        np.minimum(throttle, 1.0 - added.max(axis=1, keepdims=True)),
+        idle - added.min(axis=1, keepdims=True),
+    )
     relative = voltage / gains.calibration_voltage
-    factor = np.sqrt(gains.max_thrust / vehicle.thrust.k_f) * (1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0))
-    return factor[:, None] * np.maximum(throttle + added, 0.0), low_dot, gyro_dot, np.where(windup, 0.0, integral_dot)
+    factor = np.sqrt(gains.max_thrust / vehicle.thrust.k_f) * (
+        1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
+    )
+    return (
+        factor[:, None] * np.maximum(throttle + added, 0.0),
+        low_dot,
+        gyro_dot,
+        np.where(windup, 0.0, integral_dot),
+    )
 
 
 def geometric(vehicle: VehicleParams, command: np.ndarray, rate: np.ndarray) -> np.ndarray:
@@ -171,7 +221,9 @@ def geometric(vehicle: VehicleParams, command: np.ndarray, rate: np.ndarray) -> 
 
 
 def motor(params: MotorParams, speed: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
-    """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero where they follow at once."""
+    """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero where they follow at
+    once.
+    """
     if params.kind == "instant":
         return np.zeros_like(speed)
     slowing = params.time_constant_down if params.kind == "asymmetric" else params.time_constant
@@ -183,13 +235,19 @@ def open_circuit_voltage(params: BatteryParams, used: np.ndarray) -> np.ndarray:
     return params.ocv[0] + used * (params.ocv[1] + used * (params.ocv[2] + used * params.ocv[3]))
 
 
-def electrical_power(params: BatteryParams, speed: np.ndarray, rotor_torque: np.ndarray) -> np.ndarray:
+def electrical_power(
+    params: BatteryParams, speed: np.ndarray, rotor_torque: np.ndarray
+) -> np.ndarray:
     """Return the power that the vehicle draws [W], shape (E,)."""
     return params.idle_power + np.sum(np.abs(rotor_torque) * speed, axis=1) / params.efficiency
 
 
 def battery(
-    params: BatteryParams, used: np.ndarray, voltage: np.ndarray, speed: np.ndarray, rotor_torque: np.ndarray
+    params: BatteryParams,
+    used: np.ndarray,
+    voltage: np.ndarray,
+    speed: np.ndarray,
+    rotor_torque: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the rates of used fraction [1/s] and terminal voltage [V/s], shapes (E,)."""
     if params.kind == "ideal":
@@ -200,7 +258,11 @@ def battery(
 
 
 def thrust_map(
-    params: ThrustParams, reference_voltage: float, speed: np.ndarray, voltage: np.ndarray, gain: np.ndarray
+    params: ThrustParams,
+    reference_voltage: float,
+    speed: np.ndarray,
+    voltage: np.ndarray,
+    gain: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return thrust [N] and aerodynamic torque [N m] of the rotors, shapes (E, 4).
 
@@ -212,17 +274,27 @@ def thrust_map(
         gain: error of each motor's thrust besides ``params.gain``, 1 for none, shape (E, 4).
     """
     factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
-    thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None] * np.array(params.gain) * gain
+    thrust = (
+        (params.k_f * speed**2 + params.k_1 * speed)
+        * factor[:, None]
+        * np.array(params.gain)
+        * gain
+    )
     return thrust, drag_torque_ratio(params) * thrust
 
 
 def drag_torque_ratio(params: ThrustParams) -> float:
-    """Return a rotor's true ratio of drag torque to thrust [m]; the controller's mixer knows of the nominal one."""
+    """Return a rotor's true ratio of drag torque to thrust [m]; the controller's mixer knows of the
+    nominal one.
+    """
     return params.torque_ratio * params.torque_gain
 
 
 def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarray:
-    """Return the factor on the rotors' thrust at heights of the centre of mass [m], shapes (E,). See ``AirParams``."""
+    """Return the factor on the rotors' thrust at heights of the centre of mass [m], shapes (E,).
+
+    See ``AirParams``.
+    """
     if strength == 0.0:
         return np.ones_like(height)
     ratio = radius / (4.0 * np.maximum(height, 0.5 * radius))
@@ -230,7 +302,12 @@ def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarra
 
 
 def aerodynamics(
-    params: AeroParams, arms: np.ndarray, torque_ratio: float, thrust: np.ndarray, air_velocity_b: np.ndarray, rate: np.ndarray
+    params: AeroParams,
+    arms: np.ndarray,
+    torque_ratio: float,
+    thrust: np.ndarray,
+    air_velocity_b: np.ndarray,
+    rate: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return what the relative air adds.
 
@@ -243,16 +320,24 @@ def aerodynamics(
         rate: body rate [rad/s], shape (E, 3).
 
     Returns:
-        Drag force [N] and flapping torque [N m], shapes (E, 3); change of each rotor's thrust [N] and of its drag
-        torque [N m], shapes (E, 4).
+        Drag force [N] and flapping torque [N m], shapes (E, 3); change of each rotor's thrust [N]
+        and of its drag torque [N m], shapes (E, 4).
     """
     if params.kind == "none":
-        return np.zeros_like(rate), np.zeros_like(rate), np.zeros_like(thrust), np.zeros_like(thrust)
+        return (
+            np.zeros_like(rate),
+            np.zeros_like(rate),
+            np.zeros_like(thrust),
+            np.zeros_like(thrust),
+        )
     v = air_velocity_b
     force = -np.array([params.drag_x, params.drag_y, params.drag_z]) * v
     force = force - params.parasitic * length(v) * v
     hub = v[:, None, :] + cross(rate[:, None, :], arms)
-    thrust_change = thrust * (-params.inflow * hub[..., 2] + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2))
+    thrust_change = thrust * (
+        -params.inflow * hub[..., 2]
+        + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2)
+    )
     torque_change = torque_ratio * thrust * (-params.torque_inflow * hub[..., 2])
     total = thrust.sum(axis=1)
     flapping = params.flapping * total[:, None] * (v @ _QUARTER_TURN)
@@ -269,7 +354,9 @@ def composer(
     rate: np.ndarray,
     aero: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Add up the body wrench about the centre of mass. Returns the force [N] and torque [N m], body frame, shapes (E, 3).
+    """Add up the body wrench about the centre of mass.
+
+    Returns the force [N] and torque [N m], body frame, shapes (E, 3).
 
     Convention: the change of thrust by inflow enters the force as well as the torque.
     """
@@ -281,7 +368,9 @@ def composer(
     torque = flapping.copy()
     torque[:, 0] += np.sum(arms[..., 1] * lift, axis=1)
     torque[:, 1] -= np.sum(arms[..., 0] * lift, axis=1)
-    torque[:, 2] += np.sum(spin * (rotor_torque + torque_change + rotors.inertia * speed_dot), axis=1)
+    torque[:, 2] += np.sum(
+        spin * (rotor_torque + torque_change + rotors.inertia * speed_dot), axis=1
+    )
     momentum = -rotors.inertia * np.sum(spin * speed, axis=1)
     torque[:, 0] -= rate[:, 1] * momentum
     torque[:, 1] += rate[:, 0] * momentum
@@ -289,9 +378,14 @@ def composer(
 
 
 def payload_force(
-    rope: RopeParams, drag: float, velocity_w: np.ndarray, wind_w: np.ndarray, along_w: np.ndarray, lift_w: np.ndarray,
+    rope: RopeParams,
+    drag: float,
+    velocity_w: np.ndarray,
+    wind_w: np.ndarray,
+    along_w: np.ndarray,
+    lift_w: np.ndarray,
     hanging: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return the force on the payload [N], world frame, shape (E, 3).
 
     Args:
@@ -310,7 +404,9 @@ def payload_force(
 
 
 def release_lag(params: ReleaseParams, pull: np.ndarray, payload_mass: np.ndarray) -> np.ndarray:
-    """Return the time from the latch to the separation [s], shape (E,), from the rope's pull at the latch [N]."""
+    """Return the time from the latch to the separation [s], shape (E,), from the rope's pull at the
+    latch [N].
+    """
     return params.lag + params.lag_tension * (pull - payload_mass * GRAVITY)
 
 

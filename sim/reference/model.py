@@ -1,18 +1,20 @@
 """MuJoCo models of quadrotor, rope and payload, built with ``MjSpec``.
 
-Body frames: a rod's body frame has its origin at the rod's upper end and its z axis against the rod's direction, so
-that a level quadrotor with a hanging rope has every relative rotation at identity.
+Body frames: a rod's body frame has its origin at the rod's upper end and its z axis against the
+rod's direction, so that a level quadrotor with a hanging rope has every relative rotation at
+identity.
 
 Joints:
 
-- ``universal``: two perpendicular hinges a segment, first about the frame's y axis, then about its x axis. The first
-  turns without limit, so a rope may fold back on itself in the pitch plane, where throws happen; the pair is singular
-  only where the second stands at +-90 deg, that is where a segment points along +-y of its parent.
-- ``ball``: a ball joint a segment; no singularity. Axial spin is then a coordinate of its own that no force drives.
+- ``universal``: two perpendicular hinges a segment, first about the frame's y axis, then about its
+  x axis. The first turns without limit, so a rope may fold back on itself in the pitch plane, where
+  throws happen; the pair is singular only where the second stands at +-90 deg, that is where a
+  segment points along +-y of its parent.
+- ``ball``: a ball joint a segment; no singularity. Axial spin is then a coordinate of its own that
+  no force drives.
 
-Joint damping acts on the relative rate of a universal joint, which lies in the plane of its two axes. Ball joints get
-none here: ``sim.reference.plant`` applies it as a couple.
-"""
+Joint damping acts on the relative rate of a universal joint, which lies in the plane of its two
+axes. Ball joints get none here: ``sim.reference.plant`` applies it as a couple."""
 
 from typing import Literal
 
@@ -20,18 +22,26 @@ import mujoco
 
 from sim.params import GRAVITY, BodyParams, RopeParams
 
-AXIAL_INERTIA = 1e-12  # inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it must not matter
+# inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it
+# must not matter
+AXIAL_INERTIA = 1e-12
 
 
-def _set_inertial(body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]) -> None:
+def _set_inertial(
+    body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]
+) -> None:
     body.mass = mass
     body.ipos = [0.0, 0.0, centre_z]
     body.inertia = list(inertia)
     body.explicitinertial = True
 
 
-def _rod_inertial(rope: RopeParams, loaded: bool) -> tuple[float, float, tuple[float, float, float]]:
-    """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included on the loaded one."""
+def _rod_inertial(
+    rope: RopeParams, loaded: bool
+) -> tuple[float, float, tuple[float, float, float]]:
+    """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included
+    on the loaded one.
+    """
     mass, length = rope.segment_mass, rope.segment_length
     about_centre = mass * length**2 / 12.0
     if not loaded:
@@ -44,7 +54,9 @@ def _rod_inertial(rope: RopeParams, loaded: bool) -> tuple[float, float, tuple[f
     return total, -centre, (transverse, transverse, AXIAL_INERTIA)
 
 
-def _add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float) -> None:
+def _add_joints(
+    body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float
+) -> None:
     if joints == "ball":
         body.add_joint(name=f"ball{index}", type=mujoco.mjtJoint.mjJNT_BALL)
         return
@@ -70,8 +82,8 @@ def add_vehicle(spec: "mujoco.MjSpec", body: BodyParams) -> "mujoco.MjsBody":
     vehicle.add_freejoint(name="root")
     _set_inertial(vehicle, body.mass, 0.0, body.inertia)
     vehicle.add_site(name="centre")
-    # Forces in the body frame as actuators on a site: MuJoCo turns them with the body in every stage of RK4, an
-    # applied world force it would hold for the whole step.
+    # Forces in the body frame as actuators on a site: MuJoCo turns them with the body in every
+    # stage of RK4, an applied world force it would hold for the whole step.
     for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
         gear = [0.0] * 6
         gear[i] = 1.0
@@ -93,13 +105,23 @@ def build_attached(
         rope: masses and lengths.
         joints: kind of the rope's joints.
         armature: reflected inertia added to every hinge [kg m^2]; 0 is the physical model.
-        stretch: stiffness [N/m] and damping [N s/m] of a slide along the rope between last segment and payload.
+        stretch: stiffness [N/m] and damping [N s/m] of a slide along the rope between last segment
+            and payload.
 
     Returns:
         Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
     """
     spec = new_spec()
-    add_chain(spec, rope, add_vehicle(spec, body), list(rope.mount), joints, armature, stretch, free_root=False)
+    add_chain(
+        spec,
+        rope,
+        add_vehicle(spec, body),
+        list(rope.mount),
+        joints,
+        armature,
+        stretch,
+        free_root=False,
+    )
     return spec.compile()
 
 
@@ -121,12 +143,18 @@ def add_chain(
     free_root: bool,
     load: bool = True,
 ) -> "mujoco.MjsBody":
-    """Rods, the last with the payload (``load``) or without; returns the last body. See :func:`build_attached`."""
+    """Rods, the last with the payload (``load``) or without; returns the last body.
+
+    See :func:`build_attached`.
+    """
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)
-        mass, centre, inertia = _rod_inertial(rope, i == rope.segments - 1 and load and stretch is None)
+        mass, centre, inertia = _rod_inertial(
+            rope, i == rope.segments - 1 and load and stretch is None
+        )
         if joints == "ball":
-            # Without twist in the joints the axial inertia enters nothing; this one keeps the mass matrix well scaled.
+            # Without twist in the joints the axial inertia enters nothing; this one keeps the mass
+            # matrix well scaled.
             inertia = (inertia[0], inertia[1], inertia[0])
         _set_inertial(rod, mass, centre, inertia)
         if i == 0 and free_root:
@@ -137,7 +165,9 @@ def add_chain(
     if stretch is None and load:
         parent.add_site(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
     if stretch is not None:
-        payload = parent.add_body(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
+        payload = parent.add_body(
+            name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset]
+        )
         _set_inertial(payload, rope.payload_mass, 0.0, (rope.payload_inertia,) * 3)
         slide = payload.add_joint(name="stretch", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
         slide.stiffness[0] = stretch[0]

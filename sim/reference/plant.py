@@ -1,8 +1,9 @@
-"""The whole plant in float64: vehicle, rope and payload, release and flight, with the extras of the real world.
+"""The whole plant in float64: vehicle, rope and payload, release and flight, with the extras of the
+real world.
 
-Integration: classical RK4 over bodies, rope and block states together; MuJoCo gives the accelerations of each stage.
-Command switches, the separation and the instants of motion-capture samples fall on step edges exactly.
-"""
+Integration: classical RK4 over bodies, rope and block states together; MuJoCo gives the
+accelerations of each stage. Command switches, the separation and the instants of motion-capture
+samples fall on step edges exactly."""
 
 from dataclasses import MISSING, fields, replace
 
@@ -11,40 +12,70 @@ import numpy as np
 from sim.params import GRAVITY, PlantParams
 from sim.reference import blocks
 from sim.reference.extras import ReferenceExtras
-from sim.reference.quadrotor import BLOCKS, BODY, VehicleErrors, initial_blocks, rigid_body_rates, vehicle_rates
+from sim.reference.quadrotor import (
+    BLOCKS,
+    BODY,
+    VehicleErrors,
+    initial_blocks,
+    rigid_body_rates,
+    vehicle_rates,
+)
 from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
 from sim.reference.state import Landings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
 LARGEST_DECAY = 2.2
-"""Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis."""
+"""Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis.
+"""
 
 
 KNOWN_EXTENSIONS = {
-    "body.com", "thrust.gain", "thrust.torque_gain", "air.wind_w", "air.ground_effect", "rope.payload_drag", "rope.mount_damping",
-    "rope.swing_damping", "rope.downwash", "release.lag_tension", "release.kick_w", "release.kick_along",
-}  # fmt: skip
+    "body.com",
+    "thrust.gain",
+    "thrust.torque_gain",
+    "air.wind_w",
+    "air.ground_effect",
+    "rope.payload_drag",
+    "rope.mount_damping",
+    "rope.swing_damping",
+    "rope.downwash",
+    "release.lag_tension",
+    "release.kick_w",
+    "release.kick_along",
+}
 """Parameters with a default that the plant has; the payload's drag stands among its extras."""
 
 
 def _refuse_unknown(params: PlantParams) -> None:
     """Raise ValueError where the plant would fly something else than what the parameters say."""
     vehicle = params.vehicle
-    parts = {"body": vehicle.body, "thrust": vehicle.thrust, "rope": params.rope, "release": params.release, "air": params.air}
+    parts = {
+        "body": vehicle.body,
+        "thrust": vehicle.thrust,
+        "rope": params.rope,
+        "release": params.release,
+        "air": params.air,
+    }
     unknown = [
         f"{name}.{f.name}"
         for name, part in parts.items()
         for f in fields(part)
-        if f.default is not MISSING and f"{name}.{f.name}" not in KNOWN_EXTENSIONS and getattr(part, f.name) != f.default
+        if f.default is not MISSING
+        and f"{name}.{f.name}" not in KNOWN_EXTENSIONS
+        and getattr(part, f.name) != f.default
     ]
     unknown += ["laws"] if params.laws else []
     if unknown:
-        raise ValueError(f"the reference plant does not know {', '.join(unknown)}; expected plants without")
+        raise ValueError(
+            f"the reference plant does not know {', '.join(unknown)}; expected plants without"
+        )
 
 
 class ReferencePlant:
-    """Vehicles with ropes. Raises ValueError: a step that is not positive, or a parameter that this plant does not know.
+    """Vehicles with ropes.
+
+    Raises ValueError: a step that is not positive, or a parameter that this plant does not know.
 
     Args:
         params: vehicle, rope, release; of ``params.sim`` only the control period is used.
@@ -55,7 +86,12 @@ class ReferencePlant:
     """
 
     def __init__(
-        self, params: PlantParams, extras: ReferenceExtras = ReferenceExtras(), seed: int = 0, count: int = 1, step: float = 5e-4
+        self,
+        params: PlantParams,
+        extras: ReferenceExtras = ReferenceExtras(),
+        seed: int = 0,
+        count: int = 1,
+        step: float = 5e-4,
     ) -> None:
         if not step > 0.0:
             raise ValueError(f"plant: step is {step} s, expected more than 0")
@@ -65,7 +101,12 @@ class ReferencePlant:
         self._ropes = None
         height = 1.5
         pos_w = np.tile([0.0, 0.0, height], (count, 1))
-        self.reset(pos_w, np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3)), np.zeros((count, 3)))
+        self.reset(
+            pos_w,
+            np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+        )
 
     def reset(
         self,
@@ -76,7 +117,8 @@ class ReferencePlant:
         cable_dir_w: np.ndarray | None = None,
         cable_vel_w: np.ndarray | None = None,
     ) -> None:
-        """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in hover.
+        """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in
+        hover.
 
         Raises ValueError: an array of another shape.
 
@@ -85,7 +127,8 @@ class ReferencePlant:
             quat_wb: xyzw, shape (E, 4).
             vel_w: of the frame's origin [m/s], shape (E, 3).
             rate_b: [rad/s], shape (E, 3).
-            cable_dir_w: unit directions of the segments from the mount outwards, shape (E, L, 3); None for hanging.
+            cable_dir_w: unit directions of the segments from the mount outwards, shape (E, L, 3);
+                None for hanging.
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3); None for zero.
         """
         count, segments = self.count, self.params.rope.segments
@@ -96,59 +139,116 @@ class ReferencePlant:
             "vel_w": (vel_w, (count, 3)),
             "rate_b": (rate_b, (count, 3)),
             "cable_dir_w": (hanging if cable_dir_w is None else cable_dir_w, (count, segments, 3)),
-            "cable_vel_w": (np.zeros_like(hanging) if cable_vel_w is None else cable_vel_w, (count, segments, 3)),
+            "cable_vel_w": (
+                np.zeros_like(hanging) if cable_vel_w is None else cable_vel_w,
+                (count, segments, 3),
+            ),
         }
         values = {name: _array(name, value, shape) for name, (value, shape) in given.items()}
         self._draw()
         rotation = rotation_from_quat(values["quat_wb"])
         offset_w = turned(rotation, self._errors.com_offset)
         offset_vel = turned(rotation, cross(values["rate_b"], self._errors.com_offset))
-        body = np.hstack((values["pos_w"] + offset_w, values["quat_wb"], values["vel_w"] + offset_vel, values["rate_b"]))
+        body = np.hstack(
+            (
+                values["pos_w"] + offset_w,
+                values["quat_wb"],
+                values["vel_w"] + offset_vel,
+                values["rate_b"],
+            )
+        )
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
         n = values["cable_dir_w"] / np.linalg.norm(values["cable_dir_w"], axis=-1, keepdims=True)
         n_dot = values["cable_vel_w"] - np.sum(values["cable_vel_w"] * n, -1, keepdims=True) * n
-        self._state = np.hstack((body, block, np.zeros((count, 6)), n.reshape(count, -1), n_dot.reshape(count, -1), np.zeros((count, 2))))
+        self._state = np.hstack(
+            (
+                body,
+                block,
+                np.zeros((count, 6)),
+                n.reshape(count, -1),
+                n_dot.reshape(count, -1),
+                np.zeros((count, 2)),
+            )
+        )
         if self._ropes.stretch is not None:
             self._state[:, -2] = self._payload_mass * GRAVITY / self.extras.stretch_stiffness
         hover = np.zeros((count, 4))
         hover[:, 0] = weight
         self._queue_times, self._queue_commands = [np.full(count, -np.inf)], [hover]
         self.time = 0.0
-        self._attached, self._latched, self._landed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+        self._attached, self._latched, self._landed = (
+            np.ones(count, bool),
+            np.zeros(count, bool),
+            np.zeros(count, bool),
+        )
         self._separation, self._landing_time = np.full(count, np.nan), np.full(count, np.nan)
         self._landing_point = np.full((count, 3), np.nan)
         self._samples = [(-np.inf, self.state)]
 
     def _draw(self) -> None:
         """Draw the errors of this episode and build the ropes."""
-        extras, rope, vehicle, count, rng = self.extras, self.params.rope, self.params.vehicle, self.count, self._rng
-        gain = 1.0 + extras.thrust_gain_error + extras.thrust_gain_sigma * rng.standard_normal((count, 1))
+        extras, rope, vehicle, count, rng = (
+            self.extras,
+            self.params.rope,
+            self.params.vehicle,
+            self.count,
+            self._rng,
+        )
+        gain = (
+            1.0
+            + extras.thrust_gain_error
+            + extras.thrust_gain_sigma * rng.standard_normal((count, 1))
+        )
         gain = gain + extras.motor_gain_sigma * rng.standard_normal((count, 4))
-        com = np.add(vehicle.body.com, extras.com_offset) + np.array(extras.com_offset_sigma) * rng.standard_normal((count, 3))
+        com = np.add(vehicle.body.com, extras.com_offset) + np.array(
+            extras.com_offset_sigma
+        ) * rng.standard_normal((count, 3))
         self._errors = VehicleErrors(gain, com)
-        self._payload_mass = rope.payload_mass * (1.0 + extras.payload_mass_sigma * rng.standard_normal(count))
+        self._payload_mass = rope.payload_mass * (
+            1.0 + extras.payload_mass_sigma * rng.standard_normal(count)
+        )
         length = rope.length * (1.0 + extras.rope_length_sigma * rng.standard_normal(count))
         self._used = rng.uniform(0.0, 1.0, count) * extras.battery_start_used
         self._rope_mass = self._payload_mass + rope.rope_mass
-        self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * rng.standard_normal((count, 3))
+        self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * rng.standard_normal(
+            (count, 3)
+        )
         self._next_wind = self._wind
-        # Compiling a model takes milliseconds; without these draws the ropes of the last episode serve on.
-        if self._ropes is not None and not (extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)):
+        # Compiling a model takes milliseconds; without these draws the ropes of the last episode
+        # serve on.
+        if self._ropes is not None and not (
+            extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)
+        ):
             return
         damping = rope.joint_damping + extras.extra_joint_damping
         ropes = [
             replace(
-                rope, mount=tuple(np.array(rope.mount) - com[i]), length=length[i], payload_mass=mass, joint_damping=damping,
+                rope,
+                mount=tuple(np.array(rope.mount) - com[i]),
+                length=length[i],
+                payload_mass=mass,
+                joint_damping=damping,
                 payload_inertia=rope.payload_inertia * mass / rope.payload_mass,
             )
             for i, mass in enumerate(self._payload_mass)
-        ]  # fmt: skip
-        stretch = (extras.stretch_stiffness, extras.stretch_damping) if extras.stretch_stiffness > 0.0 else None
+        ]
+        stretch = (
+            (extras.stretch_stiffness, extras.stretch_damping)
+            if extras.stretch_stiffness > 0.0
+            else None
+        )
         self._ropes = RopeDynamics(vehicle.body, ropes, stretch, rope.mount_damping)
-        # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d / (m l^2).
-        fastest = 48.0 * (damping + rope.mount_damping) / (rope.segment_mass * float(np.min(length) / rope.segments) ** 2)
-        self._step = min(self.step_size, LARGEST_DECAY / fastest) if fastest > 0.0 else self.step_size
+        # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d /
+        # (m l^2).
+        fastest = (
+            48.0
+            * (damping + rope.mount_damping)
+            / (rope.segment_mass * float(np.min(length) / rope.segments) ** 2)
+        )
+        self._step = (
+            min(self.step_size, LARGEST_DECAY / fastest) if fastest > 0.0 else self.step_size
+        )
 
     @property
     def _mean_wind(self) -> np.ndarray:
@@ -164,24 +264,42 @@ class ReferencePlant:
         start, size = BODY + BLOCKS + 6, 3 * self._ropes.segments
         return slice(start, start + size), slice(start + size, start + 2 * size)
 
-    def _upper_end(self, state: np.ndarray, rotation: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity of the rope's upper end: the mount while attached; ``rotation`` of the vehicles, where it is known."""
+    def _upper_end(
+        self, state: np.ndarray, rotation: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity of the rope's upper end: the mount while attached; ``rotation`` of
+        the vehicles, where it is known.
+        """
         rotation = rotation_from_quat(state[:, 3:7]) if rotation is None else rotation
         arm = turned(rotation, self._ropes.mount)
         arm_dot = turned(rotation, cross(state[:, 10:13], self._ropes.mount))
         on = self._attached[:, None]
         free = state[:, BODY + BLOCKS : BODY + BLOCKS + 6]
-        return np.where(on, state[:, 0:3] + arm, free[:, :3]), np.where(on, state[:, 7:10] + arm_dot, free[:, 3:])
+        return np.where(on, state[:, 0:3] + arm, free[:, :3]), np.where(
+            on, state[:, 7:10] + arm_dot, free[:, 3:]
+        )
 
-    def _rates(self, state: np.ndarray, command: np.ndarray, wind_w: np.ndarray, moving: np.ndarray) -> np.ndarray:
-        """Time derivative of the whole state; ropes that have landed and environments not ``moving`` stand still."""
+    def _rates(
+        self, state: np.ndarray, command: np.ndarray, wind_w: np.ndarray, moving: np.ndarray
+    ) -> np.ndarray:
+        """Time derivative of the whole state; ropes that have landed and environments not
+        ``moving`` stand still.
+        """
         vehicle, rates = self.params.vehicle, np.zeros_like(state)
         rotation = rotation_from_quat(state[:, 3:7])
         body, rate_b = state[:, :BODY], state[:, 10:13]
         air_b = turned_back(rotation, body[:, 7:10] - wind_w)
-        near_ground = blocks.near_ground(self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2])
+        near_ground = blocks.near_ground(
+            self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2]
+        )
         force_b, torque_b, rates[:, BODY : BODY + BLOCKS], thrust = vehicle_rates(
-            vehicle, self._errors, state[:, BODY : BODY + BLOCKS], command, air_b, rate_b, near_ground
+            vehicle,
+            self._errors,
+            state[:, BODY : BODY + BLOCKS],
+            command,
+            air_b,
+            rate_b,
+            near_ground,
         )
         force_w = turned(rotation, force_b)
         rates[:, :BODY] = rigid_body_rates(vehicle, body, force_w, torque_b)
@@ -189,17 +307,22 @@ class ReferencePlant:
         root = self._upper_end(state, rotation)
         lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
         drag_w = blocks.payload_force(
-            self.params.rope, self.extras.payload_drag, self._ropes.payload_velocity(root[1], rope), wind_w, rope[0][:, -1], lift_w,
+            self.params.rope,
+            self.extras.payload_drag,
+            self._ropes.payload_velocity(root[1], rope),
+            wind_w,
+            rope[0][:, -1],
+            lift_w,
             self._attached,
-        )  # fmt: skip
+        )
         second = np.zeros_like(rope[0])
         stretch_dot = np.zeros(self.count)
         ids = np.flatnonzero(self._attached & moving)
         if len(ids):
             picked = tuple(part[ids] for part in rope)
             wrench = (force_w[ids], torque_b[ids])
-            rates[ids, 7:10], rates[ids, 10:13], second[ids], stretch_dot[ids] = self._ropes.attached(
-                ids, body[ids], rotation[ids], wrench, picked, drag_w[ids]
+            rates[ids, 7:10], rates[ids, 10:13], second[ids], stretch_dot[ids] = (
+                self._ropes.attached(ids, body[ids], rotation[ids], wrench, picked, drag_w[ids])
             )
         flying = np.flatnonzero(~self._attached & ~self._landed & moving)
         free = slice(BODY + BLOCKS, BODY + BLOCKS + 6)
@@ -217,10 +340,17 @@ class ReferencePlant:
         return rates
 
     def _pull(self) -> np.ndarray:
-        """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles' acceleration."""
-        command = blocks.command_queue(np.array(self._queue_times), np.array(self._queue_commands), np.full(self.count, self.time))
+        """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles'
+        acceleration.
+        """
+        command = blocks.command_queue(
+            np.array(self._queue_times),
+            np.array(self._queue_commands),
+            np.full(self.count, self.time),
+        )
         with_rope, without = (
-            self._rates(self._state, command, self._wind, np.full(self.count, moving))[:, 7:10] for moving in (True, False)
+            self._rates(self._state, command, self._wind, np.full(self.count, moving))[:, 7:10]
+            for moving in (True, False)
         )
         force_w = self.params.vehicle.body.mass * (with_rope - without)
         return np.sum(force_w * self._rope_of(self._state)[0][:, 0], axis=1)
@@ -229,14 +359,19 @@ class ReferencePlant:
         """Give a command now and advance one control period.
 
         Args:
-            command: collective thrust [N] and body rates [rad/s], shape (E, 4); acts after the delay of the queue.
+            command: collective thrust [N] and body rates [rad/s], shape (E, 4); acts after the
+                delay of the queue.
             release: latch the release now, shape (E,), bool; a latch does not untrip.
         """
         extras, rng, period = self.extras, self._rng, self.params.sim.control_period
         start, end = self.time, self.time + period
-        delay = self.params.vehicle.queue.delay + extras.delay_jitter * rng.uniform(-1.0, 1.0, self.count)
+        delay = self.params.vehicle.queue.delay + extras.delay_jitter * rng.uniform(
+            -1.0, 1.0, self.count
+        )
         self._queue_times.append(np.maximum(start + np.maximum(delay, 0.0), self._queue_times[-1]))
-        self._queue_commands.append(np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4)).copy())
+        self._queue_commands.append(
+            np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4)).copy()
+        )
         lag = self.params.release.lag
         if self.params.release.lag_tension:
             lag = blocks.release_lag(self.params.release, self._pull(), self._payload_mass)
@@ -246,7 +381,11 @@ class ReferencePlant:
         self._latched = self._latched | tripped
         decay = np.exp(-period / extras.wind_time_constant)
         mean, sigma = self._mean_wind, np.array(extras.wind_sigma_w)
-        self._next_wind = mean + decay * (self._wind - mean) + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
+        self._next_wind = (
+            mean
+            + decay * (self._wind - mean)
+            + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
+        )
         self._advance(start, end)
         self._wind, self.time = self._next_wind, end
         self._prune(end)
@@ -255,7 +394,14 @@ class ReferencePlant:
         """Integrate one period, from event to event in each environment."""
         sample = end - self.extras.mocap_latency % (end - start)
         times, commands = np.array(self._queue_times), np.array(self._queue_commands)
-        edges = [[start, *[t for t in (*times[1:, e], self._separation[e], sample) if start < t < end], end] for e in range(self.count)]
+        edges = [
+            [
+                start,
+                *[t for t in (*times[1:, e], self._separation[e], sample) if start < t < end],
+                end,
+            ]
+            for e in range(self.count)
+        ]
         steps = segments_of_period(edges, self._step)
         clock = np.full(self.count, start)
         for column in steps.T:
@@ -266,7 +412,12 @@ class ReferencePlant:
             share = ((middle - start) / (end - start))[:, None]
             wind_w = self._wind + share * (self._next_wind - self._wind)
             before = self._state
-            self._state = halving_rk4(lambda x, h: self._rates(x, command, wind_w, h > 0.0), before, column, *self._rope_columns)
+            self._state = halving_rk4(
+                lambda x, h: self._rates(x, command, wind_w, h > 0.0),
+                before,
+                column,
+                *self._rope_columns,
+            )
             self._normalise()
             self._land(before, clock, column)
             clock = clock + column
@@ -276,11 +427,15 @@ class ReferencePlant:
         self._separate(clock)
 
     def _separate(self, clock: np.ndarray) -> None:
-        """Open the loop of the ropes whose time has come: their upper ends fly on with the mount's velocity."""
+        """Open the loop of the ropes whose time has come: their upper ends fly on with the mount's
+        velocity.
+        """
         due = self._attached & (self._separation <= clock + blocks.TIME_TOLERANCE)
         if np.any(due):
             pos, vel = self._upper_end(self._state)
-            vel = vel + blocks.release_kick(self.params.release, self._rope_of(self._state)[0][:, -1])
+            vel = vel + blocks.release_kick(
+                self.params.release, self._rope_of(self._state)[0][:, -1]
+            )
             self._state[due, BODY + BLOCKS : BODY + BLOCKS + 6] = np.hstack((pos, vel))[due]
             self._attached = self._attached & ~due
 
@@ -296,19 +451,34 @@ class ReferencePlant:
         if not np.any(flying):
             return
         height = self.params.release.landing_height
-        ends = [self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:] for state in (before, self._state)]
+        ends = [
+            self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:]
+            for state in (before, self._state)
+        ]
         for e in np.flatnonzero(flying & (ends[1][0][:, 2] <= height)):
-            share, point = crossing(ends[0][0][e], ends[0][1][e], ends[1][0][e], ends[1][1][e], step[e], height)
+            share, point = crossing(
+                ends[0][0][e], ends[0][1][e], ends[1][0][e], ends[1][1][e], step[e], height
+            )
             self._landed[e] = True
             self._landing_time[e], self._landing_point[e] = clock[e] + share * step[e], point
 
     def _keep_sample(self, time: float, reached: np.ndarray) -> None:
-        """Keep the state for the motion capture; environments reach the same instant in different columns."""
+        """Keep the state for the motion capture; environments reach the same instant in different
+        columns.
+        """
         now = self.state
         if self._samples[-1][0] == time:
             older = self._samples.pop()[1]
             keep = {}
-            for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w", "cable_points_w"):
+            for name in (
+                "pos_w",
+                "quat_wb",
+                "vel_w",
+                "rate_b",
+                "payload_pos_w",
+                "payload_vel_w",
+                "cable_points_w",
+            ):
                 new, old = getattr(now, name), getattr(older, name)
                 keep[name] = np.where(reached.reshape(-1, *[1] * (new.ndim - 1)), new, old)
             now = replace(older, **keep)
@@ -317,7 +487,10 @@ class ReferencePlant:
     def _prune(self, now: float) -> None:
         while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= now):
             del self._queue_times[0], self._queue_commands[0]
-        while len(self._samples) > 1 and self._samples[1][0] <= now - self.extras.mocap_latency + blocks.TIME_TOLERANCE:
+        while (
+            len(self._samples) > 1
+            and self._samples[1][0] <= now - self.extras.mocap_latency + blocks.TIME_TOLERANCE
+        ):
             del self._samples[0]
 
     @property
@@ -328,19 +501,27 @@ class ReferencePlant:
         offset = self._errors.com_offset
         points, ball, ball_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
         return Snapshot(
-            time=self.time, pos_w=state[:, 0:3] - turned(rotation, offset), quat_wb=state[:, 3:7].copy(),
-            vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)), rate_b=state[:, 10:13].copy(),
+            time=self.time,
+            pos_w=state[:, 0:3] - turned(rotation, offset),
+            quat_wb=state[:, 3:7].copy(),
+            vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)),
+            rate_b=state[:, 10:13].copy(),
             payload_pos_w=np.where(self._landed[:, None], self._landing_point, ball),
-            payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel), cable_points_w=points,
-            motor_speed=state[:, BODY + 9 : BODY + 13].copy(), battery_voltage=state[:, BODY + 14].copy(),
-            attached=self._attached.copy(), latched=self._latched.copy(),
-        )  # fmt: skip
+            payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel),
+            cable_points_w=points,
+            motor_speed=state[:, BODY + 9 : BODY + 13].copy(),
+            battery_voltage=state[:, BODY + 14].copy(),
+            attached=self._attached.copy(),
+            latched=self._latched.copy(),
+        )
 
     @property
     def landing(self) -> Landings:
         """Where and when the payloads came down."""
         separated = np.where(self._attached, np.nan, self._separation)
-        return Landings(self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated)
+        return Landings(
+            self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated
+        )
 
     @property
     def exposed(self) -> Snapshot:
@@ -348,11 +529,11 @@ class ReferencePlant:
         return self._samples[0][1]
 
     def measured(self) -> Snapshot:
-        """Return the state as motion capture and gyro give it: late by the latency, with noise drawn anew at each call.
+        """Return the state as motion capture and gyro give it: late by the latency, with noise
+        drawn anew at each call.
 
-        ``time`` is when the sample was taken. ``cable_points_w`` and the flags are not measured: points come without
-        noise for drawing, the flags as the vehicle knows them now.
-        """
+        ``time`` is when the sample was taken. ``cable_points_w`` and the flags are not measured:
+        points come without noise for drawing, the flags as the vehicle knows them now."""
         extras, rng = self.extras, self._rng
         time, sample = self._samples[0]
         rotation_noise = 0.5 * extras.mocap_angle_sigma * rng.standard_normal((self.count, 3))
@@ -368,9 +549,13 @@ class ReferencePlant:
             )
         }
         return replace(
-            sample, time=max(time, 0.0), quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
-            attached=self._attached.copy(), latched=self._latched.copy(), **noisy,
-        )  # fmt: skip
+            sample,
+            time=max(time, 0.0),
+            quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
+            attached=self._attached.copy(),
+            latched=self._latched.copy(),
+            **noisy,
+        )
 
 
 def _array(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""The vehicle of ``sim.reference.plant``: the seven blocks on a rigid body, whose place MuJoCo takes while the rope is on."""
+"""The vehicle of ``sim.reference.plant``: the seven blocks on a rigid body, whose place MuJoCo
+takes while the rope is on.
+"""
 
 from dataclasses import dataclass
 
@@ -8,8 +10,12 @@ from sim.params import GRAVITY, VehicleParams
 from sim.reference import blocks
 from sim.reference.rotations import cross, quat_dot
 
-BODY = 13  # columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate 10:13 (body)
-BLOCKS = 15  # columns of the blocks: set-point 0:3, gyro 3:6, integral 6:9, motor speed 9:13, used fraction 13, voltage 14
+# columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate
+# 10:13 (body)
+BODY = 13
+# columns of the blocks: set-point 0:3, gyro 3:6, integral 6:9, motor speed 9:13, used fraction 13,
+# voltage 14
+BLOCKS = 15
 
 
 @dataclass(frozen=True)
@@ -31,11 +37,13 @@ def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
     return np.array((rotors.x, rotors.y, (rotors.z,) * 4)).T - errors.com_offset[:, None, :]
 
 
-def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray) -> np.ndarray:
+def initial_blocks(
+    vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray
+) -> np.ndarray:
     """Return block states in steady hover, shape (E, 15).
 
-    Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that carries
-    ``weight``, terminal voltage settled under that load.
+    Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that
+    carries ``weight``, terminal voltage settled under that load.
 
     Args:
         vehicle: parameters.
@@ -49,7 +57,9 @@ def initial_blocks(vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarra
     state[:, 3:6] = rate_b
     voltage = np.full(count, cell.reference_voltage)
     for _ in range(50):
-        lift = weight / 4.0 / (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
+        lift = (
+            weight / 4.0 / (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
+        )
         speed = 2.0 * lift / (thrust.k_1 + np.sqrt(thrust.k_1**2 + 4.0 * thrust.k_f * lift))
         if cell.kind == "ideal":
             break
@@ -85,33 +95,43 @@ def vehicle_rates(
         near_ground: factor on the rotors' thrust, shape (E,).
 
     Returns:
-        Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's time derivative, and
-        the rotors' thrust [N], shape (E, 4).
+        Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's
+        time derivative, and the rotors' thrust [N], shape (E, 4).
     """
     used, voltage = state[:, 13], state[:, 14]
     rates = np.zeros_like(state)
     if vehicle.controller.kind == "geometric":
         setpoint = blocks.geometric(vehicle, command, rate_b)
     elif vehicle.controller.kind == "motor_mixing":
-        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.motor_mixing(vehicle, state[:, 0:9], command, rate_b, voltage)
+        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.motor_mixing(
+            vehicle, state[:, 0:9], command, rate_b, voltage
+        )
     else:
         setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.betaflight(
             vehicle, state[:, 0:3], state[:, 3:6], state[:, 6:9], command, rate_b, voltage
         )
     speed = setpoint if vehicle.motor.kind == "instant" else state[:, 9:13]
     rates[:, 9:13] = blocks.motor(vehicle.motor, speed, setpoint)
-    thrust, torque = blocks.thrust_map(vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain)
+    thrust, torque = blocks.thrust_map(
+        vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain
+    )
     thrust, torque = (np.reshape(near_ground, (-1, 1)) * part for part in (thrust, torque))
     rates[:, 13], rates[:, 14] = blocks.battery(vehicle.battery, used, voltage, speed, torque)
     arms = rotor_arms(vehicle, errors)
     ratio = blocks.drag_torque_ratio(vehicle.thrust)
     aero = blocks.aerodynamics(vehicle.aero, arms, ratio, thrust, air_velocity_b, rate_b)
-    force_b, torque_b = blocks.composer(vehicle.rotors, arms, thrust, torque, speed, rates[:, 9:13], rate_b, aero)
+    force_b, torque_b = blocks.composer(
+        vehicle.rotors, arms, thrust, torque, speed, rates[:, 9:13], rate_b, aero
+    )
     return force_b, torque_b, rates, thrust
 
 
-def rigid_body_rates(vehicle: VehicleParams, body: np.ndarray, force_w: np.ndarray, torque_b: np.ndarray) -> np.ndarray:
-    """Return the time derivative of free bodies, shape (E, 13), under world force [N], gravity and torque [N m]."""
+def rigid_body_rates(
+    vehicle: VehicleParams, body: np.ndarray, force_w: np.ndarray, torque_b: np.ndarray
+) -> np.ndarray:
+    """Return the time derivative of free bodies, shape (E, 13), under world force [N], gravity and
+    torque [N m].
+    """
     inertia = np.array(vehicle.body.inertia)
     rate = body[:, 10:13]
     rates = np.empty_like(body)

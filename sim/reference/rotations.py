@@ -6,7 +6,9 @@ _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def _from_products() -> np.ndarray:
-    """Coefficients of the products of two components xyzw in the entries of ``R - 1``, shape (16, 9)."""
+    """Coefficients of the products of two components xyzw in the entries of ``R - 1``, shape (16,
+    9).
+    """
     x, y, z, w = range(4)
     out = np.zeros((4, 4, 3, 3))
     for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
@@ -20,7 +22,9 @@ _FROM_PRODUCTS = _from_products()
 
 
 def _half_of_products() -> np.ndarray:
-    """Coefficients of a component xyzw times one of a rate in ``1/2 q (rate, 0)``, shape (12, 4)."""
+    """Coefficients of a component xyzw times one of a rate in ``1/2 q (rate, 0)``,
+    shape (12, 4).
+    """
     x, y, z, w = range(4)
     out = np.zeros((4, 3, 4))
     for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
@@ -32,12 +36,16 @@ _HALF_OF_PRODUCTS = _half_of_products()
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few vectors."""
+    """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
+    vectors.
+    """
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
 def length(vectors: np.ndarray) -> np.ndarray:
-    """Return the norm over the last axis, which stays; ``np.linalg.norm`` takes twice as long on a few vectors."""
+    """Return the norm over the last axis, which stays; ``np.linalg.norm`` takes twice as long on a
+    few vectors.
+    """
     return np.sqrt(np.add.reduce(vectors * vectors, -1, keepdims=True))
 
 
@@ -55,41 +63,65 @@ def rotation_from_quat(quat: np.ndarray) -> np.ndarray:
     """Return rotation matrices of quaternions xyzw of any length, shape (..., 3, 3)."""
     unit = quat / length(quat)
     products = unit[..., :, None] * unit[..., None, :]
-    return np.eye(3) + (products.reshape(*quat.shape[:-1], 16) @ _FROM_PRODUCTS).reshape(*quat.shape[:-1], 3, 3)
+    return np.eye(3) + (products.reshape(*quat.shape[:-1], 16) @ _FROM_PRODUCTS).reshape(
+        *quat.shape[:-1], 3, 3
+    )
 
 
 def quat_dot(quat: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
-    """Return the time derivative of quaternions xyzw under a body rate [rad/s], ``1/2 q (rate, 0)``."""
+    """Return the time derivative of quaternions xyzw under a body rate [rad/s], ``1/2 q (rate,
+    0)``.
+    """
     products = quat[..., :, None] * rate_b[..., None, :]
     return products.reshape(*quat.shape[:-1], 12) @ _HALF_OF_PRODUCTS
 
 
 def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
-    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as possible from hanging.
+    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as
+    possible from hanging.
 
     Args:
         direction_w: unit vectors, shape (..., 3).
 
-    Source: Frisvad, Building an orthonormal basis from a 3D unit vector without normalization, 2012, with the branch of
-    Duff et al. 2017 on the sign of z, so that no direction is singular.
+    Source: Frisvad, Building an orthonormal basis from a 3D unit vector without normalization,
+    2012, with the branch of Duff et al. 2017 on the sign of z, so that no direction is singular.
     """
     z = -np.asarray(direction_w, dtype=np.float64)
     sign = np.where(z[..., 2] >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + z[..., 2])
     b = z[..., 0] * z[..., 1] * a
     out = np.empty((*z.shape, 3))
-    out[..., 0, 0], out[..., 1, 0], out[..., 2, 0] = 1.0 + sign * z[..., 0] ** 2 * a, sign * b, -sign * z[..., 0]
+    out[..., 0, 0], out[..., 1, 0], out[..., 2, 0] = (
+        1.0 + sign * z[..., 0] ** 2 * a,
+        sign * b,
+        -sign * z[..., 0],
+    )
     out[..., 0, 1], out[..., 1, 1], out[..., 2, 1] = b, sign + z[..., 1] ** 2 * a, -z[..., 1]
     out[..., 2] = z
     return out
 
 
 def _products(m: np.ndarray) -> np.ndarray:
-    """Four times the products of the components wxyz of the quaternions of rotation matrices, shape (..., 4, 4)."""
+    """Four times the products of the components wxyz of the quaternions of rotation matrices, shape
+    (..., 4, 4).
+    """
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    rows = ((1 + xx + yy + zz, wx, wy, wz), (wx, 1 + xx - yy - zz, xy, xz), (wy, xy, 1 - xx + yy - zz, yz), (wz, xz, yz, 1 - xx - yy + zz))
+    wx, wy, wz = (
+        m[..., 2, 1] - m[..., 1, 2],
+        m[..., 0, 2] - m[..., 2, 0],
+        m[..., 1, 0] - m[..., 0, 1],
+    )
+    xy, xz, yz = (
+        m[..., 0, 1] + m[..., 1, 0],
+        m[..., 0, 2] + m[..., 2, 0],
+        m[..., 1, 2] + m[..., 2, 1],
+    )
+    rows = (
+        (1 + xx + yy + zz, wx, wy, wz),
+        (wx, 1 + xx - yy - zz, xy, xz),
+        (wy, xy, 1 - xx + yy - zz, yz),
+        (wz, xz, yz, 1 - xx - yy + zz),
+    )
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
@@ -99,7 +131,9 @@ _OF_ENTRIES = _products(np.eye(9).reshape(9, 3, 3)).reshape(9, 16) - _OF_NONE
 
 
 def quat_wxyz_from_matrix(matrix: np.ndarray) -> np.ndarray:
-    """Return unit quaternions wxyz of rotation matrices, shape (..., 4), by the largest of the four squares."""
+    """Return unit quaternions wxyz of rotation matrices, shape (..., 4), by the largest of the four
+    squares.
+    """
     products = (matrix.reshape(-1, 9) @ _OF_ENTRIES + _OF_NONE).reshape(-1, 4, 4)
     largest = products[:, *np.diag_indices(4)].argmax(-1)
     quat = products[np.arange(len(products)), largest]

@@ -1,4 +1,6 @@
-"""What any plant says of its vehicles: their state at one time, and where their payloads came down."""
+"""What any plant says of its vehicles: their state at one time, and where their
+payloads came down.
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple

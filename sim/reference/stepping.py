@@ -1,9 +1,9 @@
-"""Steps from event to event of a control period, and Runge-Kutta steps of order 4 that halve themselves where a rope snaps.
+"""Steps from event to event of a control period, and Runge-Kutta steps of order 4 that halve
+themselves where a rope snaps.
 
-A rope that snaps taut stiffens within a step: its transverse modes rise with the root of the tension. Each step reads
-the frequency that its own two middle stages show and how far a segment turned; environments beyond the limits repeat
-the step as two halves.
-"""
+A rope that snaps taut stiffens within a step: its transverse modes rise with the root of the
+tension. Each step reads the frequency that its own two middle stages show and how far a segment
+turned; environments beyond the limits repeat the step as two halves."""
 
 from collections.abc import Callable
 
@@ -12,8 +12,12 @@ import numpy as np
 from sim.reference.blocks import TIME_TOLERANCE
 from sim.reference.rotations import length
 
-LARGEST_PHASE = 0.9  # frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83
-LARGEST_TURN = 0.25  # turn of a segment within one step beyond which it is halved [rad]; RK4 then errs by about 0.25^5 / 120 = 8e-6 rad
+LARGEST_PHASE = (
+    0.9  # frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83
+)
+# turn of a segment within one step beyond which it is halved [rad]; RK4 then errs by about 0.25^5 /
+# 120 = 8e-6 rad
+LARGEST_TURN = 0.25
 MOST_HALVINGS = 6
 
 
@@ -25,10 +29,12 @@ def halving_rk4(
     velocity: slice,
     depth: int = 0,
 ) -> np.ndarray:
-    """Take one step of order 4 in each environment, in halves, quarters .. where the rope asks for it.
+    """Take one step of order 4 in each environment, in halves, quarters .. where the rope asks for
+    it.
 
     Args:
-        rates: function from state and step to the state's time derivative; rows with a step of 0 may stand still.
+        rates: function from state and step to the state's time derivative; rows with a step of 0
+            may stand still.
         state: shape (E, N).
         step: [s], shape (E,).
         direction: columns of the segments' directions.
@@ -41,11 +47,14 @@ def halving_rk4(
     k3 = rates(state + 0.5 * h * k2, step)
     k4 = rates(state + h * k3, step)
     after = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    # k2 and k3 belong to one time and to states 0.5 h (k2 - k1) apart: their ratio is the square of a frequency.
+    # k2 and k3 belong to one time and to states 0.5 h (k2 - k1) apart: their ratio is the square of
+    # a frequency.
     apart = 0.5 * step * length(k2[:, direction] - k1[:, direction])[:, 0]
     pull = length(k3[:, velocity] - k2[:, velocity])[:, 0]
     phase = step * np.sqrt(pull / np.maximum(apart, 1e-12))
-    turn = step * np.sqrt(np.max(np.square(after[:, velocity]).reshape(len(state), -1, 3).sum(-1), axis=1))
+    turn = step * np.sqrt(
+        np.max(np.square(after[:, velocity]).reshape(len(state), -1, 3).sum(-1), axis=1)
+    )
     fine = (phase <= LARGEST_PHASE) & (turn <= LARGEST_TURN)  # false for NaN too
     coarse = ~fine & (step > 0.0)
     if depth < MOST_HALVINGS and np.any(coarse):
@@ -64,7 +73,8 @@ def segments_of_period(edges: list[list[float]], step: float) -> np.ndarray:
         step: largest step [s].
 
     Returns:
-        Steps [s], shape (E, S); zeros where an environment needs fewer than the one that needs most.
+        Steps [s], shape (E, S); zeros where an environment needs fewer than the one that needs
+        most.
     """
     rows = []
     for times in edges:
@@ -80,7 +90,12 @@ def segments_of_period(edges: list[list[float]], step: float) -> np.ndarray:
 
 
 def crossing(
-    pos_0: np.ndarray, vel_0: np.ndarray, pos_1: np.ndarray, vel_1: np.ndarray, step: float, height: float
+    pos_0: np.ndarray,
+    vel_0: np.ndarray,
+    pos_1: np.ndarray,
+    vel_1: np.ndarray,
+    step: float,
+    height: float,
 ) -> tuple[float, np.ndarray]:
     """Find where a path passes a height going down, by the cubic through both ends of a step.
 
@@ -99,7 +114,9 @@ def crossing(
     def path(s: float) -> np.ndarray:
         bend = s * (1.0 - s)
         straight = pos_0 + s * (pos_1 - pos_0)
-        return straight + bend * ((1.0 - s) * (step * vel_0 - (pos_1 - pos_0)) - s * (step * vel_1 - (pos_1 - pos_0)))
+        return straight + bend * (
+            (1.0 - s) * (step * vel_0 - (pos_1 - pos_0)) - s * (step * vel_1 - (pos_1 - pos_0))
+        )
 
     low, high = 0.0, 1.0
     if pos_0[2] <= height:

@@ -1,1 +1,4 @@
-"""Measurements that stand behind records of this repository: ``python -m tests.bench.NAME --help``."""
+"""Measurements that stand behind records of this repository:
+
+``python -m tests.bench.NAME --help``.
+"""

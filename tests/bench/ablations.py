@@ -1,7 +1,9 @@
-"""The paper's ablations as hidden defects: a model that lacks a block is compared with flights of a plant that has it.
+"""The paper's ablations as hidden defects: a model that lacks a block is compared with flights of a
+plant that has it.
 
-The shipped policy throws on the reference plant, which has everything; the same flights are diagnosed with four models, each
-without one block. What must be named is the block. Nothing is trained. Throws that no diagnosis saw say what the name is worth.
+The shipped policy throws on the reference plant, which has everything; the same flights are
+diagnosed with four models, each without one block. What must be named is the block. Nothing is
+trained. Throws that no diagnosis saw say what the name is worth.
 
     python -m tests.bench.ablations                 all four; minutes on two cores
     python -m tests.bench.ablations no_motor_lag    one of them
@@ -33,16 +35,22 @@ from visthrow.throws.reference_protocol import place_in_hover
 from visthrow.training.device import resolve
 
 LACKS = {
-    "no_aerodynamics": "aerodynamics", "no_motor_lag": "motor_lag", "simple_controller": "controller_kind",
+    "no_aerodynamics": "aerodynamics",
+    "no_motor_lag": "motor_lag",
+    "simple_controller": "controller_kind",
     "rigid_cable": "rope_flexible",
-}  # fmt: skip
-"""Ablation, as in ``configs/train/state_NAME.toml`` -> the entry of the catalogue that gives the block back."""
+}
+"""Ablation, as in ``configs/train/state_NAME.toml`` -> the entry of the catalogue that gives the
+block back.
+"""
 
 COMMITTED = Path(__file__).parent / "loops" / "ablations" / "record.json"
 """Record of the last round that is told of."""
 
 SETTLED, AFTERWARDS = 2.4, 0.7
-"""Hover before the policy takes over, of which a log keeps the last part; flown on after the last landing [s]."""
+"""Hover before the policy takes over, of which a log keeps the last part; flown on after the last
+landing [s].
+"""
 
 NEAR, FAR = 1.0, 1.9
 """Distances of the targets, which lie all around [m]."""
@@ -78,13 +86,22 @@ class Ablations:
         if strange:
             raise DiagnoseError(f"no ablation {', '.join(strange)}; there are {', '.join(LACKS)}")
         logs = self._flown(say)
-        told = [self._one(name, logs, lambda line, name=name: say(f"{name}: {line}")) for name in self.names]
-        record = {"policy": self.policy, "flights": self.flights, "held": self.held, "ablations": told}
+        told = [
+            self._one(name, logs, lambda line, name=name: say(f"{name}: {line}"))
+            for name in self.names
+        ]
+        record = {
+            "policy": self.policy,
+            "flights": self.flights,
+            "held": self.held,
+            "ablations": told,
+        }
         write_json(self.folder / "record.json", record)
         return record
 
     def _flown(self, say: Callable[[str], None]) -> list[Path]:
-        """Logs of throws at targets all around, by the policy as it was trained, on the plant that has everything.
+        """Logs of throws at targets all around, by the policy as it was trained, on the plant that
+        has everything.
 
         Of those held back somebody noted where they came down.
         """
@@ -94,8 +111,12 @@ class Ablations:
             return paths
         rng = np.random.default_rng(0)
         angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(NEAR, FAR, count)
-        goals = np.column_stack((distance * np.cos(angle), distance * np.sin(angle), np.zeros(count)))
-        for i, (path, log) in enumerate(zip(paths, throws(load_policy(self.policy), PLANT, goals, 0))):
+        goals = np.column_stack(
+            (distance * np.cos(angle), distance * np.sin(angle), np.zeros(count))
+        )
+        for i, (path, log) in enumerate(
+            zip(paths, throws(load_policy(self.policy), PLANT, goals, 0))
+        ):
             seen = recorded(log, np.random.default_rng(i))
             landing = {"landing": log["landing"]} if i >= self.flights else {}
             FlightLog({**seen.channels, **landing}, seen.meta).save(path)
@@ -107,12 +128,23 @@ class Ablations:
         own.mkdir(parents=True, exist_ok=True)
         verdict = explained(logs[: self.flights], base, own / "verdict.json", self.device, say)
         theta, findings = named(verdict), verdict.get("findings", ())
-        record = {"model": base, "lacks": LACKS[name], "overall": verdict["overall"], "named": theta}
-        record |= {"seconds": verdict.get("seconds"), "reasons": verdict.get("reasons", []), "threshold": verdict.get("threshold")}
+        record = {
+            "model": base,
+            "lacks": LACKS[name],
+            "overall": verdict["overall"],
+            "named": theta,
+        }
+        record |= {
+            "seconds": verdict.get("seconds"),
+            "reasons": verdict.get("reasons", []),
+            "threshold": verdict.get("threshold"),
+        }
         record["nats"] = {f["name"]: f["nats"] for f in findings if f["name"] in theta}
         kept = own / "held.json"
         if not kept.exists():
-            write_json(kept, on_held_back(base, theta, LACKS[name], logs[self.flights :], self.device))
+            write_json(
+                kept, on_held_back(base, theta, LACKS[name], logs[self.flights :], self.device)
+            )
             say("weighed on the throws that were held back")
         return record | {"held": json.loads(kept.read_text())}
 
@@ -120,7 +152,8 @@ class Ablations:
 def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> list[FlightLog]:
     """Throw at goals, one vehicle each, side by side: one vehicle costs nearly as much as thirty.
 
-    All hover for the same time first; :func:`visthrow.throws.recorded.fly` waits for the swing to become quiet.
+    All hover for the same time first; :func:`visthrow.throws.recorded.fly` waits for the swing to
+    become quiet.
 
     Args:
         loaded: policy and experiment, whose plant it is.
@@ -129,12 +162,16 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
         seed: of plant and starts.
 
     Returns:
-        A log each with poses, commands, the release's command and the landing; ``meta["times"]`` as of that function.
+        A log each with poses, commands, the release's command and the landing; ``meta["times"]`` as
+        of that function.
 
     Raises:
         DiagnoseError: A throw failed.
     """
-    plant, rng = make_plant(plant_name, loaded.experiment, len(goals_w), seed), np.random.default_rng(seed)
+    plant, rng = (
+        make_plant(plant_name, loaded.experiment, len(goals_w), seed),
+        np.random.default_rng(seed),
+    )
     home = place_in_hover(plant, loaded.experiment, rng)
     meta = {"policy": loaded.name, "plant": plant.name}
     recording = Recording(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
@@ -148,8 +185,8 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     flight.run([hover(SETTLED), Phase(True, over)])
     if flight.failed.any():
         raise DiagnoseError(
-            f"throws {np.flatnonzero(flight.failed)} did not come down ({', '.join({c for c in flight.failures if c})}); "
-            "can the policy fly this plant?"
+            f"throws {np.flatnonzero(flight.failed)} did not come down"
+            f" ({', '.join({c for c in flight.failures if c})}); can the policy fly this plant?"
         )
     landing, end = plant.landing, plant.time - plant.period
     for recorder, point, when in zip(recording.recorders, landing.point_w, landing.time):
@@ -158,14 +195,17 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     return [recorder.log() for recorder in recording.recorders]
 
 
-def on_held_back(base: str, theta: Mapping[str, float], lacks: str, logs: Sequence[Path], device: str) -> dict[str, Any]:
+def on_held_back(
+    base: str, theta: Mapping[str, float], lacks: str, logs: Sequence[Path], device: str
+) -> dict[str, Any]:
     """What a verdict is worth on throws that it was not found in.
 
     Returns:
-        ``before``, ``after``: nats by which the throws are explained worse by the model as it was, and with what was named,
-        than by the model with the block that it lacks; see :func:`tests.diagnose.shortfalls.shortfalls`. ``landing_before``,
-        ``landing_after``, ``landing_whole``: mean distance of predicted and seen landings [m], open loop from a second before
-        the separation; None where one never comes down.
+        ``before``, ``after``: nats by which the throws are explained worse by the model as it was,
+        and with what was named, than by the model with the block that it lacks; see
+        :func:`tests.diagnose.shortfalls.shortfalls`. ``landing_before``, ``landing_after``,
+        ``landing_whole``: mean distance of predicted and seen landings [m], open loop from a second
+        before the separation; None where one never comes down.
     """
     from tests.diagnose.shortfalls import shortfalls
     from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -178,7 +218,9 @@ def on_held_back(base: str, theta: Mapping[str, float], lacks: str, logs: Sequen
     found = {"before": before, "after": after, "samples": samples}
     for who, theta_ in zip(("before", "after", "whole"), sizes):
         off = model.landings(theta_).errors
-        found[f"landing_{who}"] = float(np.mean(off)) if len(off) and np.isfinite(off).all() else None
+        found[f"landing_{who}"] = (
+            float(np.mean(off)) if len(off) and np.isfinite(off).all() else None
+        )
     return found
 
 
@@ -190,25 +232,48 @@ def read(path: Path | None = None) -> dict[str, Any]:
     """
     file = COMMITTED if path is None else path / "record.json" if path.is_dir() else path
     if not file.exists():
-        raise DiagnoseError(f"{file}: no such record; expected what `python -m tests.bench.ablations` left")
+        raise DiagnoseError(
+            f"{file}: no such record; expected what `python -m tests.bench.ablations` left"
+        )
     return json.loads(file.read_text())
 
 
 def table(record: Mapping[str, Any]) -> str:
     """Markdown table of a round."""
     lines = [
-        f"{record['flights']} throws of '{record['policy']}' diagnosed, {record['held']} held back", "",
-        "| the model lacks | named | verdict | held back: nats short of the whole model | predicted landing off by [mm] | [s] |",
+        f"{record['flights']} throws of '{record['policy']}' diagnosed, {record['held']} held back",
+        "",
+        (
+            "| the model lacks | named | verdict | held back: nats short of the whole model |"
+            " predicted landing off by [mm] | [s] |"
+        ),
         "|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for r in record["ablations"]:
-        found = ", ".join(f"{n} {size:+.3g} ({r['nats'][n]:.0f} nats)" for n, size in r["named"].items()) or "nothing"
+        found = (
+            ", ".join(
+                f"{n} {size:+.3g} ({r['nats'][n]:.0f} nats)" for n, size in r["named"].items()
+            )
+            or "nothing"
+        )
         held = r["held"]
-        off = " -> ".join("-" if (x := held[f"landing_{who}"]) is None else f"{1e3 * x:.0f}" for who in ("before", "after"))
+        off = " -> ".join(
+            "-" if (x := held[f"landing_{who}"]) is None else f"{1e3 * x:.0f}"
+            for who in ("before", "after")
+        )
         worth = f"{held['before']:.0f} -> {held['after']:.0f}"
-        right = "named" if set(r["named"]) == {r["lacks"]} else "named, with others" if r["lacks"] in r["named"] else "not named"
+        right = (
+            "named"
+            if set(r["named"]) == {r["lacks"]}
+            else "named, with others"
+            if r["lacks"] in r["named"]
+            else "not named"
+        )
         took = f"{r['seconds']:.0f}" if r["seconds"] else "-"
-        lines.append(f"| {r['lacks']} ({r['model']}) | {found} | {r['overall']}, {right} | {worth} | {off} | {took} |")
+        lines.append(
+            f"| {r['lacks']} ({r['model']}) | {found} | {r['overall']}, {right} | {worth} | {off} |"
+            f" {took} |"
+        )
     return "\n".join(lines)
 
 
@@ -218,7 +283,12 @@ def run(args: argparse.Namespace) -> None:
         print("\n\n".join(table(read(place)) for place in args.show or (None,)))
         return
     one = Ablations(
-        Path(args.out) / "ablations", args.names or tuple(LACKS), args.policy, args.flights, args.held, resolve(args.diagnose_on)
+        Path(args.out) / "ablations",
+        args.names or tuple(LACKS),
+        args.policy,
+        args.flights,
+        args.held,
+        resolve(args.diagnose_on),
     )
     print("\n" + table(one.run(lambda line: print(f"  {line}", flush=True))))
 
@@ -227,8 +297,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__, record=False)
     add_arguments(parser)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(LACKS)} (default: all)")
-    parser.add_argument("--held", type=int, default=Ablations.held, help="throws held back (default: 3)")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join(LACKS)} (default: all)"
+    )
+    parser.add_argument(
+        "--held", type=int, default=Ablations.held, help="throws held back (default: 3)"
+    )
     return start.main(parser, run, argv)
 
 

@@ -1,4 +1,6 @@
-"""The baseline's throws that the report stands on: flies what no record holds, and writes the record anew."""
+"""The baseline's throws that the report stands on: flies what no record holds, and writes the
+record anew.
+"""
 
 import argparse
 import importlib
@@ -18,7 +20,12 @@ from visthrow.throws import results
 def full() -> list[dict[str, Any]]:
     """Units of the committed record ``baseline``: the cheap and informative ones first."""
     made_up = [*_front(), *_on_reference("both", 20, front.SPEEDS[1::2])]
-    return [*_by_target(50), *made_up, *_late_front(), *_on_reference("delay", 20, front.SPEEDS[1:2])]
+    return [
+        *_by_target(50),
+        *made_up,
+        *_late_front(),
+        *_on_reference("delay", 20, front.SPEEDS[1:2]),
+    ]
 
 
 def _by_target(throws: int) -> Iterator[dict[str, Any]]:
@@ -39,8 +46,12 @@ def _front() -> Iterator[dict[str, Any]]:
     """The sweep in the own model and, all delays made up for, in the training simulator."""
     for bounds in BOUNDS[::-1]:
         for how in _settings():
-            yield from thrower.units(thrower.OWN, "none", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how)
-            yield from thrower.units("hybrid", "both", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how)
+            yield from thrower.units(
+                thrower.OWN, "none", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how
+            )
+            yield from thrower.units(
+                "hybrid", "both", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how
+            )
 
 
 def _late_front() -> Iterator[dict[str, Any]]:
@@ -49,12 +60,16 @@ def _late_front() -> Iterator[dict[str, Any]]:
         yield from thrower.units("hybrid", "delay", FRONT_TARGET, FRONT_THROWS, **how)
 
 
-def _on_reference(compensation: str, throws: int, speeds: tuple[float, ...]) -> Iterator[dict[str, Any]]:
+def _on_reference(
+    compensation: str, throws: int, speeds: tuple[float, ...]
+) -> Iterator[dict[str, Any]]:
     """By target and a part of the sweep: a throw takes seconds there."""
     for target in (FRONT_TARGET, *(target for target in TARGETS if target != FRONT_TARGET)):
         yield from thrower.units("reference-realistic", compensation, target, throws)
     for how in _settings(speeds):
-        yield from thrower.units("reference-realistic", compensation, FRONT_TARGET, FRONT_THROWS, **how)
+        yield from thrower.units(
+            "reference-realistic", compensation, FRONT_TARGET, FRONT_THROWS, **how
+        )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,7 +77,14 @@ def run(args: argparse.Namespace) -> int:
     importlib.import_module("piqp")  # said here rather than by every worker
     path = Path(args.records) / "throws" / "baseline.json"
     known = results.load_all([path])
-    found = results.work(full(), args.out, thrower.fly_unit, known, args.jobs, lambda text: print(text, file=sys.stderr, flush=True))
+    found = results.work(
+        full(),
+        args.out,
+        thrower.fly_unit,
+        known,
+        args.jobs,
+        lambda text: print(text, file=sys.stderr, flush=True),
+    )
     results.pack(found.values(), path)
     print(path)
     return 0
@@ -71,9 +93,21 @@ def run(args: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__, record=False)
-    parser.add_argument("--records", metavar="FOLDER", default=str(results.RECORDS), help="of records (default: the package's)")
-    parser.add_argument("--out", metavar="FOLDER", default="out/baseline/throws", help="of what is flown, to go on with")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at once (default: 1)")
+    parser.add_argument(
+        "--records",
+        metavar="FOLDER",
+        default=str(results.RECORDS),
+        help="of records (default: the package's)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FOLDER",
+        default="out/baseline/throws",
+        help="of what is flown, to go on with",
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="processes at once (default: 1)"
+    )
     return start.main(parser, run, argv)
 
 

@@ -22,11 +22,15 @@ from visthrow.common.errors import VisthrowError
 
 STRETCH = 0.2  # [s], wall time of one measurement, about
 SAFE_ANGLE = math.radians(85.0)
-"""Up to here [rad, off the axis] kornia and OpenCV are right and well conditioned: accuracy is compared there."""
+"""Up to here [rad, off the axis] kornia and OpenCV are right and well conditioned: accuracy is
+compared there.
+"""
 
 
 class Views:
-    """Random views: vehicles up to 60 deg tilted and 1 to 2 m high, goals within 2.5 m, balls a rope's length away."""
+    """Random views: vehicles up to 60 deg tilted and 1 to 2 m high, goals within 2.5 m, balls a
+    rope's length away.
+    """
 
     def __init__(self, params: Any, count: int, device: str, seed: int = 0):
         draw = torch.Generator().manual_seed(seed)
@@ -38,16 +42,22 @@ class Views:
             return x.to(device=device, dtype=torch.float32)
 
         axis = torch.nn.functional.normalize(uniform(count, 3), dim=-1)
-        skew = torch.linalg.cross(torch.eye(3).expand(count, 3, 3), axis[:, None].expand(count, 3, 3), dim=-1)
+        skew = torch.linalg.cross(
+            torch.eye(3).expand(count, 3, 3), axis[:, None].expand(count, 3, 3), dim=-1
+        )
         angle = uniform(count, 1, 1, high=math.radians(60.0), low=0.0)
-        rope = torch.nn.functional.normalize(uniform(count, 3) - torch.tensor([0.0, 0.0, 1.0]), dim=-1)
+        rope = torch.nn.functional.normalize(
+            uniform(count, 3) - torch.tensor([0.0, 0.0, 1.0]), dim=-1
+        )
         pos_w = uniform(count, 3) * torch.tensor([0.5, 0.5, 0.5]) + torch.tensor([0.0, 0.0, 1.5])
         self.camera = KeypointCamera(params, device)
         self.pos_w, self.rot_wb = to(pos_w), to(torch.linalg.matrix_exp(angle * skew))
         self.goal_w, self.payload_w = to(uniform(count, 2) * 2.5), to(pos_w + 0.38 * rope)
         corners = self.goal_w.new_zeros(count, 4, 3)
         corners[..., :2] = self.goal_w[:, None]
-        around = torch.cat([corners + self.camera.square_w, self.payload_w[:, None].expand(-1, 4, -1)], 1)
+        around = torch.cat(
+            [corners + self.camera.square_w, self.payload_w[:, None].expand(-1, 4, -1)], 1
+        )
         self.points_c = points_c_from_w(
             around, self.pos_w, self.rot_wb, self.camera.rot_cb, self.camera.position_b
         ).contiguous()
@@ -69,12 +79,16 @@ def kornia_projection(points_c: torch.Tensor, values: torch.Tensor) -> torch.Ten
     return distort_points_kannala_brandt(points_c[..., :2] / points_c[..., 2:], values)
 
 
-def opencv_projection(points_c: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+def opencv_projection(
+    points_c: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray
+) -> np.ndarray:
     """OpenCV's projection, pixels, shape (E K, 1, 2)."""
     import cv2
 
     still = np.zeros(3)
-    return cv2.fisheye.projectPoints(points_c.reshape(-1, 1, 3), still, still, matrix, coefficients)[0]
+    return cv2.fisheye.projectPoints(
+        points_c.reshape(-1, 1, 3), still, still, matrix, coefficients
+    )[0]
 
 
 def intrinsics(f: Any) -> tuple[list[float], np.ndarray, np.ndarray]:
@@ -83,7 +97,9 @@ def intrinsics(f: Any) -> tuple[list[float], np.ndarray, np.ndarray]:
     return [f.fx, f.fy, f.cx, f.cy, *f.coefficients], matrix, np.array(f.coefficients)
 
 
-def median_time(function: Callable[[], Any], device: str, repeats: int, stretch: float = STRETCH) -> float:
+def median_time(
+    function: Callable[[], Any], device: str, repeats: int, stretch: float = STRETCH
+) -> float:
     """Median wall time of a call [s]."""
 
     def stretch_of(calls: int) -> float:
@@ -115,7 +131,9 @@ def graphed(function: Callable[[], Any], device: str) -> Callable[[], None]:
     return graph.replay
 
 
-def on_device(params: Any, count: int, device: str, repeats: int, stretch: float = STRETCH) -> dict[str, float]:
+def on_device(
+    params: Any, count: int, device: str, repeats: int, stretch: float = STRETCH
+) -> dict[str, float]:
     """Seconds a call of each contender that runs on a device."""
     views = Views(params, count, device)
     row, matrix, coefficients = intrinsics(params.fisheye)
@@ -135,7 +153,9 @@ def on_device(params: Any, count: int, device: str, repeats: int, stretch: float
 
 
 def accuracy(params: Any, count: int) -> dict[str, float]:
-    """Largest distance [px] from kornia and OpenCV in float64 up to ``SAFE_ANGLE``; share of points past 90 deg."""
+    """Largest distance [px] from kornia and OpenCV in float64 up to ``SAFE_ANGLE``; share of points
+    past 90 deg.
+    """
     points = Views(params, count, "cpu").points_c.double().reshape(-1, 3)
     angle = torch.atan2(points[:, :2].norm(dim=-1), points[:, 2])
     safe = points[angle < SAFE_ANGLE][None]
@@ -155,7 +175,10 @@ def accuracy(params: Any, count: int) -> dict[str, float]:
 def run(args: argparse.Namespace) -> int:
     """Measure the camera."""
     if args.environments < 1 or args.repeats < 1:
-        raise VisthrowError(f"--environments {args.environments}, --repeats {args.repeats}: expected positive numbers")
+        raise VisthrowError(
+            f"--environments {args.environments}, --repeats {args.repeats}: expected positive"
+            " numbers"
+        )
     from camera.params import CameraParams
     from visthrow.training.device import resolve
 
@@ -187,14 +210,21 @@ def measure(params: Any, count: int, device: str, repeats: int, stretch: float =
             for n, t in row.items()
         )
         where = "one CPU core" if place == "cpu" else device_name(place)
-        tables.append(Table(f"{count:,} environments, {count * KEYPOINTS:,} points, {where}", header, cells))
+        tables.append(
+            Table(f"{count:,} environments, {count * KEYPOINTS:,} points, {where}", header, cells)
+        )
     notes = (
-        "Keypoints are the whole function of the training environment: frames, the ball's outline, projection, its box "
-        "and validity. The other rows only project as many ready points. float32, medians.",
-        f"In float64 our pixels differ from kornia's by at most {exact['kornia_px']:.1e} px and from OpenCV's by "
-        f"{exact['opencv_px']:.1e} px below {math.degrees(SAFE_ANGLE):.0f} deg off the axis. "
-        f"{100 * exact['past_90_deg']:.0f} % of these points lie past 90 deg, where both mirror them "
-        "into the image without a flag; ours projects them.",
+        (
+            "Keypoints are the whole function of the training environment: frames, the ball's"
+            " outline, projection, its box and validity. The other rows only project as many ready"
+            " points. float32, medians."
+        ),
+        (
+            f"In float64 our pixels differ from kornia's by at most {exact['kornia_px']:.1e} px and"
+            f" from OpenCV's by {exact['opencv_px']:.1e} px below {math.degrees(SAFE_ANGLE):.0f}"
+            f" deg off the axis. {100 * exact['past_90_deg']:.0f} % of these points lie past 90"
+            " deg, where both mirror them into the image without a flag; ours projects them."
+        ),
     )
     figures = {
         "environments": count,
@@ -219,8 +249,16 @@ _LABELS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__)
-    parser.add_argument("--environments", type=int, default=16384, metavar="N", help="batch size (default: 16384)")
-    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)")
+    parser.add_argument(
+        "--environments", type=int, default=16384, metavar="N", help="batch size (default: 16384)"
+    )
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=5,
+        metavar="N",
+        help="measurements; the median counts (default: 5)",
+    )
     add_common(parser, json=False)
     return start.main(parser, run, argv)
 

@@ -10,10 +10,14 @@ KINDS = {
     "hover": "hover thrust within 10 %, body rates within 0.5 rad/s",
     "full": "thrust and body rates anywhere within the policy's limits",
 }
-"""Every command is drawn anew for each environment and control period, so that neighbours take different branches."""
+"""Every command is drawn anew for each environment and control period, so that neighbours take
+different branches.
+"""
 
 
-def draw(kind: str, plant: PlantParams, limits: ActionParams, steps: int, count: int, seed: int = 0) -> np.ndarray:
+def draw(
+    kind: str, plant: PlantParams, limits: ActionParams, steps: int, count: int, seed: int = 0
+) -> np.ndarray:
     """Collective thrust [N] and body rates [rad/s], float32, shape (steps, count, 4)."""
     a = np.random.default_rng(seed).random((steps, count, 4), dtype=np.float32)
     a *= 2.0
@@ -29,6 +33,11 @@ def draw(kind: str, plant: PlantParams, limits: ActionParams, steps: int, count:
 
 
 def shares(sim: HybridSim) -> dict[str, float]:
-    """Shares of environments whose last control step fell back to the first stage somewhere, and that failed."""
+    """Shares of environments whose last control step fell back to the first stage somewhere, and
+    that failed.
+    """
     status = sim.get("status")
-    return {"fallback": float(np.mean((status & 2) != 0)), "failed": float(np.mean((status & 1) != 0))}
+    return {
+        "fallback": float(np.mean((status & 2) != 0)),
+        "failed": float(np.mean((status & 1) != 0)),
+    }

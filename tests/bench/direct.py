@@ -1,12 +1,13 @@
-"""The throw of the fake autopilot without a wire, a line of JSON a seed: what the wire costs is measured against it.
+"""The throw of the fake autopilot without a wire, a line of JSON a seed: what the wire costs is
+measured against it.
 
-Plant, start, motion capture, estimator and policy are those of a throw over the wire, with the same seeds; link, autopilot,
-state machine, processes and real time are left out; set-points act as late as the kind of autopilot lets them, which the estimator
-makes up for. Over the wire the runner's ticks and the motion capture know nothing of
-each other, so that at a tick the newest pose is as old as the latency and up to a period of the motion capture more. So here:
-the seed says by how many of the plant's periods ticks follow poses, and whether one that arrives at the instant of a tick is in
-time.
-"""
+Plant, start, motion capture, estimator and policy are those of a throw over the wire, with the same
+seeds; link, autopilot, state machine, processes and real time are left out; set-points act as late
+as the kind of autopilot lets them, which the estimator makes up for. Over the wire the runner's
+ticks and the motion capture know nothing of each other, so that at a tick the newest pose is as old
+as the latency and up to a period of the motion capture more. So here: the seed says by how many of
+the plant's periods ticks follow poses, and whether one that arrives at the instant of a tick is in
+time."""
 
 import argparse
 import json
@@ -33,8 +34,9 @@ from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy, find_policy
 
 SETTLED = 0.1
-"""What checks and arming take over the wire beyond the times that the configuration asks for [s]: 5 ticks. A throw that begins at
-the same time meets the same noise."""
+"""What checks and arming take over the wire beyond the times that the configuration asks for [s]: 5
+ticks. A throw that begins at the same time meets the same noise.
+"""
 
 MOST = 8.0  # after which a throw is given up [s]
 
@@ -44,19 +46,28 @@ OURS = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
 class Direct:
     """One vehicle, from poses to commands in one loop."""
 
-    def __init__(self, plant: WirePlant, policy: Policy, params: HilParams, mocap: MocapParams, seed: int) -> None:
-        """Begin at the plant's start, with a policy on the CPU and the run's estimator, autopilot and goal; ``seed``: of noise and loss."""
+    def __init__(
+        self, plant: WirePlant, policy: Policy, params: HilParams, mocap: MocapParams, seed: int
+    ) -> None:
+        """Begin at the plant's start, with a policy on the CPU and the run's estimator, autopilot
+        and goal; ``seed``: of noise and loss.
+        """
         self.plant, self.params = plant, params
         self.pilot = Pilot(policy, params.camera)
         self.mocap = Mocap(mocap, seed)
-        self._tracks = {body: Track(OURS, params.gate, params.estimate) for body in (VEHICLE, PAYLOAD)}
+        self._tracks = {
+            body: Track(OURS, params.gate, params.estimate) for body in (VEHICLE, PAYLOAD)
+        }
         share = round(1.0 / (mocap.rate * plant.period))
         draw = np.random.default_rng([seed, 1])
         self._phase, self._in_time = int(draw.integers(max(share, 1))), bool(draw.integers(2))
         self._aim = 0.5 * sum(policy.contract["observation"]["latency"])
         self._latency = mocap.latency
         states = params.states
-        self._taken, self._start = states.check_hold, states.check_hold + states.armed_least + SETTLED
+        self._taken, self._start = (
+            states.check_hold,
+            states.check_hold + states.armed_least + SETTLED,
+        )
         place = tuple(plant.state["pos_w"].astype(float).tolist())
         self._hover = Hovering(place, 0.0, plant.max_thrust, self.pilot.period)
         self._late = KINDS[params.backend].usual_delay if params.backend in KINDS else 0.0
@@ -66,19 +77,27 @@ class Direct:
     def _state(self, body: str, now: float) -> BodyState | None:
         track = self._tracks[body]
         age = track.gate.age(now) + self._latency
-        ahead = age - self._aim + self._late if self.params.delay.compensate and math.isfinite(age) else 0.0
+        ahead = (
+            age - self._aim + self._late
+            if self.params.delay.compensate and math.isfinite(age)
+            else 0.0
+        )
         return track.state(now, ahead)
 
     def _take(self) -> None:
         now = self.plant.time
         if self.mocap.due(now):
             self._coming.extend(self.mocap.measure(now, self.plant.state))
-        while self._coming and self._coming[0].arrival <= now + (SLACK if self._in_time else -SLACK):
+        while self._coming and self._coming[0].arrival <= now + (
+            SLACK if self._in_time else -SLACK
+        ):
             pose = self._coming.popleft()
             self._tracks[pose.body].update(pose)
 
     def throw(self) -> dict[str, Any]:
-        """Hover where the vehicle is, as in other hands, then at the hover point, throw, wait for the landing; its report."""
+        """Hover where the vehicle is, as in other hands, then at the hover point, throw, wait for
+        the landing; its report.
+        """
         latch, start = None, None
         tick = self._phase * self.plant.period
         level = np.array([self.plant.mass[0] * GRAVITY, 0.0, 0.0, 0.0])
@@ -106,7 +125,9 @@ class Direct:
         trips = after < self.plant.period - SLACK
         self.plant.step(level if command is None else command, trips, after if trips else 0.0)
 
-    def _decide(self, now: float, throwing: bool, latch: float | None) -> tuple[np.ndarray | None, bool]:
+    def _decide(
+        self, now: float, throwing: bool, latch: float | None
+    ) -> tuple[np.ndarray | None, bool]:
         vehicle, payload = self._state(VEHICLE, now), self._state(PAYLOAD, now)
         if vehicle is None or payload is None:
             return None, False
@@ -115,13 +136,18 @@ class Direct:
             if now >= self._taken:
                 self._hover.place_w = self.params.home_w
             return np.array(self._hover.command(vehicle, self.plant.mass[1 if apart else 0])), False
-        views = [np.array([v]) for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)]
+        views = [
+            np.array([v])
+            for v in (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate, payload.pos)
+        ]
         out = self.pilot.act(*views, np.array(self.params.goal_w), True)
         return out.command[0].astype(float), bool(out.release[0])
 
 
 def scored(report: dict[str, Any], params: HilParams, start: float | None) -> dict[str, Any]:
-    """Return the error [m] and duration [s] of a plant's true landing; both None where there is none."""
+    """Return the error [m] and duration [s] of a plant's true landing; both None where there is
+    none.
+    """
     landed, when = report["landing_w"], report["landing_time"]
     if landed is None:
         return {"error": None, "duration": None}
@@ -136,17 +162,36 @@ def run(args: argparse.Namespace) -> None:
     for seed in args.seeds:
         flown = load_plant(args.plant, args.policy or params.policy, seed)
         report = Direct(flown, policy, params, MocapParams(), seed).throw()
-        print(json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}), flush=True)
+        print(
+            json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}),
+            flush=True,
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__, record=False)
-    parser.add_argument("--config", metavar="NAME", default="fake", help="of configs/hil, or a file (default: fake)")
+    parser.add_argument(
+        "--config", metavar="NAME", default="fake", help="of configs/hil, or a file (default: fake)"
+    )
     parser.add_argument("--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[])
-    parser.add_argument("--seeds", metavar="N", type=int, nargs="+", default=[0], help="of starts, noise and loss; a throw each")
-    parser.add_argument("--policy", metavar="POLICY", help="whose plant is flown (default: the one that throws)")
-    parser.add_argument("--plant", metavar="MODULE:FUNCTION", default="visthrow.throws.wire_plant:make", help="that makes the vehicle")
+    parser.add_argument(
+        "--seeds",
+        metavar="N",
+        type=int,
+        nargs="+",
+        default=[0],
+        help="of starts, noise and loss; a throw each",
+    )
+    parser.add_argument(
+        "--policy", metavar="POLICY", help="whose plant is flown (default: the one that throws)"
+    )
+    parser.add_argument(
+        "--plant",
+        metavar="MODULE:FUNCTION",
+        default="visthrow.throws.wire_plant:make",
+        help="that makes the vehicle",
+    )
     return start.main(parser, run, argv)
 
 

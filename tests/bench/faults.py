@@ -1,4 +1,6 @@
-"""What the runner does when something fails, and after how long: each fault over UDP between two processes, in real time."""
+"""What the runner does when something fails, and after how long: each fault over UDP between two
+processes, in real time.
+"""
 
 import argparse
 import os
@@ -51,7 +53,13 @@ HUGE = 3e38
 FULL = 2_000
 """Bytes that a file may still grow by where the disk is full: a few ticks."""
 
-QUICK = {"states.check_hold": 0.2, "states.armed_least": 0.1, "states.quiet": 0.1, "states.abort": 0.5, "states.throw": 60.0}
+QUICK = {
+    "states.check_hold": 0.2,
+    "states.armed_least": 0.1,
+    "states.quiet": 0.1,
+    "states.abort": 0.5,
+    "states.throw": 60.0,
+}
 ODOMETRY = (
     'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
     '{ body = "payload", message = "ODOMETRY", system = 1, component = 25 }]'
@@ -69,10 +77,12 @@ class Case:
 
     Attributes:
         text: what happens. group: of the table. policy: of `POLICIES`.
-        run: settings of the run. fake: arguments of the fake. spoiled: name and time of a fault of its motion capture.
+        run: settings of the run. fake: arguments of the fake. spoiled: name and time of a fault of
+            its motion capture.
         act: done to the run's process in mid throw. since: what times count from: `START` on the
         vehicle's clock ("fault"), the deed ("act"), or the run's latch or first tick in a state.
-        refused: whether the run does not even start. ends: whether it is a way for the run to end, and so flown with any kind.
+        refused: whether the run does not even start. ends: whether it is a way for the run to end,
+            and so flown with any kind.
     """
 
     text: str
@@ -112,7 +122,9 @@ def _option(*settings: str) -> tuple[str, ...]:
 def _mocap(name: str, text: str) -> Case:
     odometry = name == "reset"
     more = _option("pose_message=ODOMETRY") if odometry else ()
-    return Case(text, MOCAP, run=(ODOMETRY,) if odometry else (), fake=more, spoiled=(name, str(START)))
+    return Case(
+        text, MOCAP, run=(ODOMETRY,) if odometry else (), fake=more, spoiled=(name, str(START))
+    )
 
 
 HERE = ("goal_w=[0.0, 0.0, 0.0]",)
@@ -124,9 +136,11 @@ def _answer(answer: str, text: str) -> Case:
 
 
 ENDS = {
-    "ctrl-c": ("Ctrl-C", signal.SIGINT), "sigterm": ("SIGTERM (systemd, timeout, shutdown)", signal.SIGTERM),
-    "sighup": ("SIGHUP (ssh is gone, the terminal closed)", signal.SIGHUP), "killed": ("the runner is killed (SIGKILL)", signal.SIGKILL),
-}  # fmt: skip
+    "ctrl-c": ("Ctrl-C", signal.SIGINT),
+    "sigterm": ("SIGTERM (systemd, timeout, shutdown)", signal.SIGTERM),
+    "sighup": ("SIGHUP (ssh is gone, the terminal closed)", signal.SIGHUP),
+    "killed": ("the runner is killed (SIGKILL)", signal.SIGKILL),
+}
 """Ways for a run to be ended from outside, and the signals."""
 
 HOVERS = ("states.armed_least=9.0",)
@@ -145,27 +159,50 @@ def _twice(folder: Path, pid: int, speed: float) -> None:
 
 CASES = {
     "silent": Case("the autopilot falls silent", AUTOPILOT, fake=_option(f"silent_after={START}")),
-    "taken": Case("the pilot takes the vehicle into another mode", AUTOPILOT, fake=_option(f"taken_after={START}")),
-    "not-armed": Case("it is not armed, nor is the runner to arm it", AUTOPILOT, run=("states.idle=1.5",),
-                      fake=_option("armed=false"), since="idle"),
-    "no-arming": Case("it refuses to arm", AUTOPILOT, run=("ardupilot.arm=true",),
-                      fake=_option("armed=false", "arming=false"), since="ready"),
+    "taken": Case(
+        "the pilot takes the vehicle into another mode",
+        AUTOPILOT,
+        fake=_option(f"taken_after={START}"),
+    ),
+    "not-armed": Case(
+        "it is not armed, nor is the runner to arm it",
+        AUTOPILOT,
+        run=("states.idle=1.5",),
+        fake=_option("armed=false"),
+        since="idle",
+    ),
+    "no-arming": Case(
+        "it refuses to arm",
+        AUTOPILOT,
+        run=("ardupilot.arm=true",),
+        fake=_option("armed=false", "arming=false"),
+        since="ready",
+    ),
     "stuck": _answer("stuck", "the release is acknowledged, and nothing moves"),
     "in-progress": _answer("in-progress", "the release stays IN_PROGRESS for ever"),
     "no-answer": _answer("silent", "the release is not answered"),
     "denied": _answer("denied", "the release is denied"),
-    "slow-mechanism": Case("the mechanism is slower than the one trained with, 0.15 s", AUTOPILOT,
-                           run=("ardupilot.mechanism_lag=0.15",), refused=True),
+    "slow-mechanism": Case(
+        "the mechanism is slower than the one trained with, 0.15 s",
+        AUTOPILOT,
+        run=("ardupilot.mechanism_lag=0.15",),
+        refused=True,
+    ),
     "no-numbers": Case("the policy puts out no numbers", OWN, "no numbers", since="throw"),
-    "limits": Case("the policy puts out all that it may, thrust and rates", OWN, "limits", since="throw"),
+    "limits": Case(
+        "the policy puts out all that it may, thrust and rates", OWN, "limits", since="throw"
+    ),
     "late": Case("a tick is 0.15 s late", OWN, act=_pause(0.15), since="act"),
     "very-late": Case("a tick is 0.8 s late", OWN, act=_pause(0.8), since="act"),
     "disk-full": Case("the disk is full", OWN, act=_fill_disk, since="act"),
     **{name: _ending(text, number) for name, (text, number) in ENDS.items()},
-    **{f"{name}-in-hover": _ending(f"{text}, in hover", number, HOVERS) for name, (text, number) in ENDS.items()},
+    **{
+        f"{name}-in-hover": _ending(f"{text}, in hover", number, HOVERS)
+        for name, (text, number) in ENDS.items()
+    },
     "ctrl-c-twice": Case("Ctrl-C twice", OWN, act=_twice, since="act", ends=True),
     "time-over": Case("the time of --seconds is over", OWN, since="time", ends=True),
-}  # fmt: skip
+}
 
 
 def known_cases() -> dict[str, Case]:
@@ -185,8 +222,11 @@ def policies(folder: Path) -> dict[str, Path]:
     wide = contract["observation"]["dimension"]
     for name, action in same.items():
         made[name] = folder / f"{name.replace(' ', '-')}.npz"
-        Policy((torch.zeros(len(action), wide),), (torch.tensor(action),), "relu", contract).save(made[name])
-    # Of finite weights, as the loader asks for, and without a finite output: infinity less infinity.
+        Policy((torch.zeros(len(action), wide),), (torch.tensor(action),), "relu", contract).save(
+            made[name]
+        )
+    # Of finite weights, as the loader asks for, and without a finite output: infinity less
+    # infinity.
     weights = torch.zeros(2, wide), torch.tensor([[10.0, -10.0]] * contract["action"]["dimension"])
     biases = torch.full((2,), HUGE), torch.zeros(contract["action"]["dimension"])
     made["no numbers"] = folder / "no-numbers.npz"
@@ -195,7 +235,9 @@ def policies(folder: Path) -> dict[str, Path]:
 
 
 class Deed:
-    """Does something to the run's process, `START` after its first pose; the times are of the run's clock [s]."""
+    """Does something to the run's process, `START` after its first pose; the times are of the run's
+    clock [s].
+    """
 
     def __init__(self, act: Act, folder: Path, speed: float) -> None:
         """Wait to be called; see `Pair.fly`."""
@@ -226,7 +268,9 @@ def faults(args: argparse.Namespace) -> Report:
     if args.kind not in CONFIGS:
         raise VisthrowError(f"--kind {args.kind}; {suggest(args.kind, CONFIGS)}")
     if not (args.jobs >= 1 and 0.05 <= args.speed <= 1.0):
-        raise VisthrowError(f"--jobs {args.jobs}, --speed {args.speed}; expected 1 or more, and 0.05 to 1")
+        raise VisthrowError(
+            f"--jobs {args.jobs}, --speed {args.speed}; expected 1 or more, and 0.05 to 1"
+        )
     cases = known_cases()
     for name in args.faults:
         if name not in cases:
@@ -237,32 +281,59 @@ def faults(args: argparse.Namespace) -> Report:
         made = policies(Path(folder))
 
         def inject(name: str, cores: tuple[int | None, int | None]) -> tuple[str, dict[str, Any]]:
-            return name, _one(cases[name], made[cases[name].policy], Path(folder) / name, cores, args.speed, args.kind)
+            return name, _one(
+                cases[name],
+                made[cases[name].policy],
+                Path(folder) / name,
+                cores,
+                args.speed,
+                args.kind,
+            )
 
         flown = {name for name in cases if args.kind == "ardupilot" or cases[name].ends}
         odd = [name for name in args.faults if name not in flown]
         if odd:
-            raise VisthrowError(f"--kind {args.kind} with {', '.join(odd)}; expected {', '.join(sorted(flown))}")
+            raise VisthrowError(
+                f"--kind {args.kind} with {', '.join(odd)}; expected {', '.join(sorted(flown))}"
+            )
         names = [name for name in cases if name in (args.faults or flown)]
         done = dict(_announced(side_by_side(inject, names, own_cores(args.jobs))))
         for name in names:
             case, found = cases[name], done[name]
             figures[name] = found
             row = (name, case.text, _told(found["states"]), _told(found["events"]) or "-")
-            counts = tuple(str(found[key]) for key in ("missed", "commands", "releases")) + (str(len(found["breaches"])),)
+            counts = tuple(str(found[key]) for key in ("missed", "commands", "releases")) + (
+                str(len(found["breaches"])),
+            )
             rows.setdefault(case.group, []).append((*row, *counts))
     notes = (
-        f"each fault begins in mid throw, {START:g} s after the first pose, of a policy that never releases, but where the "
-        "release itself is what fails; times count from the first pose that the fault spoiled, from when it happened, from "
-        "the latch, or from the first tick of the throw",
-        "a breach is a command that is not finite or beyond the limits of training, or a release that was not armed, was outside "
-        "of the fence or came twice, as seen by the vehicle",
+        (
+            f"each fault begins in mid throw, {START:g} s after the first pose, of a policy that"
+            " never releases, but where the release itself is what fails; times count from the"
+            " first pose that the fault spoiled, from when it happened, from the latch, or from"
+            " the first tick of the throw"
+        ),
+        (
+            "a breach is a command that is not finite or beyond the limits of training, or a"
+            " release that was not armed, was outside of the fence or came twice, as seen by the"
+            " vehicle"
+        ),
     )
     if args.speed < 1.0:
         notes += (f"both clocks ran at {args.speed:g} of real time, and all times are theirs",)
-    header = ("fault", "what happens", "what the runner did", "what the vehicle did", "missed ticks", "commands", "releases",
-              "breaches")  # fmt: skip
-    tables = tuple(Table(f"{group}, over UDP", header, tuple(lines)) for group, lines in rows.items())
+    header = (
+        "fault",
+        "what happens",
+        "what the runner did",
+        "what the vehicle did",
+        "missed ticks",
+        "commands",
+        "releases",
+        "breaches",
+    )
+    tables = tuple(
+        Table(f"{group}, over UDP", header, tuple(lines)) for group, lines in rows.items()
+    )
     return Report("hil", "What the runner does when something fails", tables, notes, figures)
 
 
@@ -277,8 +348,13 @@ def _told(steps: list[dict[str, Any]]) -> str:
 
 
 def _one(
-    case: Case, policy: Path, folder: Path, cores: tuple[int | None, int | None], speed: float, kind: str
-) -> dict[str, Any]:  # fmt: skip
+    case: Case,
+    policy: Path,
+    folder: Path,
+    cores: tuple[int | None, int | None],
+    speed: float,
+    kind: str,
+) -> dict[str, Any]:
     length, clock = LENGTHS[case.group], ("--speed", str(speed))
     run = [*clock, "--set", f'policy="{policy}"']
     for setting in (*(f"{key}={value}" for key, value in QUICK.items()), *case.run):
@@ -289,29 +365,52 @@ def _one(
         run += ["--seconds", str(ENOUGH)]
     deed = None if case.act is None else Deed(case.act, folder, speed)
     try:
-        summary, report = Pair(tuple(run), fake, *cores, kind=kind, spoiled=case.spoiled).fly(folder, deed, alone=True)
+        summary, report = Pair(tuple(run), fake, *cores, kind=kind, spoiled=case.spoiled).fly(
+            folder, deed, alone=True
+        )
     except VisthrowError as error:
         if not case.refused:
             raise
-        said = str(error).strip().splitlines()[0].removeprefix("the run did not start: visthrow: error: ")
-        return {"began_in": None, "states": [{"what": f"refused: {said}", "after": 0.0}], "events": [], "missed": 0, "commands": 0,
-                "releases": 0, "breaches": []}  # fmt: skip
+        said = (
+            str(error)
+            .strip()
+            .splitlines()[0]
+            .removeprefix("the run did not start: visthrow: error: ")
+        )
+        return {
+            "began_in": None,
+            "states": [{"what": f"refused: {said}", "after": 0.0}],
+            "events": [],
+            "missed": 0,
+            "commands": 0,
+            "releases": 0,
+            "breaches": [],
+        }
     ticks = json_lines(folder / "ticks.jsonl")
     offset = _offset(folder)
     begin = _begin(case, summary, ticks, offset, deed)
     last = early + START + length - 0.1 + offset  # then the fake goes, which is none of these
-    began_in = before = next((tick["state"] for tick in reversed(ticks) if tick["time"] < begin), None)
+    began_in = before = next(
+        (tick["state"] for tick in reversed(ticks) if tick["time"] < begin), None
+    )
     states = []
     for tick in ticks:
         if begin <= tick["time"] < last and tick["state"] != before:
             before = tick["state"]
             states.append({"what": f"{before} ({tick['reason']})", "after": tick["time"] - begin})
-    events = [{"what": text, "after": at + offset - LATENCY - begin} for at, text in report["events"]]
+    events = [
+        {"what": text, "after": at + offset - LATENCY - begin} for at, text in report["events"]
+    ]
     return {
-        "began_in": began_in, "states": states, "events": [event for event in events if event["after"] > -0.02],
-        "missed": summary.get("missed", "?"), "summary": bool(summary), "commands": report["commands"], "releases": report["releases"],
+        "began_in": began_in,
+        "states": states,
+        "events": [event for event in events if event["after"] > -0.02],
+        "missed": summary.get("missed", "?"),
+        "summary": bool(summary),
+        "commands": report["commands"],
+        "releases": report["releases"],
         "breaches": report["breaches"],
-    }  # fmt: skip
+    }
 
 
 def _offset(folder: Path) -> float:

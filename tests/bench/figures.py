@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 
 
-def bootstrap_upper(ratio_of: np.ndarray, level: float = 0.9, draws: int = 20_000, seed: int = 0) -> tuple[float, float]:
-    """Ratio of the means of two columns of pairs, and the one-sided upper bound of it by drawing pairs anew.
+def bootstrap_upper(
+    ratio_of: np.ndarray, level: float = 0.9, draws: int = 20_000, seed: int = 0
+) -> tuple[float, float]:
+    """Ratio of the means of two columns of pairs, and the one-sided upper bound of it by drawing
+    pairs anew.
 
     Args:
         ratio_of: shape (N, 2).
@@ -23,7 +26,9 @@ def bootstrap_upper(ratio_of: np.ndarray, level: float = 0.9, draws: int = 20_00
 
 
 def json_lines(path: Path) -> list[dict[str, Any]]:
-    """Values of a file of lines; a last one that was cut short is left out, and so is a file that is not there."""
+    """Values of a file of lines; a last one that was cut short is left out, and so is a file that
+    is not there.
+    """
     found = []
     for row in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
         try:

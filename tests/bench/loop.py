@@ -1,14 +1,16 @@
-"""The loop closed: an effect hidden in the reference plant, flights, diagnosis, training in the extended model, flights again.
+"""The loop closed: an effect hidden in the reference plant, flights, diagnosis, training in the
+extended model, flights again.
 
-Every stage leaves a file in the folder of its effect and is skipped where the file is there, so a loop that was interrupted
-goes on; stages that do not need each other run side by side. Three policies meet on the same throws of the plant: the one
-that knew nothing, the one that was trained anew in the model extended by the diagnosis, and the oracle, trained in a model
-that has the hidden effect itself.
+Every stage leaves a file in the folder of its effect and is skipped where the file is there, so a
+loop that was interrupted goes on; stages that do not need each other run side by side. Three
+policies meet on the same throws of the plant: the one that knew nothing, the one that was trained
+anew in the model extended by the diagnosis, and the oracle, trained in a model that has the hidden
+effect itself.
 
-    python -m tests.bench.loop --hide motor_tau=0.02     a slower motor; minutes on a GPU, hours on a CPU
-    python -m tests.bench.loop --base state_no_motor_lag --policy runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1
-    python -m tests.bench.loop --show                    the committed loops
-    python -m tests.bench.loop --show runs/loop/* --picture loops.png
+    python -m tests.bench.loop --hide motor_tau=0.02     a slower motor; minutes on a GPU, hours on
+    a CPU python -m tests.bench.loop --base state_no_motor_lag --policy
+    runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1 python -m tests.bench.loop --show
+    the committed loops python -m tests.bench.loop --show runs/loop/* --picture loops.png
 """
 
 import argparse
@@ -51,7 +53,10 @@ BEFORE, AFTER = 1.5, 0.6
 """What is kept of a flight before the policy starts and after the landing [s]."""
 
 BATCH = 20
-"""Throws that share a process: of 200, ten cores fly each policy's at once. Other sizes would be other throws."""
+"""Throws that share a process: of 200, ten cores fly each policy's at once.
+
+Other sizes would be other throws.
+"""
 
 THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
@@ -63,7 +68,9 @@ WHO = ("before", "after", "oracle")
 """The policies that are compared."""
 
 POLICY, CHECKPOINT, SUMMARY = "policy.npz", "checkpoint.pt", "summary.json"
-"""Of a training's folder, as :mod:`visthrow.training.trainer` names them; that one is heavy to import."""
+"""Of a training's folder, as :mod:`visthrow.training.trainer` names them; that one is heavy to
+import.
+"""
 
 RECORD = "record.json"
 """What a finished loop leaves in its folder."""
@@ -83,7 +90,8 @@ class Loop:
         flights: to be diagnosed.
         throws: of each policy on the plant, in the end.
         target: of those throws, along x [m].
-        device: of the trainings; where the diagnosis names nothing or fails, there is none after it, and "after" is "before".
+        device: of the trainings; where the diagnosis names nothing or fails, there is none after
+            it, and "after" is "before".
         diagnose_on: device of the diagnosis.
         processes: for flights and throws.
         changes: ``key=value`` of the trainings, such as fewer iterations for a trial.
@@ -120,7 +128,9 @@ class Loop:
 
         def oracle() -> dict[str, Any]:
             timed("training of the oracle", self._train, "oracle")
-            return timed("throws of the oracle", self._throws, "oracle", str(self.folder / "oracle" / POLICY))
+            return timed(
+                "throws of the oracle", self._throws, "oracle", str(self.folder / "oracle" / POLICY)
+            )
 
         with concurrent.futures.ThreadPoolExecutor(3) as stages:
             knowing = stages.submit(oracle)
@@ -133,11 +143,23 @@ class Loop:
             if theta:
                 self._config("extended", extended(nominal, theta))
                 timed("training", self._train, "extended")
-                throws["after"] = timed("throws after", self._throws, "after", str(self.folder / "extended" / POLICY))
+                throws["after"] = timed(
+                    "throws after", self._throws, "after", str(self.folder / "extended" / POLICY)
+                )
             throws |= {"before": blind.result(), "oracle": knowing.result()}
             throws["after"] = throws["after"] or throws["before"]
-        record = {"base": self.base, "hidden": dict(self.hidden), "named": theta, "overall": verdict["overall"]}
-        record |= {"target": self.target, "flights": self.flights, "throws": throws, "seconds": seconds}
+        record = {
+            "base": self.base,
+            "hidden": dict(self.hidden),
+            "named": theta,
+            "overall": verdict["overall"],
+        }
+        record |= {
+            "target": self.target,
+            "flights": self.flights,
+            "throws": throws,
+            "seconds": seconds,
+        }
         record["recovered"] = recovered(throws)
         write_json(self.folder / RECORD, record)
         return record
@@ -152,7 +174,15 @@ class Loop:
         if (self.folder / name / SUMMARY).exists() or flown.exists():
             return
         source = self.folder / ("hidden.toml" if name == "oracle" else f"{name}.toml")
-        command = [sys.executable, "-m", "visthrow.cli", "train", str(source), "--out", str(self.folder / name)]
+        command = [
+            sys.executable,
+            "-m",
+            "visthrow.cli",
+            "train",
+            str(source),
+            "--out",
+            str(self.folder / name),
+        ]
         command += ["--device", self.device, "--seed", "1"]
         if (self.folder / name / CHECKPOINT).exists():
             command.append("--resume")
@@ -161,7 +191,9 @@ class Loop:
         for change in self.changes:
             command += ["--set", change]
         with (self.folder / f"{name}.log").open("w") as log:
-            status = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
+            status = subprocess.run(
+                command, stdout=log, stderr=subprocess.STDOUT, check=False
+            ).returncode
         if status != 0:
             tail = (self.folder / f"{name}.log").read_text()[-600:]
             raise DiagnoseError(f"the training '{name}' failed: {tail}")
@@ -169,7 +201,15 @@ class Loop:
 
     def _flights(self, truth: Experiment, say: Callable[[str], None]) -> list[Path]:
         """Throws of the policy at targets all around, on the plant with the hidden effect."""
-        return fly_all(self.folder / "flights", self.policy, self.base, truth, self.flights, self.processes, say)
+        return fly_all(
+            self.folder / "flights",
+            self.policy,
+            self.base,
+            truth,
+            self.flights,
+            self.processes,
+            say,
+        )
 
     def _diagnose(self, logs: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
         return explained(logs, self.base, self.folder / "verdict.json", self.diagnose_on, say)
@@ -187,7 +227,10 @@ class Loop:
             write_json(path, kept | {"success": np.asarray(result.success, dtype=bool).tolist()})
         found = json.loads(path.read_text())
         error = landed(found)
-        say(f"thrown: {name}, {len(error)} landed" + (f", {np.mean(error):.3f} m" if len(error) else ""))
+        say(
+            f"thrown: {name}, {len(error)} landed"
+            + (f", {np.mean(error):.3f} m" if len(error) else "")
+        )
         return found
 
 
@@ -200,12 +243,20 @@ def read(places: Sequence[Path] = ()) -> list[dict[str, Any]]:
     Raises:
         DiagnoseError: a folder without a record, or no committed ones.
     """
-    files = [place if place.suffix == ".json" else place / RECORD for place in places] or sorted(COMMITTED.glob("*.json"))
+    files = [place if place.suffix == ".json" else place / RECORD for place in places] or sorted(
+        COMMITTED.glob("*.json")
+    )
     if not files:
-        raise DiagnoseError(f"{COMMITTED}: no records of loops; name folders of loops that went round, runs/loop/motor_tau_0.02")
+        raise DiagnoseError(
+            f"{COMMITTED}: no records of loops; name folders of loops that went round,"
+            " runs/loop/motor_tau_0.02"
+        )
     for file in files:
         if not file.exists():
-            raise DiagnoseError(f"{file}: no such record; expected the folder of a loop that went round, runs/loop/motor_tau_0.02")
+            raise DiagnoseError(
+                f"{file}: no such record; expected the folder of a loop that went round,"
+                " runs/loop/motor_tau_0.02"
+            )
     return [json.loads(file.read_text()) for file in files]
 
 
@@ -215,10 +266,11 @@ def landed(throws: Mapping[str, Any]) -> np.ndarray:
 
 
 def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> dict[str, float]:
-    """Share of the landing error that the hidden effect costs which the diagnosis wins back, with its 95 % interval.
+    """Share of the landing error that the hidden effect costs which the diagnosis wins back, with
+    its 95 % interval.
 
-    ``(before - after) / (before - oracle)`` of the mean errors; bootstrap over throws, each policy by itself.
-    """
+    ``(before - after) / (before - oracle)`` of the mean errors; bootstrap over throws, each policy
+    by itself."""
     rng = np.random.default_rng(seed)
     errors = {name: landed(throws[name]) for name in WHO}
     if any(len(e) < 2 for e in errors.values()):
@@ -230,7 +282,11 @@ def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> di
 
     again = {n: e[rng.integers(0, len(e), (draws, len(e)))].mean(1) for n, e in errors.items()}
     low, high = np.quantile(share(again), [0.025, 0.975])
-    return {"share": float(share({n: e.mean() for n, e in errors.items()})), "low": float(low), "high": float(high)}
+    return {
+        "share": float(share({n: e.mean() for n, e in errors.items()})),
+        "low": float(low),
+        "high": float(high),
+    }
 
 
 def named(verdict: Mapping[str, Any]) -> dict[str, float]:
@@ -239,9 +295,17 @@ def named(verdict: Mapping[str, Any]) -> dict[str, float]:
 
 
 def fly_all(
-    folder: Path, policy: str, base: str, truth: Experiment, count: int, processes: int, say: Callable[[str], None]
+    folder: Path,
+    policy: str,
+    base: str,
+    truth: Experiment,
+    count: int,
+    processes: int,
+    say: Callable[[str], None],
 ) -> list[Path]:
-    """Fly a policy that was trained in ``base`` on the reference plant of ``truth``; flights that are there are not flown again."""
+    """Fly a policy that was trained in ``base`` on the reference plant of ``truth``; flights that
+    are there are not flown again.
+    """
     paths = [folder / f"flight_{i:02d}.npz" for i in range(count)]
     todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
     text = toml_text.dumps(config.to_dict(truth, defaults=False))
@@ -267,7 +331,9 @@ def explained(
 
 
 def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> None:
-    """Fly one throw of a policy that was trained in ``base``, by its number, and keep what was measured of it."""
+    """Fly one throw of a policy that was trained in ``base``, by its number, and keep what was
+    measured of it.
+    """
     number, path = flight
     shipped = load_policy(policy, base)
     truth = config.loads(Experiment, text, (), name="the hidden world")
@@ -278,13 +344,22 @@ def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> Non
 
 
 def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
-    """What motion capture and the radio's log would hold of a simulated flight: noisy poses, commands, nothing true."""
+    """What motion capture and the radio's log would hold of a simulated flight: noisy poses,
+    commands, nothing true.
+    """
     start = log.meta["times"]["policy_start"] - BEFORE
     end = log.meta["times"].get("landing", log.meta["times"]["end"])
-    channels = {name: _between(log[name], start, end + AFTER) for name in ("command", "release_command", "pos_w", "quat_wb")}
+    channels = {
+        name: _between(log[name], start, end + AFTER)
+        for name in ("command", "release_command", "pos_w", "quat_wb")
+    }
     channels["payload_pos_w"] = _between(log["payload_pos_w"], start, end)
-    seen = mocap.measured({name: channels[name].values for name in ("pos_w", "payload_pos_w", "quat_wb")}, NOISE, rng)
-    channels |= {name: dataclasses.replace(channels[name], values=values) for name, values in seen.items()}
+    seen = mocap.measured(
+        {name: channels[name].values for name in ("pos_w", "payload_pos_w", "quat_wb")}, NOISE, rng
+    )
+    channels |= {
+        name: dataclasses.replace(channels[name], values=values) for name, values in seen.items()
+    }
     return FlightLog(channels, {"policy": log.meta["policy"], "plant": log.meta["plant"]})
 
 
@@ -296,12 +371,17 @@ def _between(channel: Channel, start: float, end: float) -> Channel:
 def hidden_text(record: Mapping[str, Any]) -> str:
     """What was hidden from which model, in words for tables."""
     base = record.get("base", "state")
-    return ", ".join(f"{n} {v:+.4g}" for n, v in record["hidden"].items()) + ("" if base == "state" else f" ({base})")
+    return ", ".join(f"{n} {v:+.4g}" for n, v in record["hidden"].items()) + (
+        "" if base == "state" else f" ({base})"
+    )
 
 
 def table(records: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of loops: mean landing errors in millimetres with 95 % intervals."""
-    lines = ["| hidden | named | before [mm] | after [mm] | oracle [mm] | won back |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| hidden | named | before [mm] | after [mm] | oracle [mm] | won back |",
+        "|---|---|---|---|---|---|",
+    ]
     for r in records:
         found = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
         errors = {name: landed(throws) for name, throws in r["throws"].items()}
@@ -309,14 +389,20 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
         for name in WHO:
             count = f" ({len(errors[name])} of {len(r['throws'][name]['error'])} landed)"
             whole = len(errors[name]) == len(r["throws"][name]["error"])
-            told.append((statistics.mean(1e3 * errors[name]).text(0) if len(errors[name]) else "-") + ("" if whole else count))
+            told.append(
+                (statistics.mean(1e3 * errors[name]).text(0) if len(errors[name]) else "-")
+                + ("" if whole else count)
+            )
         share = r["recovered"]
         if share["share"] is None or np.isnan(share["share"]):  # JSON has no NaN
             won = "-"
         elif statistics.difference(errors["before"], errors["oracle"]).low <= 0.0:
             won = "nothing was lost"
         else:
-            won = f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
+            won = (
+                f"{100 * share['share']:.0f} % [{100 * share['low']:.0f},"
+                f" {100 * share['high']:.0f}]"
+            )
         lines.append(f"| {hidden_text(r)} | {found} | {' | '.join(told)} | {won} |")
     return "\n".join(lines)
 
@@ -348,24 +434,51 @@ def run(args: argparse.Namespace) -> None:
         try:
             hidden[name] = float(size)
         except ValueError:
-            raise ConfigError(f"--hide {item}; expected EFFECT=SIZE, such as motor_tau=0.02") from None
+            raise ConfigError(
+                f"--hide {item}; expected EFFECT=SIZE, such as motor_tau=0.02"
+            ) from None
     if not hidden:
-        raise ConfigError("nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --show")
+        raise ConfigError(
+            "nothing to hide; name an effect, such as --hide motor_tau=0.02, or say --show"
+        )
     parts = [f"{n}_{v:g}" for n, v in hidden.items()]
     folder = Path(args.out) / "-".join(parts if args.base == Loop.base else [args.base, *parts])
     record = Loop(
-        hidden, folder, args.base, args.policy, flights=args.flights, throws=args.throws, device=resolve(args.device),
-        diagnose_on=resolve(args.diagnose_on), processes=args.processes or cores(), changes=tuple(args.changes),
-    ).run(lambda line: print(f"  {line}", flush=True))  # fmt: skip
+        hidden,
+        folder,
+        args.base,
+        args.policy,
+        flights=args.flights,
+        throws=args.throws,
+        device=resolve(args.device),
+        diagnose_on=resolve(args.diagnose_on),
+        processes=args.processes or cores(),
+        changes=tuple(args.changes),
+    ).run(lambda line: print(f"  {line}", flush=True))
     print("\n" + table([record]))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what loops and ablations share."""
-    parser.add_argument("--policy", default=Loop.policy, metavar="NAME", help="shipped, or a file (default: state)")
-    parser.add_argument("--show", type=Path, nargs="*", metavar="FOLDER", help="run nothing, show these (default: those committed)")
-    parser.add_argument("--flights", type=int, default=Loop.flights, help="that are diagnosed (default: 12)")
-    parser.add_argument("--diagnose-on", default="cpu", metavar="NAME", help="device of the diagnosis (default: cpu)")
+    parser.add_argument(
+        "--policy", default=Loop.policy, metavar="NAME", help="shipped, or a file (default: state)"
+    )
+    parser.add_argument(
+        "--show",
+        type=Path,
+        nargs="*",
+        metavar="FOLDER",
+        help="run nothing, show these (default: those committed)",
+    )
+    parser.add_argument(
+        "--flights", type=int, default=Loop.flights, help="that are diagnosed (default: 12)"
+    )
+    parser.add_argument(
+        "--diagnose-on",
+        default="cpu",
+        metavar="NAME",
+        help="device of the diagnosis (default: cpu)",
+    )
     parser.add_argument("--out", default="runs/loop", metavar="FOLDER", help="(default: runs/loop)")
 
 
@@ -373,13 +486,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__, record=False)
     add_arguments(parser)
-    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT=SIZE", help="of the catalogue; may be repeated")
-    parser.add_argument("--base", default=Loop.base, metavar="NAME", help="of configs/train: what is diagnosed (default: state)")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="with --show: draw them, a PNG")
-    parser.add_argument("--throws", type=int, default=Loop.throws, help="of each policy in the end (default: 200)")
-    parser.add_argument("--processes", type=int, help="for flights and throws (default: one a core)")
+    parser.add_argument(
+        "--hide",
+        action="append",
+        default=[],
+        metavar="EFFECT=SIZE",
+        help="of the catalogue; may be repeated",
+    )
+    parser.add_argument(
+        "--base",
+        default=Loop.base,
+        metavar="NAME",
+        help="of configs/train: what is diagnosed (default: state)",
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help="with --show: draw them, a PNG"
+    )
+    parser.add_argument(
+        "--throws", type=int, default=Loop.throws, help="of each policy in the end (default: 200)"
+    )
+    parser.add_argument(
+        "--processes", type=int, help="for flights and throws (default: one a core)"
+    )
     parser.add_argument("--device", default="auto", metavar="NAME", help="of the trainings")
-    parser.add_argument("--set", action="append", default=[], dest="changes", metavar="KEY=VALUE", help="in the trainings")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="changes",
+        metavar="KEY=VALUE",
+        help="in the trainings",
+    )
     return start.main(parser, run, argv)
 
 

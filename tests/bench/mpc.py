@@ -43,7 +43,10 @@ def measure(experiment, throws: int, core: int | None = None) -> Report:
     rows, figures = [], []
     for target in TARGETS:
         unit = thrower.unit("hybrid", "both", target, throws)
-        plan = thrower.plan_of(experiment, *(unit[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds")))
+        plan = thrower.plan_of(
+            experiment,
+            *(unit[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds")),
+        )
         delays = fly.delays_of(experiment, "both")
         for plant, name in (("pendulum", "own model"), ("hybrid", "training simulator")):
             if plant == "pendulum":
@@ -53,32 +56,65 @@ def measure(experiment, throws: int, core: int | None = None) -> Report:
             times = 1e3 * flown.step_times
             off = 100.0 * flown.tracking[flown.success]
             figure = {
-                "target": target, "plant": plant, "steps": len(times), "p50_ms": float(np.percentile(times, 50)),
-                "p99_ms": float(np.percentile(times, 99)), "max_ms": float(times.max()),
-                "share_over_limit": float((times > LIMIT_MS).mean()), "landed": float(flown.success.mean()),
+                "target": target,
+                "plant": plant,
+                "steps": len(times),
+                "p50_ms": float(np.percentile(times, 50)),
+                "p99_ms": float(np.percentile(times, 99)),
+                "max_ms": float(times.max()),
+                "share_over_limit": float((times > LIMIT_MS).mean()),
+                "landed": float(flown.success.mean()),
                 "tracking_cm": float(off.mean()) if len(off) else None,
-            }  # fmt: skip
+            }
             figures.append(figure)
             cells = (f"{figure[key]:.2f}" for key in ("p50_ms", "p99_ms", "max_ms"))
             tracking = "-" if figure["tracking_cm"] is None else f"{figure['tracking_cm']:.1f}"
             rows.append((f"{target:g} m", name, str(len(times)), *cells, tracking))
-    head = ("target", "flown in", "steps", "p50 [ms]", "p99 [ms]", "longest [ms]", "off the plan, RMS [cm]")
+    head = (
+        "target",
+        "flown in",
+        "steps",
+        "p50 [ms]",
+        "p99 [ms]",
+        "longest [ms]",
+        "off the plan, RMS [cm]",
+    )
     notes = (
-        f"One step: linearise 62 stages, fill and solve the quadratic programme (piqp), move on; {throws} throws a row.",
-        "The programme is set up once, before the throw, and is not part of a step. On the training simulator all known delays "
-        "are made up for, by looking ahead; that is not part of a step either.",
-        f"Measured on one core{'' if core is None else f', number {core}'}; a step was to stay under {LIMIT_MS:g} ms at p99.",
+        (
+            "One step: linearise 62 stages, fill and solve the quadratic programme (piqp), move"
+            f" on; {throws} throws a row."
+        ),
+        (
+            "The programme is set up once, before the throw, and is not part of a step. On the"
+            " training simulator all known delays are made up for, by looking ahead; that is not"
+            " part of a step either."
+        ),
+        (
+            f"Measured on one core{'' if core is None else f', number {core}'}; a step was to stay"
+            f" under {LIMIT_MS:g} ms at p99."
+        ),
     )
     table = Table("Step times", head, tuple(rows))
-    return Report("mpc", "Step of the model-predictive controller", (table,), notes, {"rows": figures})
+    return Report(
+        "mpc", "Step of the model-predictive controller", (table,), notes, {"rows": figures}
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__)
-    parser.add_argument("--throws", type=int, default=10, metavar="N", help="a target and plant (default: 10)")
-    parser.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
-    parser.add_argument("--config", default="state", metavar="NAME", help="of configs/train: whose plant it is (default: state)")
+    parser.add_argument(
+        "--throws", type=int, default=10, metavar="N", help="a target and plant (default: 10)"
+    )
+    parser.add_argument(
+        "--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)"
+    )
+    parser.add_argument(
+        "--config",
+        default="state",
+        metavar="NAME",
+        help="of configs/train: whose plant it is (default: state)",
+    )
     add_common(parser, device=False, json=False)
     return start.main(parser, run, argv)
 

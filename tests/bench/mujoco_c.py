@@ -1,7 +1,7 @@
 """MuJoCo C on the rope of a scene, as fast as it goes: what the batched simulator is timed against.
 
-Contacts and constraints are off, nothing is recorded, and no Python runs within a stretch of ``mj_step``.
-"""
+Contacts and constraints are off, nothing is recorded, and no Python runs within a stretch of
+``mj_step``."""
 
 import dataclasses
 from collections.abc import Callable
@@ -30,7 +30,9 @@ class BenchScene:
     advance: Callable[[int], None]  # so many steps; starts the scene anew whenever it has ended
 
 
-def started(scene: Scene, step: float, integrator: str, armature: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def started(
+    scene: Scene, step: float, integrator: str, armature: float
+) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """MuJoCo's model and data at the start of a scene, whose first wrench acts throughout.
 
     Args:
@@ -38,13 +40,18 @@ def started(scene: Scene, step: float, integrator: str, armature: float) -> tupl
         step: [s]. integrator: RK4 or implicitfast. armature: of the hinges [kg m^2].
     """
     model = build_attached(*vehicle_and_rope(scene), "universal", armature)
-    model.opt.timestep, model.opt.integrator = step, getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    model.opt.timestep, model.opt.integrator = (
+        step,
+        getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"),
+    )
     data, first = initial_data(model, scene), scene.schedule[0]
     data.ctrl[:] = (*first.force_b, *first.torque_b)
     return model, data
 
 
-def timed_scene(scene: Scene, name: str, step: float, integrator: str = "RK4", armature: float = 0.0) -> BenchScene:
+def timed_scene(
+    scene: Scene, name: str, step: float, integrator: str = "RK4", armature: float = 0.0
+) -> BenchScene:
     """A rope that runs in C; arguments as of :func:`started`."""
     model, data = started(scene, step, integrator, armature)
     start = data.qpos.copy(), data.qvel.copy()

@@ -1,4 +1,6 @@
-"""MuJoCo Warp on the rope of the hard throw: implicitfast with armature at 2 ms, from a CUDA graph."""
+"""MuJoCo Warp on the rope of the hard throw: implicitfast with armature at 2 ms, from a
+CUDA graph.
+"""
 
 import importlib
 import statistics
@@ -22,7 +24,9 @@ MISSING = (
 def _model() -> tuple[Any, Any]:
     from tests.bench import mujoco_c
 
-    return mujoco_c.started(mujoco_c.HARD_THROW, mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE)
+    return mujoco_c.started(
+        mujoco_c.HARD_THROW, mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE
+    )
 
 
 class Worlds:
@@ -59,7 +63,9 @@ class Worlds:
         return self.count * SUBSTEPS * replays / (time.perf_counter() - start)
 
     def off_from_c(self, replays: int) -> float:
-        """Distance [m] of world 0's vehicle from MuJoCo C's after as many steps: the same model was measured."""
+        """Distance [m] of world 0's vehicle from MuJoCo C's after as many steps: the same model was
+        measured.
+        """
         import mujoco
 
         self.rate(replays)
@@ -69,7 +75,11 @@ class Worlds:
 
 
 def measure(
-    device: str, repeats: int, control_period: float, batches: tuple[int, ...] = BATCHES, stretch: int = STRETCH
+    device: str,
+    repeats: int,
+    control_period: float,
+    batches: tuple[int, ...] = BATCHES,
+    stretch: int = STRETCH,
 ) -> dict[str, Any]:
     """Median rates over batch sizes; only ``why_not`` where a package is missing."""
     for package in ("mujoco", "mujoco_warp"):
@@ -85,7 +95,14 @@ def measure(
         off = worlds.off_from_c(min(stretch, 5))
         rates = [worlds.rate(stretch) for _ in range(repeats)]
         best = statistics.median(rates)
-        rows.append({"batch": count, "substeps_per_s": best, "env_steps_per_s": best / substeps, "runs": rates})
+        rows.append(
+            {
+                "batch": count,
+                "substeps_per_s": best,
+                "env_steps_per_s": best / substeps,
+                "runs": rates,
+            }
+        )
         del worlds
     return {
         "rows": rows,
@@ -97,6 +114,9 @@ def measure(
 
 def table(found: dict[str, Any]) -> Table:
     """Printed form of :func:`measure`."""
-    cells = [(f"{r['batch']:,}", rate(r["substeps_per_s"]), rate(r["env_steps_per_s"])) for r in found["rows"]]
+    cells = [
+        (f"{r['batch']:,}", rate(r["substeps_per_s"]), rate(r["env_steps_per_s"]))
+        for r in found["rows"]
+    ]
     title = f"MuJoCo Warp, bare rope, implicitfast with armature, {found['step_s'] * 1e3:g} ms"
     return Table(title, ("worlds", "substeps/s", "env-steps/s"), tuple(cells))

@@ -1,4 +1,6 @@
-"""Runs and fakes as processes of their own: what is measured is what is flown, the command itself."""
+"""Runs and fakes as processes of their own: what is measured is what is flown, the
+command itself.
+"""
 
 import contextlib
 import json
@@ -33,7 +35,9 @@ _giving = threading.Lock()
 
 
 def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    """A port of this machine, UDP or TCP, that nobody listens on, and that this process was not given before."""
+    """A port of this machine, UDP or TCP, that nobody listens on, and that this process was not
+    given before.
+    """
     with _giving:
         while True:
             with socket.socket(socket.AF_INET, kind) as probe:
@@ -45,15 +49,20 @@ def free_port(kind: int = socket.SOCK_DGRAM) -> int:
 
 
 def own_cores(jobs: int) -> list[tuple[int | None, int | None]]:
-    """Cores of run and fake for each of so many pairs at once; None where there are too few for two each and one to spare."""
+    """Cores of run and fake for each of so many pairs at once; None where there are too few for two
+    each and one to spare.
+    """
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     if len(usable) <= 2 * jobs:
         return [(None, None)] * jobs
     return [(usable[2 * job], usable[2 * job + 1]) for job in range(jobs)]
 
 
-def side_by_side(what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]) -> Iterator[Any]:
-    """Yield what is made of each item in a thread, as they are done; as many at once as there are places, one a place.
+def side_by_side(
+    what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]
+) -> Iterator[Any]:
+    """Yield what is made of each item in a thread, as they are done; as many at once as there are
+    places, one a place.
 
     After an error nothing more is begun.
     """
@@ -101,17 +110,51 @@ class Pair:
             alone: the fake flies on to its end where the run has ended, or was killed, before.
 
         Returns:
-            The run's summary, with whether it was ``interrupted``, empty where it was killed, and the fake's report.
+            The run's summary, with whether it was ``interrupted``, empty where it was killed, and
+            the fake's report.
 
         Raises:
-            VisthrowError: one of them did not start, or did not end; the message holds what it said.
+            VisthrowError: one of them did not start, or did not end; the message holds what it
+                said.
         """
-        port, msp, report = free_port(), free_port(socket.SOCK_STREAM), folder.with_suffix(".fake.json")
+        port, msp, report = (
+            free_port(),
+            free_port(socket.SOCK_STREAM),
+            folder.with_suffix(".fake.json"),
+        )
         folder.parent.mkdir(parents=True, exist_ok=True)
-        run = [*COMMAND, "run", "--config", CONFIGS[self.kind], "--set", f'link.device="udp:127.0.0.1:{port}"', "--auto-arm", "--bare"]
-        run += ["--set", f'betaflight.device="tcp:127.0.0.1:{msp}"', "--out", str(folder), *self.run]
-        command = [sys.executable, "-m", "tests.mocap_faults", *self.spoiled, "hil"] if self.spoiled else COMMAND
-        fake = [*command, "fake", "--kind", self.kind, "--device", f"udpout:127.0.0.1:{port}", "--msp-port", str(msp)]
+        run = [
+            *COMMAND,
+            "run",
+            "--config",
+            CONFIGS[self.kind],
+            "--set",
+            f'link.device="udp:127.0.0.1:{port}"',
+            "--auto-arm",
+            "--bare",
+        ]
+        run += [
+            "--set",
+            f'betaflight.device="tcp:127.0.0.1:{msp}"',
+            "--out",
+            str(folder),
+            *self.run,
+        ]
+        command = (
+            [sys.executable, "-m", "tests.mocap_faults", *self.spoiled, "hil"]
+            if self.spoiled
+            else COMMAND
+        )
+        fake = [
+            *command,
+            "fake",
+            "--kind",
+            self.kind,
+            "--device",
+            f"udpout:127.0.0.1:{port}",
+            "--msp-port",
+            str(msp),
+        ]
         fake += ["--out", str(report), *self.fake]
         with contextlib.ExitStack() as both:
             if self.kind == "betaflight":
@@ -124,15 +167,25 @@ class Pair:
             interrupted = self._until(other, watch, runner, alone)
             killed = _end(runner, said, alone)
         try:
-            summary = {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            summary = (
+                {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            )
             summary |= {} if killed else {"interrupted": interrupted}
             return summary, json.loads(report.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise VisthrowError(f"a process of the pair ended without its report: {error}") from error
+            raise VisthrowError(
+                f"a process of the pair ended without its report: {error}"
+            ) from error
         finally:
             report.unlink(missing_ok=True)
 
-    def _until(self, fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> bool:
+    def _until(
+        self,
+        fake: subprocess.Popen,
+        watch: Callable[[int], None] | None,
+        runner: subprocess.Popen,
+        alone: bool,
+    ) -> bool:
         """Wait for the fake's end; whether Ctrl-C brought it about."""
         try:
             _until(fake, watch, runner, alone)
@@ -148,9 +201,13 @@ class Pair:
     def _started(self, command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
         quiet = subprocess.DEVNULL
         process = subprocess.Popen(
-            command, stdin=quiet, stdout=quiet, stderr=subprocess.PIPE, text=True,
+            command,
+            stdin=quiet,
+            stdout=quiet,
+            stderr=subprocess.PIPE,
+            text=True,
             start_new_session=self.orderly,  # the terminal's Ctrl-C is for us alone
-        )  # fmt: skip
+        )
         try:
             if core is not None:  # long before it has threads
                 os.sched_setaffinity(process.pid, {core})
@@ -169,7 +226,12 @@ def _first_line(process: subprocess.Popen, expected: str) -> str:
     return line
 
 
-def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: subprocess.Popen, alone: bool) -> None:
+def _until(
+    fake: subprocess.Popen,
+    watch: Callable[[int], None] | None,
+    runner: subprocess.Popen,
+    alone: bool,
+) -> None:
     while fake.poll() is None:
         gone = runner.poll() is not None
         if gone and not alone:  # aborted, say: the fake tells what it has seen
@@ -185,17 +247,22 @@ def _until(fake: subprocess.Popen, watch: Callable[[int], None] | None, runner: 
 
 
 def _end(runner: subprocess.Popen, said: str, alone: bool) -> bool:
-    """The fake is gone; what is still flying is told to stop. Whether the run had been killed, which it may where it was left
-    alone."""
+    """The fake is gone; what is still flying is told to stop.
+
+    Whether the run had been killed, which it may where it was left alone.
+    """
     if runner.poll() is None:
         runner.send_signal(signal.SIGINT)
     try:
         _, text = runner.communicate(timeout=ENDED)
     except subprocess.TimeoutExpired as error:
-        raise VisthrowError(f"the run did not end within {ENDED:g} s after it was told to: {said}") from error
+        raise VisthrowError(
+            f"the run did not end within {ENDED:g} s after it was told to: {said}"
+        ) from error
     if alone and runner.returncode == -signal.SIGKILL:
         return True
-    # 1: aborted, as it was told; interrupted: it had just ended by itself as the signal came. Its summary tells the rest.
+    # 1: aborted, as it was told; interrupted: it had just ended by itself as the signal came. Its
+    # summary tells the rest.
     if runner.returncode not in (0, 1, EXIT_INTERRUPTED, -signal.SIGINT):
         raise VisthrowError(f"the run failed with status {runner.returncode}: {text}")
     return False

@@ -1,7 +1,8 @@
-"""How policies let go: ball and vehicle at the separation and the cable's shape, where they were trained and on the full plant.
+"""How policies let go: ball and vehicle at the separation and the cable's shape, where they were
+trained and on the full plant.
 
-Tells why a component of the simulator matters or does not: a policy trained without it reaches another release state on the
-full plant, or the same.
+Tells why a component of the simulator matters or does not: a policy trained without it reaches
+another release state on the full plant, or the same.
 
     python -m tests.bench.releases paper --units state-1,state_rigid_cable-1    at 2 m
 """
@@ -40,8 +41,8 @@ class Releases:
         ball_w, ball_vel_w: of the payload then [m], [m/s], shape (N, 3).
         vehicle_w: [m], shape (N, 3).
         landing_w: [m], shape (N, 3).
-        bow: greatest distance of a joint of the cable from the straight line between its ends while the payload hung
-            on it [m], shape (N,).
+        bow: greatest distance of a joint of the cable from the straight line between its ends while
+            the payload hung on it [m], shape (N,).
         slack: greatest shortening of that line against the cable's length [m], shape (N,).
     """
 
@@ -85,7 +86,12 @@ class _Watched(ThrowEnv):
         self.bow = torch.where(hanging, torch.maximum(self.bow, off), self.bow)
         self.slack = torch.where(hanging, torch.maximum(self.slack, lengths - chord), self.slack)
         gone = self.open & self.last["released"]
-        found = {"ball": "payload_pos_w", "vel": "payload_vel_w", "vehicle": "release_pos_w", "landing": "landing_w"}
+        found = {
+            "ball": "payload_pos_w",
+            "vel": "payload_vel_w",
+            "vehicle": "release_pos_w",
+            "landing": "landing_w",
+        }
         for name, field in found.items():
             self.kept[name] = torch.where(gone[:, None], out[field], self.kept[name])
         time = self.last["duration"] - out["time_to_impact"]
@@ -109,9 +115,19 @@ def releases(loaded: Loaded, target: float, count: int, device: str, seed: int =
         built.append(_Watched(*args))
         return built[0]
 
-    throw(loaded.experiment, loaded.policy.to(device).actor(count), target, count, device, seed, build)
+    throw(
+        loaded.experiment, loaded.policy.to(device).actor(count), target, count, device, seed, build
+    )
     env = built[0]
-    parts = (env.time, env.kept["ball"], env.kept["vel"], env.kept["vehicle"], env.kept["landing"], env.bow, env.slack)
+    parts = (
+        env.time,
+        env.kept["ball"],
+        env.kept["vel"],
+        env.kept["vehicle"],
+        env.kept["landing"],
+        env.bow,
+        env.slack,
+    )
     return Releases(*(part.cpu().numpy().astype(float) for part in parts))
 
 
@@ -121,21 +137,25 @@ def row(name: str, where: str, found: Releases) -> str:
     ball, vel, vehicle, landing = (np.nanmean(point, axis=0) for point in points)
     bow, slack = 1e3 * found.bow, 1e3 * found.slack
     return (
-        f"| {name} | {where} | {np.nanmean(found.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m | {vel[0]:.2f}, {vel[2]:.2f} m/s "
-        f"| {vehicle[0]:.3f}, {vehicle[2]:.3f} m | {landing[0]:.3f} m | {bow.mean():.1f}, {bow.max():.1f} mm "
-        f"| {slack.mean():.1f}, {slack.max():.1f} mm |"
+        f"| {name} | {where} | {np.nanmean(found.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m |"
+        f" {vel[0]:.2f}, {vel[2]:.2f} m/s | {vehicle[0]:.3f}, {vehicle[2]:.3f} m | {landing[0]:.3f}"
+        f" m | {bow.mean():.1f}, {bow.max():.1f} mm | {slack.mean():.1f}, {slack.max():.1f} mm |"
     )
 
 
 HEAD = (
-    "| policy | flown in | separation | ball x, z | its velocity x, z | vehicle x, z | landing x | cable off straight, mean, most "
-    "| shorter, mean, most |\n|---|---|---|---|---|---|---|---|---|"
+    "| policy | flown in | separation | ball x, z | its velocity x, z | vehicle x, z | landing x |"
+    " cable off straight, mean, most | shorter, mean, most |\n|---|---|---|---|---|---|---|---|---|"
 )
 
 
 def run(args: argparse.Namespace) -> None:
     """Throw with the policies of a list, where they were trained and on the full plant."""
-    work, out, device = load_list(args.list, tuple(args.overrides)), Path(args.out), resolve(args.device)
+    work, out, device = (
+        load_list(args.list, tuple(args.overrides)),
+        Path(args.out),
+        resolve(args.device),
+    )
     known = {source.name: source for source in work.sources if source.config and source.done(out)}
     print(HEAD)
     for name in (args.units or ",".join(known)).split(","):
@@ -144,7 +164,10 @@ def run(args: argparse.Namespace) -> None:
         source = known[name]
         layout = source.experiment().task.observation.layout
         vehicle = ("vehicle", "rope", "release", "observation.latency")
-        for where, config_name, changes in (("its own", source.config, source.changes), ("the full", layout, ())):
+        for where, config_name, changes in (
+            ("its own", source.config, source.changes),
+            ("the full", layout, ()),
+        ):
             if where == "its own" or source.config != layout:
                 loaded = load_policy(source.policy(out), config_name, changes, vehicle)
                 print(row(name, where, releases(loaded, TARGET, COUNT, device)), flush=True)
@@ -153,9 +176,20 @@ def run(args: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = start.parser_of(__doc__, record=False)
-    parser.add_argument("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
-    parser.add_argument("--units", metavar="NAMES", help="which, with commas between (default: all that are trained)")
-    parser.add_argument("--out", metavar="FOLDER", default=DEFAULT_OUT, help=f"of the sweep (default: {DEFAULT_OUT})")
+    parser.add_argument(
+        "list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own"
+    )
+    parser.add_argument(
+        "--units",
+        metavar="NAMES",
+        help="which, with commas between (default: all that are trained)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FOLDER",
+        default=DEFAULT_OUT,
+        help=f"of the sweep (default: {DEFAULT_OUT})",
+    )
     add_common(parser, json=False)
     return start.main(parser, run, argv)
 

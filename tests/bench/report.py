@@ -1,4 +1,6 @@
-"""Reports of measurements: printed as Markdown, written as JSON with their provenance, kept in the package."""
+"""Reports of measurements: printed as Markdown, written as JSON with their provenance, kept in the
+package.
+"""
 
 import argparse
 import re
@@ -41,8 +43,12 @@ class Report:
     bench: str  # which module of this folder made it
     title: str
     tables: tuple[Table, ...]
-    notes: tuple[str, ...]  # sentences below the tables: how it was measured, what a number does not say
-    figures: dict[str, Any] = field(default_factory=dict)  # the numbers behind the tables, SI units, for programs
+    notes: tuple[
+        str, ...
+    ]  # sentences below the tables: how it was measured, what a number does not say
+    figures: dict[str, Any] = field(
+        default_factory=dict
+    )  # the numbers behind the tables, SI units, for programs
 
     def record(self) -> dict[str, Any]:
         """The report with its provenance, as JSON holds it."""
@@ -74,12 +80,18 @@ def finish(report: Report, args: argparse.Namespace) -> int:
 def record_path(name: str) -> Path:
     """File of a record; StorageError for a name that is no plain word."""
     if not _NAME.fullmatch(name):
-        raise StorageError(f"record name '{name}'; expected lower-case letters, digits, '-' and '_'")
+        raise StorageError(
+            f"record name '{name}'; expected lower-case letters, digits, '-' and '_'"
+        )
     return measurements.FOLDER / f"{name}.json"
 
 
 def add_arguments_of_measurements(parser: argparse.ArgumentParser, repeats: int) -> None:
-    """Add ``--repeats`` and ``--record``; what :func:`finish` asks for besides, ``--json``, is among the common ones."""
+    """Add ``--repeats`` and ``--record``; what :func:`finish` asks for besides, ``--json``, is
+    among the common ones.
+    """
     text = f"measurements; the median counts (default: {repeats})"
     parser.add_argument("--repeats", type=int, default=repeats, metavar="N", help=text)
-    parser.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
+    parser.add_argument(
+        "--record", metavar="NAME", help="keep the result in the package's records under this name"
+    )

@@ -1,4 +1,5 @@
-"""The simulator: on one CPU core against MuJoCo C on the same rope, on a GPU over batches and against MuJoCo Warp.
+"""The simulator: on one CPU core against MuJoCo C on the same rope, on a GPU over batches and
+against MuJoCo Warp.
 
 On the core: wall time a simulated second of one environment.
 """
@@ -26,8 +27,9 @@ from visthrow.common.errors import VisthrowError
 from visthrow.task import Experiment, plant_of
 
 BATCH = 1024
-"""Environments of the batch: what they share, the launch and the fetching of code, is spread over enough of them, and
-their state (1 kB each) stays in the core's second-level cache."""
+"""Environments of the batch: what they share, the launch and the fetching of code, is spread over
+enough of them, and their state (1 kB each) stays in the core's second-level cache.
+"""
 
 EPISODE = 50
 """Control steps from one start to the next: one simulated second, about a throw."""
@@ -63,11 +65,15 @@ class Batch:
 
     def __init__(self, experiment: Experiment, count: int, kind: str, threads: int = 1):
         self.plant, self.spreads = plant_of(experiment), experiment.task.start
-        self.sim = HybridSim(self.plant, count, ropes=tether_lengths(experiment.rope, self.spreads), threads=threads)
+        self.sim = HybridSim(
+            self.plant, count, ropes=tether_lengths(experiment.rope, self.spreads), threads=threads
+        )
         self.commands = commands.draw(kind, self.plant, experiment.task.action, EPISODE, count)
 
     def cost(self, seconds: float) -> float:
-        """Wall time [s] a simulated second and environment, measured for about ``seconds``, starts left out."""
+        """Wall time [s] a simulated second and environment, measured for about ``seconds``, starts
+        left out.
+        """
         spent, steps = 0.0, 0
         while spent < seconds:
             self.sim.randomize(self.spreads)
@@ -81,7 +87,9 @@ class Batch:
 
 
 def cost_in_c(scene: Any, seconds: float) -> float:
-    """Wall time [s] a simulated second of a scene of `tests.bench.mujoco_c`, measured for about ``seconds``."""
+    """Wall time [s] a simulated second of a scene of `tests.bench.mujoco_c`, measured for about
+    ``seconds``.
+    """
     chunk = round(0.5 / scene.step)
     spent, steps = 0.0, 0
     while spent < seconds:
@@ -92,13 +100,18 @@ def cost_in_c(scene: Any, seconds: float) -> float:
     return spent / (steps * scene.step)
 
 
-def interleaved(a: Callable[[], float], b: Callable[[], float], repeats: int) -> list[tuple[float, float]]:
+def interleaved(
+    a: Callable[[], float], b: Callable[[], float], repeats: int
+) -> list[tuple[float, float]]:
     """Measure A B A B ...; each pair sees about the same machine."""
     return [(a(), b()) for _ in range(repeats)]
 
 
-def longest_accurate_step(error: Callable[[float], float], duration: float, tolerance: float) -> float:
-    """Longest step [s] that divides ``duration`` and whose error, and that of shorter ones, stays within ``tolerance``.
+def longest_accurate_step(
+    error: Callable[[float], float], duration: float, tolerance: float
+) -> float:
+    """Longest step [s] that divides ``duration`` and whose error, and that of shorter ones, stays
+    within ``tolerance``.
 
     Args:
         error: of a step [m]; NaN counts as too much.
@@ -121,24 +134,39 @@ def longest_accurate_step(error: Callable[[float], float], duration: float, tole
 
 
 def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
-    """MuJoCo's two scenes, and how far (ball, vehicle) [m] each contender ends from the converged hard throw."""
+    """MuJoCo's two scenes, and how far (ball, vehicle) [m] each contender ends from the converged
+    hard throw.
+    """
     from tests.bench import mujoco_c
 
     hard, numerics = mujoco_c.HARD_THROW, plant.sim
     truth = converged(hard)
 
     def off(ball_w: np.ndarray, pos_w: np.ndarray) -> tuple[float, float]:
-        return float(np.linalg.norm(ball_w - truth.ball_pos_w[-1])), float(np.linalg.norm(pos_w - truth.pos_w[-1]))
+        return float(np.linalg.norm(ball_w - truth.ball_pos_w[-1])), float(
+            np.linalg.norm(pos_w - truth.pos_w[-1])
+        )
 
     def of_mujoco(**how: Any) -> tuple[float, float]:
         run = converged(hard, **how)
         return off(run.ball_pos_w[-1], run.pos_w[-1])
 
     step = longest_accurate_step(lambda h: max(of_mujoco(step=h)), hard.duration, TOLERANCE)
-    implicit = {"step": mujoco_c.IMPLICIT_STEP, "integrator": "implicitfast", "armature": mujoco_c.ARMATURE}
+    implicit = {
+        "step": mujoco_c.IMPLICIT_STEP,
+        "integrator": "implicitfast",
+        "armature": mujoco_c.ARMATURE,
+    }
     ours = fly(hard, numerics.substep, numerics.precision, numerics.control_period)
-    errors = {"ours": off(ours.ball_pos_w, ours.pos_w), "RK4": of_mujoco(step=step), "implicitfast": of_mujoco(**implicit)}
-    name = f"MuJoCo C, implicitfast, armature {mujoco_c.ARMATURE:g}, {mujoco_c.IMPLICIT_STEP * 1e3:g} ms"
+    errors = {
+        "ours": off(ours.ball_pos_w, ours.pos_w),
+        "RK4": of_mujoco(step=step),
+        "implicitfast": of_mujoco(**implicit),
+    }
+    name = (
+        f"MuJoCo C, implicitfast, armature {mujoco_c.ARMATURE:g},"
+        f" {mujoco_c.IMPLICIT_STEP * 1e3:g} ms"
+    )
     return {
         "RK4": mujoco_c.timed_scene(hard, f"MuJoCo C, RK4, {step * 1e3:g} ms", step),
         "implicitfast": mujoco_c.timed_scene(hard, name, **implicit),
@@ -146,7 +174,12 @@ def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float
 
 
 def measure(
-    experiment: Experiment, batch: int, repeats: int, seconds: float, core: int | None, with_mujoco: bool = True
+    experiment: Experiment,
+    batch: int,
+    repeats: int,
+    seconds: float,
+    core: int | None,
+    with_mujoco: bool = True,
 ) -> Report:
     """Measure on one core and report."""
     plant = plant_of(experiment)
@@ -162,11 +195,19 @@ def measure(
                 lambda: ours["hover"].cost(seconds), lambda s=scene: cost_in_c(s, seconds), repeats
             )
         full = [ours["full"].cost(seconds) for _ in range(repeats)]
-        alone = [a for rows in pairs.values() for a, _ in rows] or [ours["hover"].cost(seconds) for _ in range(repeats)]
+        alone = [a for rows in pairs.values() for a, _ in rows] or [
+            ours["hover"].cost(seconds) for _ in range(repeats)
+        ]
     hover = statistics.median(alone)
     period, segments = plant.sim.control_period, plant.rope.segments
     rows = [
-        _row(f"visthrow, all blocks, {plant.sim.substep * 1e3:g} ms, hover", hover, None, errors.get("ours"), period)
+        _row(
+            f"visthrow, all blocks, {plant.sim.substep * 1e3:g} ms, hover",
+            hover,
+            None,
+            errors.get("ours"),
+            period,
+        )
     ]
     rows.append(_row("the same, full-range commands", statistics.median(full), None, None, period))
     figures: dict[str, Any] = {
@@ -188,14 +229,28 @@ def measure(
         found["ratio"] = statistics.median(b / a for a, b in pairs[name])
         rows.append(_row(scene.name, found["s_per_s"], found["ratio"], errors[name], period))
         figures["rivals"][name] = found
-    header = ("plant", "wall time a simulated second", "env-steps/s", "ratio", "hard throw: ball, vehicle off by")
-    table = Table(f"One core, rope of {segments} segments; ours in a batch of {batch}", header, tuple(rows))
+    header = (
+        "plant",
+        "wall time a simulated second",
+        "env-steps/s",
+        "ratio",
+        "hard throw: ball, vehicle off by",
+    )
+    table = Table(
+        f"One core, rope of {segments} segments; ours in a batch of {batch}", header, tuple(rows)
+    )
     return Report(
-        "sim", f"Simulator on one CPU core against MuJoCo C ({segments} segments)", (table,), _notes(figures), figures
+        "sim",
+        f"Simulator on one CPU core against MuJoCo C ({segments} segments)",
+        (table,),
+        _notes(figures),
+        figures,
     )
 
 
-def measure_threads(experiment: Experiment, batch: int, repeats: int, seconds: float, threads: int) -> Report:
+def measure_threads(
+    experiment: Experiment, batch: int, repeats: int, seconds: float, threads: int
+) -> Report:
     """Measure one thread and several in turns, and compare the bits that they leave."""
     one, many = (Batch(experiment, batch, "hover", n) for n in (1, threads))
     for warm in (one, many):
@@ -208,54 +263,94 @@ def measure_threads(experiment: Experiment, batch: int, repeats: int, seconds: f
         for command in each.commands:
             each.sim.set_command(command)
             each.sim.step()
-    same = all(np.array_equal(one.sim.get(name), many.sim.get(name)) for name in (*STATE_FIELDS, *OUTPUT_FIELDS))
+    same = all(
+        np.array_equal(one.sim.get(name), many.sim.get(name))
+        for name in (*STATE_FIELDS, *OUTPUT_FIELDS)
+    )
     period = one.plant.sim.control_period
     costs = [statistics.median(column) for column in zip(*pairs)]
-    rows = [_row(f"{n} thread{'s' * (n > 1)}", cost, costs[0] / cost, None, period) for n, cost in zip((1, threads), costs)]
+    rows = [
+        _row(f"{n} thread{'s' * (n > 1)}", cost, costs[0] / cost, None, period)
+        for n, cost in zip((1, threads), costs)
+    ]
     header = ("plant", "wall time a simulated second", "env-steps/s", "ratio", "")
     table = Table(f"All blocks at hover, a batch of {batch}", header, tuple(rows))
     notes = (
-        f"In turns, stretches of {seconds:g} s, {repeats} of each; median of the pairs' ratios {ratio:.2f} (bar {THREADS_BAR:g} "
-        "with two cores).",
+        (
+            f"In turns, stretches of {seconds:g} s, {repeats} of each; median of the pairs' ratios"
+            f" {ratio:.2f} (bar {THREADS_BAR:g} with two cores)."
+        ),
         f"A second of flight from drawn starts leaves {'the same bits' if same else 'OTHER BITS'}.",
     )
-    figures = {"batch": batch, "threads": threads, "pairs": pairs, "ratio": ratio, "same_bits": same}
-    return Report("sim", f"Simulator on {threads} CPU threads against one", (table,), notes, figures)
+    figures = {
+        "batch": batch,
+        "threads": threads,
+        "pairs": pairs,
+        "ratio": ratio,
+        "same_bits": same,
+    }
+    return Report(
+        "sim", f"Simulator on {threads} CPU threads against one", (table,), notes, figures
+    )
 
 
 def _row(
     name: str, cost: float, ratio: float | None, error: tuple[float, float] | None, period: float
 ) -> tuple[str, ...]:
     off = "" if error is None else f"{error[0] * 1e3:.3g} mm, {error[1] * 1e3:.3g} mm"
-    return name, f"{cost * 1e3:.3f} ms", f"{1.0 / (cost * period):,.0f}", "" if ratio is None else f"{ratio:.1f}", off
+    return (
+        name,
+        f"{cost * 1e3:.3f} ms",
+        f"{1.0 / (cost * period):,.0f}",
+        "" if ratio is None else f"{ratio:.1f}",
+        off,
+    )
 
 
 def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
     full = figures["full_range"]
     notes = [
-        f"Measured on core {figures['core']} in stretches of {figures['seconds']:g} s, median of {figures['repeats']}.",
-        f"Under full-range commands {100 * full['fallback']:.0f} % of the last control steps kept a first stage "
-        f"somewhere and {100 * full['failed']:.2f} % failed.",
+        (
+            f"Measured on core {figures['core']} in stretches of {figures['seconds']:g} s, median"
+            f" of {figures['repeats']}."
+        ),
+        (
+            f"Under full-range commands {100 * full['fallback']:.0f} % of the last control steps"
+            f" kept a first stage somewhere and {100 * full['failed']:.2f} % failed."
+        ),
     ]
     if figures["rivals"]:
         step = figures["rivals"]["RK4"]["step_s"]
         notes += [
-            "Ours and MuJoCo take turns; the ratio is the median over the pairs. Ours flies queue, controller, motors, "
-            "battery and aerodynamics, MuJoCo the bare rope and a constant wrench, in one call of mj_step a throw.",
-            f"RK4 at {step * 1e3:.4g} ms is the longest step that ends the hard throw within {TOLERANCE * 1e3:g} mm of "
-            "a converged run (bisection over the steps that divide it).",
+            (
+                "Ours and MuJoCo take turns; the ratio is the median over the pairs. Ours flies"
+                " queue, controller, motors, battery and aerodynamics, MuJoCo the bare rope and a"
+                " constant wrench, in one call of mj_step a throw."
+            ),
+            (
+                f"RK4 at {step * 1e3:.4g} ms is the longest step that ends the hard throw within"
+                f" {TOLERANCE * 1e3:g} mm of a converged run (bisection over the steps that divide"
+                " it)."
+            ),
         ]
-        bars = ", ".join(f"{n} {r['ratio']:.1f} (at least {r['bar']:g})" for n, r in figures["rivals"].items())
+        bars = ", ".join(
+            f"{n} {r['ratio']:.1f} (at least {r['bar']:g})" for n, r in figures["rivals"].items()
+        )
         notes.append(f"Bars: {bars}.")
     return tuple(notes)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure the simulator."""
-    if args.seconds <= 0 or args.repeats < 1 or args.threads < 1 or any(n < 1 for n in args.batch or ()):
+    if (
+        args.seconds <= 0
+        or args.repeats < 1
+        or args.threads < 1
+        or any(n < 1 for n in args.batch or ())
+    ):
         raise VisthrowError(
-            f"--seconds {args.seconds}, --repeats {args.repeats}, --batch {args.batch}, --threads {args.threads}: "
-            "expected positive numbers"
+            f"--seconds {args.seconds}, --repeats {args.repeats}, --batch {args.batch}, --threads"
+            f" {args.threads}: expected positive numbers"
         )
     experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
     if args.device == "cpu":
@@ -265,15 +360,21 @@ def run(args: argparse.Namespace) -> int:
         if args.threads > 1:
             report = measure_threads(experiment, batch, args.repeats, args.seconds, args.threads)
         else:
-            report = measure(experiment, batch, args.repeats, args.seconds, args.core, not args.without_mujoco)
+            report = measure(
+                experiment, batch, args.repeats, args.seconds, args.core, not args.without_mujoco
+            )
     else:
         from tests.bench import sim_gpu
         from visthrow.training import device
 
         name = device.resolve(args.device)
         if name == "cpu":
-            raise VisthrowError(f"--device {args.device}: no GPU here; measure the CPU with --device cpu")
-        report = sim_gpu.measure(experiment, name, args.batch or sim_gpu.BATCHES, args.repeats, not args.without_mujoco)
+            raise VisthrowError(
+                f"--device {args.device}: no GPU here; measure the CPU with --device cpu"
+            )
+        report = sim_gpu.measure(
+            experiment, name, args.batch or sim_gpu.BATCHES, args.repeats, not args.without_mujoco
+        )
     return finish(report, args)
 
 
@@ -282,13 +383,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = start.parser_of(__doc__)
     batch = "environments; several on a GPU (default: 1024 on the CPU, 4096 to 524288 on a GPU)"
     parser.add_argument("--batch", type=int, nargs="+", metavar="N", help=batch)
-    parser.add_argument("--seconds", type=float, default=1.0, metavar="S", help="wall time of one measurement, about (default: 1)")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="wall time of one measurement, about (default: 1)",
+    )
     threads = "measure N threads of a CPU against one instead of MuJoCo (default: 1)"
     parser.add_argument("--threads", type=int, default=1, metavar="N", help=threads)
-    parser.add_argument("--without-mujoco", action="store_true", help="measure this simulator alone")
-    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="measurements; the median counts (default: 5)")
-    parser.add_argument("--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)")
-    parser.add_argument("--config", default="state", metavar="NAME", help="training configuration whose plant is measured")
+    parser.add_argument(
+        "--without-mujoco", action="store_true", help="measure this simulator alone"
+    )
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=5,
+        metavar="N",
+        help="measurements; the median counts (default: 5)",
+    )
+    parser.add_argument(
+        "--core", type=int, metavar="N", help="CPU core to stay on (default: the last one)"
+    )
+    parser.add_argument(
+        "--config",
+        default="state",
+        metavar="NAME",
+        help="training configuration whose plant is measured",
+    )
     add_common(parser, json=False)
     parser.set_defaults(device="cpu")
     return start.main(parser, run, argv)

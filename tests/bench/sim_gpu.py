@@ -20,10 +20,14 @@ BARS = {"env_steps_per_s": 30e6, "over_mujoco_warp": 30.0}
 class Graph:
     """Control steps of a batch under drawn commands, captured once and replayed."""
 
-    def __init__(self, experiment: Experiment, count: int, kind: str, device: str, steps: int = GRAPH_STEPS):
+    def __init__(
+        self, experiment: Experiment, count: int, kind: str, device: str, steps: int = GRAPH_STEPS
+    ):
         plant = plant_of(experiment)
         self.spreads, self.steps, self.device = experiment.task.start, steps, device
-        self.sim = HybridSim(plant, count, device, ropes=tether_lengths(experiment.rope, self.spreads))
+        self.sim = HybridSim(
+            plant, count, device, ropes=tether_lengths(experiment.rope, self.spreads)
+        )
         drawn = commands.draw(kind, plant, experiment.task.action, steps, count)
         self._commands = [wp.array(c, dtype=self.sim.types.vec4, device=device) for c in drawn]
         self.sim.randomize(self.spreads)
@@ -48,8 +52,12 @@ class Graph:
         return self.sim.count * self.steps * replays / (time.perf_counter() - start)
 
 
-def sweep(experiment: Experiment, device: str, batches: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
-    """Median rates over batch sizes and command kinds, with the shares of fallen-back and failed environments."""
+def sweep(
+    experiment: Experiment, device: str, batches: tuple[int, ...], repeats: int
+) -> list[dict[str, Any]]:
+    """Median rates over batch sizes and command kinds, with the shares of fallen-back and failed
+    environments.
+    """
     rows = []
     for count in batches:
         row: dict[str, Any] = {"batch": count}
@@ -57,14 +65,22 @@ def sweep(experiment: Experiment, device: str, batches: tuple[int, ...], repeats
             graph = Graph(experiment, count, kind, device)
             graph.rate()
             rates = [graph.rate() for _ in range(repeats)]
-            row[kind] = {"env_steps_per_s": statistics.median(rates), "runs": rates, **commands.shares(graph.sim)}
+            row[kind] = {
+                "env_steps_per_s": statistics.median(rates),
+                "runs": rates,
+                **commands.shares(graph.sim),
+            }
             del graph
         rows.append(row)
     return rows
 
 
 def measure(
-    experiment: Experiment, device: str, batches: tuple[int, ...] | list[int], repeats: int, with_mujoco: bool = True
+    experiment: Experiment,
+    device: str,
+    batches: tuple[int, ...] | list[int],
+    repeats: int,
+    with_mujoco: bool = True,
 ) -> Report:
     """Measure and report."""
     plant = plant_of(experiment)
@@ -90,11 +106,19 @@ def measure(
         if "rows" in found:
             found["ratio"] = {k: top[k] / found["best"]["env_steps_per_s"] for k in top}
             tables.append(mujoco_warp.table(found))
-    return Report("sim", f"Simulator on {device_name(device)}", tuple(tables), _notes(figures), figures)
+    return Report(
+        "sim", f"Simulator on {device_name(device)}", tuple(tables), _notes(figures), figures
+    )
 
 
 def _sweep_table(rows: list[dict[str, Any]], segments: int) -> Table:
-    header = ("environments", "hover, env-steps/s", "full range, env-steps/s", "full range: fell back", "failed")
+    header = (
+        "environments",
+        "hover, env-steps/s",
+        "full range, env-steps/s",
+        "full range: fell back",
+        "failed",
+    )
     cells = [
         (
             f"{row['batch']:,}",
@@ -111,10 +135,16 @@ def _sweep_table(rows: list[dict[str, Any]], segments: int) -> Table:
 def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
     best = figures["best"]
     notes = [
-        f"One graph holds {GRAPH_STEPS} control steps with a new command each; {REPLAYS} replays from a new random "
-        f"start a measurement, median of {figures['repeats']}. One env-step is one control step.",
+        (
+            f"One graph holds {GRAPH_STEPS} control steps with a new command each; {REPLAYS}"
+            f" replays from a new random start a measurement, median of {figures['repeats']}. One"
+            " env-step is one control step."
+        ),
         "Best: "
-        + "; ".join(f"{k} {rate(b['env_steps_per_s'])} env-steps/s at {b['batch']:,}" for k, b in best.items())
+        + "; ".join(
+            f"{k} {rate(b['env_steps_per_s'])} env-steps/s at {b['batch']:,}"
+            for k, b in best.items()
+        )
         + f" (bar {BARS['env_steps_per_s'] / 1e6:.0f} M).",
     ]
     found = figures["mujoco_warp"]
@@ -123,7 +153,9 @@ def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
         notes.append(
             found["why_not"]
             if ratios is None
-            else f"Over MuJoCo Warp's best: hover {ratios['hover']:.0f}, full range {ratios['full']:.0f} times "
-            f"(bar {BARS['over_mujoco_warp']:.0f})."
+            else (
+                f"Over MuJoCo Warp's best: hover {ratios['hover']:.0f}, full range"
+                f" {ratios['full']:.0f} times (bar {BARS['over_mujoco_warp']:.0f})."
+            )
         )
     return tuple(notes)

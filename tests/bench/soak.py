@@ -51,26 +51,45 @@ class Progress(Memory):
         if self.samples and self.seconds >= self._told + TELL:
             self._told = self.seconds
             with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"seconds": self.seconds, "memory_bytes": self.samples[-1][1]}) + "\n")
-            print(f"{self.seconds / 60:.1f} of {self._minutes:g} minutes, {self.samples[-1][1] / 1e6:.1f} MB", file=sys.stderr)
+                file.write(
+                    json.dumps({"seconds": self.seconds, "memory_bytes": self.samples[-1][1]})
+                    + "\n"
+                )
+            print(
+                f"{self.seconds / 60:.1f} of {self._minutes:g} minutes,"
+                f" {self.samples[-1][1] / 1e6:.1f} MB",
+                file=sys.stderr,
+            )
 
 
 def soak(args: argparse.Namespace) -> Report:
-    """Latency, misses and memory of a throw that lasts; Ctrl-C ends it early, and what there is by then is told.
+    """Latency, misses and memory of a throw that lasts; Ctrl-C ends it early, and what there is by
+    then is told.
 
     Raises:
         VisthrowError: a time or rate out of range.
     """
     if not (args.minutes > 0.0 and 1.0 <= args.rate <= 1000.0):
-        raise VisthrowError(f"--minutes {args.minutes}, --rate {args.rate}; expected above 0, and 1 to 1000 Hz")
+        raise VisthrowError(
+            f"--minutes {args.minutes}, --rate {args.rate}; expected above 0, and 1 to 1000 Hz"
+        )
     progress = Progress(Path(args.out) / "soak.jsonl", args.minutes)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         policy = never_releasing(args.policy, place / "policy.npz")
-        run = ("--set", f'policy="{policy}"', "--set", "states.throw=1e6", "--set", "states.abort=0.5")
+        run = (
+            "--set",
+            f'policy="{policy}"',
+            "--set",
+            "states.throw=1e6",
+            "--set",
+            "states.abort=0.5",
+        )
 
         fake = (*STILL, "--rate", str(args.rate), "--seconds", str(60.0 * args.minutes))
-        summary, report = Pair(run, fake, args.core, _another(args.core), orderly=True).fly(place / "run", progress)
+        summary, report = Pair(run, fake, args.core, _another(args.core), orderly=True).fly(
+            place / "run", progress
+        )
         size = sum(path.stat().st_size for path in (place / "run").iterdir())
         if args.keep is not None:
             shutil.copytree(place / "run", args.keep)
@@ -80,14 +99,17 @@ def soak(args: argparse.Namespace) -> Report:
 
 
 def _another(core: int | None) -> int | None:
-    """A core for the fake beside that of the run; None where the system chooses, or has no other."""
+    """A core for the fake beside that of the run; None where the system chooses, or has
+    no other.
+    """
     if core is None or not hasattr(os, "sched_getaffinity"):
         return None
     return next((other for other in sorted(os.sched_getaffinity(0)) if other != core), None)
 
 
 def never_releasing(name: str, path: Path) -> Path:
-    """Write a policy that is another one in all but its release, which it never asks for: a throw that lasts.
+    """Write a policy that is another one in all but its release, which it never asks for: a throw
+    that lasts.
 
     Args:
         name: of a shipped policy, or a file. path: to write.
@@ -103,7 +125,9 @@ def never_releasing(name: str, path: Path) -> Path:
 
 
 def slope(samples: list[tuple[float, float]]) -> float | None:
-    """Growth of memory [bytes/s] by a line through what followed the first share of the time; None with too few samples."""
+    """Growth of memory [bytes/s] by a line through what followed the first share of the time; None
+    with too few samples.
+    """
     if len(samples) < 10:
         return None
     time, size = np.array(samples).T
@@ -112,13 +136,17 @@ def slope(samples: list[tuple[float, float]]) -> float | None:
 
 
 def _stages(latency: dict[str, dict[str, float]], title: str) -> Table:
-    rows = [(name, *(f"{v[key]:.3f}" for key in TIMES), f"{v['count']:,}") for name, v in latency.items() if v]
+    rows = [
+        (name, *(f"{v[key]:.3f}" for key in TIMES), f"{v['count']:,}")
+        for name, v in latency.items()
+        if v
+    ]
     return Table(title, ("stage", "p50", "p95", "p99", "max", "count"), tuple(rows))
 
 
 def _report(
     summary: dict, report: dict, progress: Progress, size: int, args: argparse.Namespace
-) -> Report:  # fmt: skip
+) -> Report:
     grown, samples, early = slope(progress.samples), progress.samples, summary["interrupted"]
     seconds = progress.seconds if early else 60.0 * args.minutes
     ends = [f"{s / 1e6:.1f} MB" for _, s in (samples[0], samples[-1])] if samples else ["?", "?"]
@@ -129,15 +157,26 @@ def _report(
         ("commands that the fake took", f"{report['commands']:,}"),
         ("breaches it noted", str(len(report["breaches"]))),
         ("memory at the start and at the end", " and ".join(ends)),
-        ("growth after the first fifth", "not known" if grown is None else f"{grown * 60 / 1e3:+.1f} kB a minute"),
+        (
+            "growth after the first fifth",
+            "not known" if grown is None else f"{grown * 60 / 1e3:+.1f} kB a minute",
+        ),
         ("recorded", f"{size / 1e6:.1f} MB"),
     )
     figures = {
-        "latency_ms": summary["latency"], "ticks": summary["ticks"], "missed": summary["missed"], "missed_ours": summary["missed_ours"],
-        "worst_late_s": summary["worst_late_s"], "seconds": seconds, "interrupted": early, "rate_hz": args.rate,
-        "memory_bytes_per_s": grown, "memory_bytes": [s for _, s in samples[:: max(1, len(samples) // 200)]],
-        "breaches": report["breaches"], "recorded_bytes": size,
-    }  # fmt: skip
+        "latency_ms": summary["latency"],
+        "ticks": summary["ticks"],
+        "missed": summary["missed"],
+        "missed_ours": summary["missed_ours"],
+        "worst_late_s": summary["worst_late_s"],
+        "seconds": seconds,
+        "interrupted": early,
+        "rate_hz": args.rate,
+        "memory_bytes_per_s": grown,
+        "memory_bytes": [s for _, s in samples[:: max(1, len(samples) // 200)]],
+        "breaches": report["breaches"],
+        "recorded_bytes": size,
+    }
     tables = (
         _stages(summary["latency"], "Times of each stage [ms]"),
         Table("The run", ("what", "measured"), counts),
@@ -150,11 +189,28 @@ def _notes(summary: dict, early: bool, seconds: float, args: argparse.Namespace)
     total = summary["latency"]["total"]
     verdict = "within" if total["p50_ms"] < P50 and total["p99_ms"] < P99 else "NOT within"
     notes = (
-        f"total, from the look for messages to the command's bytes out: p50 {total['p50_ms']:.3f} ms and "
-        f"p99 {total['p99_ms']:.3f} ms, {verdict} the bars of {P50} and {P99} ms",
-        f"policy '{args.policy}' in a throw that it never ends, every tick: gate, filter, state machine, projection, network, "
-        "guard, link, recording to disk; the fake autopilot and its motion capture in a process of their own, UDP on loopback",
-        "the run is kept on one core" if args.core is not None else "the system chooses the cores; --core N keeps the run on one",
-        "a missed tick counts as ours where the tick before it was not done when it was due, for whatever reason",
+        (
+            "total, from the look for messages to the command's bytes out: p50"
+            f" {total['p50_ms']:.3f} ms and p99 {total['p99_ms']:.3f} ms, {verdict} the bars of"
+            f" {P50} and {P99} ms"
+        ),
+        (
+            f"policy '{args.policy}' in a throw that it never ends, every tick: gate, filter, state"
+            " machine, projection, network, guard, link, recording to disk; the fake autopilot and"
+            " its motion capture in a process of their own, UDP on loopback"
+        ),
+        (
+            "the run is kept on one core"
+            if args.core is not None
+            else "the system chooses the cores; --core N keeps the run on one"
+        ),
+        (
+            "a missed tick counts as ours where the tick before it was not done when it was due,"
+            " for whatever reason"
+        ),
     )
-    return (*notes, f"INTERRUPTED after {seconds:.0f} of {60 * args.minutes:.0f} s") if early else notes
+    return (
+        (*notes, f"INTERRUPTED after {seconds:.0f} of {60 * args.minutes:.0f} s")
+        if early
+        else notes
+    )

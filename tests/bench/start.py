@@ -13,10 +13,18 @@ Run = Callable[[argparse.Namespace], Any]
 
 def parser_of(about: str | None, record: bool = True) -> argparse.ArgumentParser:
     """A parser that shows a module's docstring; with the options of what is kept as a record."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     if record:
-        parser.add_argument("--record", metavar="NAME", help="keep the result in the package's records under this name")
-        parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
+        parser.add_argument(
+            "--record",
+            metavar="NAME",
+            help="keep the result in the package's records under this name",
+        )
+        parser.add_argument(
+            "--json", metavar="FILE", help="write the printed figures to this file as well"
+        )
     return parser
 
 

@@ -1,4 +1,6 @@
-"""Throws that begin with a calibration in the hover: what is wrong with each camera is found, and made up for."""
+"""Throws that begin with a calibration in the hover: what is wrong with each camera is found, and
+made up for.
+"""
 
 import pickle
 
@@ -27,14 +29,21 @@ def experiment(*changes):
 
 def test_a_hover_finds_each_camera_and_the_throw_sees_as_the_nominal_one(monkeypatch):
     """What a process of its own would be sent is sent here: more hovers than these go to others."""
-    monkeypatch.setattr(calibrated, "done", lambda function, hovers, *_: done(*pickle.loads(pickle.dumps((function, hovers)))))
+    monkeypatch.setattr(
+        calibrated,
+        "done",
+        lambda function, hovers, *_: done(*pickle.loads(pickle.dumps((function, hovers)))),
+    )
     flown = hover_start(experiment(*BAD))
     torch.manual_seed(2)
     with torch.inference_mode():
         env, found = ThrowEnv(flown, "cpu", 2, COUNT), []
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
         calibrated_start(flown, found)(env)
-        turn, scale = env._memory["extrinsic_rotation"].numpy(), env._memory["scale_error"].flatten().numpy()
+        turn, scale = (
+            env._memory["extrinsic_rotation"].numpy(),
+            env._memory["scale_error"].flatten().numpy(),
+        )
         assert np.abs(turn).max() > 0.03
         assert np.abs(scale).max() > 0.01
         for one, is_turned, is_scaled in zip(found, turn, scale, strict=True):
@@ -54,23 +63,36 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
     turn, scale = 0.05 * torch.randn(8, 3), 0.03 * torch.randn(8)
     goal = torch.randn(8, 3)
     nominal, _ = keypoints(camera, pos, rot, goal, load)
-    seen, valid = keypoints(camera, pos, rot, goal, load, camera.extrinsics(turn, torch.zeros(8, 3)))
+    seen, valid = keypoints(
+        camera, pos, rot, goal, load, camera.extrinsics(turn, torch.zeros(8, 3))
+    )
     got, left = corrected_keypoints(camera, seen * (1.0 + scale[:, None, None]), valid, turn, scale)
     assert left.all()
     torch.testing.assert_close(got[:, :4], nominal[:, :4], rtol=0, atol=1e-4)
-    torch.testing.assert_close(got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3)  # a box is upright in each image
+    torch.testing.assert_close(
+        got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3
+    )  # a box is upright in each image
     torch.testing.assert_close(got[:, 4:].mean(1), nominal[:, 4:].mean(1), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("change", ['task.observation.layout="state"', 'task.target.speed=[0.1,0.2]'])
+@pytest.mark.parametrize(
+    "change", ['task.observation.layout="state"', "task.target.speed=[0.1,0.2]"]
+)
 def test_what_cannot_be_calibrated_is_refused(change):
     with pytest.raises(ConfigError, match="calibration in the hover"):
         calibrated_start(experiment(change))
 
 
 def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
-    """Rotor drag, the motors' lag and unsteady thrust are in the sway: taken for the ball's motion they turned the pitch by 0.06 deg."""
-    quiet = ("task.noise.observation_step=0.0", "task.noise.observation_bias=0.0", "camera.noise.step_std=0.0", "camera.noise.bias_std=0.0")
+    """Rotor drag, the motors' lag and unsteady thrust are in the sway: taken for the ball's motion
+    they turned the pitch by 0.06 deg.
+    """
+    quiet = (
+        "task.noise.observation_step=0.0",
+        "task.noise.observation_bias=0.0",
+        "camera.noise.step_std=0.0",
+        "camera.noise.bias_std=0.0",
+    )
     changes = [*quiet, "camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03"]
     flown = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), changes))
     torch.manual_seed(0)
@@ -78,7 +100,10 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
         env, found = ThrowEnv(flown, "cpu", 0, 6), []
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
         calibrated_start(flown, found)(env)
-        turn, scale = env._memory["extrinsic_rotation"].numpy(), env._memory["scale_error"].flatten().numpy()
+        turn, scale = (
+            env._memory["extrinsic_rotation"].numpy(),
+            env._memory["scale_error"].flatten().numpy(),
+        )
     off = np.degrees([one.turn_b for one in found]) - np.degrees(turn)
     assert np.abs(off.mean(0)).max() < 0.025
     assert np.abs(off).max() < 0.06

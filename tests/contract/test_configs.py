@@ -15,7 +15,9 @@ from visthrow.config import effects, kinds, schema
 
 FILES = sorted(config.configs_root().rglob("*.toml"))
 COMMENTED = ("vehicle", "rope", "camera", "release", "sim", "start", "task", "effects")
-"""Kinds whose every number carries a comment: its table or equation of the paper, or why it was chosen."""
+"""Kinds whose every number carries a comment: its table or equation of the paper, or why it was
+chosen.
+"""
 TEXT = re.compile(r'^\w+ = (?:".*"|\[(?:"[^"]*"(?:, )?)*\])$|^prior_sd = [-\d.e]+$', re.MULTILINE)
 """Lines of words in a table of effects, and its prior, which its ``source`` explains."""
 
@@ -34,7 +36,9 @@ def test_fills_its_schema(path):
 
 
 def uncommented(text: str) -> list[str]:
-    """Return the lines with a number and no comment beside them, or above them since the last table or empty line."""
+    """Return the lines with a number and no comment beside them, or above them since the last table
+    or empty line.
+    """
     wrong, explained = [], False
     for line in text.splitlines():
         bare = line.strip()
@@ -43,20 +47,27 @@ def uncommented(text: str) -> list[str]:
         elif bare.startswith("#"):
             explained = True
         elif (
-            "=" in bare and HAS_NUMBER.search(bare.split("=", 1)[1].split("#")[0]) and "#" not in bare and not explained
+            "=" in bare
+            and HAS_NUMBER.search(bare.split("=", 1)[1].split("#")[0])
+            and "#" not in bare
+            and not explained
         ):
             wrong.append(bare)
     return wrong
 
 
-@pytest.mark.parametrize("path", [path for path in FILES if path.parent.name in COMMENTED], ids=named)
+@pytest.mark.parametrize(
+    "path", [path for path in FILES if path.parent.name in COMMENTED], ids=named
+)
 def test_every_number_says_where_it_comes_from(path):
     text = path.read_text(encoding="utf-8")
     assert not uncommented(TEXT.sub("", text) if path.parent.name == "effects" else text)
 
 
 def test_the_check_itself():
-    assert uncommented(TEXT.sub("", 'source = "of 2012"\nprior_sd = 1e-3\nof = ["x_1", "y"]\nfloor = 2.0')) == ["floor = 2.0"]
+    assert uncommented(
+        TEXT.sub("", 'source = "of 2012"\nprior_sd = 1e-3\nof = ["x_1", "y"]\nfloor = 2.0')
+    ) == ["floor = 2.0"]
     assert uncommented("a = 1\nb = 2  # because\n") == ["a = 1"]
     assert uncommented("# because\na = 1\nb = [2, 3]\n") == []
     assert uncommented("# because\na = 1\n\nb = 2\n[t]\nc = 3") == ["b = 2", "c = 3"]
@@ -65,12 +76,21 @@ def test_the_check_itself():
 
 def test_the_catalogue_reads_every_file_of_effects_and_every_number_of_a_change_exists():
     assert set(effects.FILES) == set(config.available("effects"))
-    kinds_of = {"plant": PlantParams, "sensing": SensingParams, "camera": CameraParams, "step_square": float}
+    kinds_of = {
+        "plant": PlantParams,
+        "sensing": SensingParams,
+        "camera": CameraParams,
+        "step_square": float,
+    }
     for name, effect in effects.catalogue().items():
         for path in [*(c.path for c in effect.changes), *(x.path for x in effect.lowest)]:
             kind = types.SimpleNamespace(**kinds_of)
             for part in path.split("."):
-                kind = getattr(kind, part) if isinstance(kind, types.SimpleNamespace) else schema.hints(kind)[part]
+                kind = (
+                    getattr(kind, part)
+                    if isinstance(kind, types.SimpleNamespace)
+                    else schema.hints(kind)[part]
+                )
             index = max((c.index or 0 for c in effect.changes if c.path == path), default=0)
             numbers = typing.get_args(kind) or (kind,)
             assert numbers[index] is float, f"{name}: {path}[{index}] is {kind}"
@@ -80,7 +100,9 @@ def test_an_effect_that_changes_nothing_or_names_no_condition_is_refused():
     text = config.find("effects", "numerics").read_text(encoding="utf-8")
     with pytest.raises(config.ConfigError, match="neither; expected one"):
         config.loads(kinds.schema_of("effects"), re.sub(r"(?m)^changes = .*$", "", text))
-    with pytest.raises(config.ConfigError, match="got 'never'; expected one of: always, aerodynamics"):
+    with pytest.raises(
+        config.ConfigError, match="got 'never'; expected one of: always, aerodynamics"
+    ):
         config.loads(kinds.schema_of("effects"), text + 'needs = "never"\n')
 
 
@@ -97,5 +119,7 @@ def test_a_changed_digit_in_a_key_is_caught():
     path = config.find("vehicle", "paper")
     text = path.read_text(encoding="utf-8").replace("collision_radius", "collision_radios")
     assert "collision_radios" in tomllib.loads(text)
-    with pytest.raises(config.ConfigError, match="collision_radios: unknown key; did you mean 'collision_radius'"):
+    with pytest.raises(
+        config.ConfigError, match="collision_radios: unknown key; did you mean 'collision_radius'"
+    ):
         config.loads(kinds.schema_of("vehicle"), text)

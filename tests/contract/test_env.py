@@ -1,4 +1,6 @@
-"""The environment as rsl_rl's VecEnv: fresh tensors, groups, ends, what the actor may not see, the reward by hand."""
+"""The environment as rsl_rl's VecEnv: fresh tensors, groups, ends, what the actor may not see, the
+reward by hand.
+"""
 
 import dataclasses
 import math
@@ -26,8 +28,12 @@ def experiment(kind="state", noise=True):
         e.task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
     )
     seen = dataclasses.replace(e.task.observation, latency=(0.0, 0.0))
-    lens = dataclasses.replace(e.camera, noise=dataclasses.replace(e.camera.noise, step_std=0.0, bias_std=0.0))
-    return dataclasses.replace(e, camera=lens, task=dataclasses.replace(e.task, noise=quiet, observation=seen))
+    lens = dataclasses.replace(
+        e.camera, noise=dataclasses.replace(e.camera.noise, step_std=0.0, bias_std=0.0)
+    )
+    return dataclasses.replace(
+        e, camera=lens, task=dataclasses.replace(e.task, noise=quiet, observation=seen)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +77,9 @@ def test_actor_does_not_see_what_only_the_critic_may(env):
     for name, value in saved.items():
         env.views.state[name].copy_(value)
     env.views.out["payload_vel_w"] -= 1.0
-    now = observations.VEHICLE + 5 + 2  # the payload's history moved on by one entry of the same value
+    now = (
+        observations.VEHICLE + 5 + 2
+    )  # the payload's history moved on by one entry of the same value
     torch.testing.assert_close(after["actor"][:, :now], before["actor"][:, :now], rtol=0, atol=0)
     torch.testing.assert_close(after["actor"][:, -1], before["actor"][:, -1], rtol=0, atol=0)
     assert (after["critic"] - before["critic"]).abs().amax(0).count_nonzero() >= 6
@@ -79,24 +87,44 @@ def test_actor_does_not_see_what_only_the_critic_may(env):
 
 @pytest.mark.parametrize("name", ["paper", "paper_vision"])
 def test_the_papers_recipe_and_nothing_else(name):
-    """Sec. III-C and IV-C: 35 or 61 numbers, the critic's 38, no latency, a full battery, Table II unscaled."""
+    """Sec.
+
+    III-C and IV-C: 35 or 61 numbers, the critic's 38, no latency, a full battery, Table II
+    unscaled.
+    """
     paper = config.load(Experiment, config.find("train", name))
     env = ThrowEnv(paper, count=32, seed=1)
     seen, reward, _, _ = env.step(torch.zeros(32, 5))
     assert seen["actor"].shape == (32, 61 if "vision" in name else 35)
     assert seen["critic"].shape == (32, 38)
-    np.testing.assert_array_equal(seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy())
+    np.testing.assert_array_equal(
+        seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy()
+    )
     assert not env.pose_age.any()
-    assert env.views.state["charge_used"].max() < 1e-3, "share of a full battery that one step may draw"
+    assert env.views.state["charge_used"].max() < 1e-3, (
+        "share of a full battery that one step may draw"
+    )
     rest = -2.0 * PERIOD - reward
-    assert ((rest > 0.0) & (rest < 1.0)).all(), "a second costs 2 as in Table II; what is left are speeds and commands"
-    assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == pytest.approx(2e8, rel=1e-3)
+    assert ((rest > 0.0) & (rest < 1.0)).all(), (
+        "a second costs 2 as in Table II; what is left are speeds and commands"
+    )
+    assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == pytest.approx(
+        2e8, rel=1e-3
+    )
 
 
 def test_the_critic_sees_what_is_named():
     """In the order of the documentation; without ``exact`` it begins with what the actor sees."""
     e = experiment()
-    named = {"payload_velocity": 3, "release_timer": 1, "time": 1, "mass": 1, "voltage": 1, "mount": 6, "pose_age": 1}
+    named = {
+        "payload_velocity": 3,
+        "release_timer": 1,
+        "time": 1,
+        "mass": 1,
+        "voltage": 1,
+        "mount": 6,
+        "pose_age": 1,
+    }
     for chosen in [(), ("exact",), ("mass",), ("exact", "mount"), tuple(named), ("exact", *named)]:
         own = dataclasses.replace(e, ppo=dataclasses.replace(e.ppo, privileged=chosen))
         seen = ThrowEnv(own, count=4).get_observations()
@@ -117,11 +145,15 @@ def test_release_ends_an_episode_after_the_lag_and_is_paid_by_hand():
         assert bool(done.all()) == (step == 6)
     last, p = env.last, env.cfg.task.reward
     duration = 5 * PERIOD + 0.01  # separation lies 10 ms into the sixth period
-    np.testing.assert_allclose((last["duration"] - env.views.out["time_to_impact"]).numpy(), duration, atol=1e-5)
+    np.testing.assert_allclose(
+        (last["duration"] - env.views.out["time_to_impact"]).numpy(), duration, atol=1e-5
+    )
     landing = 500.0 * torch.exp(-2.5 * last["landing_error"])
     flight = -2.0 * env.views.out["time_to_impact"]
     near = -100.0 * (0.25 - last["clearance"]).clamp(min=0.0)
-    expected = landing + flight + near - 2.0 * PERIOD  # Eq. 2: nothing of speeds and commands at the release step
+    expected = (
+        landing + flight + near - 2.0 * PERIOD
+    )  # Eq. 2: nothing of speeds and commands at the release step
     np.testing.assert_allclose((reward / p.scale).numpy(), expected.numpy(), rtol=1e-5)
 
 
@@ -129,14 +161,22 @@ def test_reward_terms_by_hand():
     p = experiment().task.reward
     one = torch.ones(1, 3)
     # 1e-3 * 3 + 1e-3 * 3 + 3e-3 * |2 - 1|^2 * 3, all negative
-    assert rewards.kinetic(p, one, one, 2 * one).item() == pytest.approx(-(3e-3 + 3e-3 + 9e-3), rel=1e-6)
+    assert rewards.kinetic(p, one, one, 2 * one).item() == pytest.approx(
+        -(3e-3 + 3e-3 + 9e-3), rel=1e-6
+    )
     # 0.5 * 0.05 * (1 + 0.25 + 0)
     command = torch.tensor([[0.7, 1.0, -0.5, 0.0, 0.0]])
-    assert rewards.command(p, command, torch.tensor(p.rate_command)).item() == pytest.approx(-0.03125, rel=1e-6)
+    assert rewards.command(p, command, torch.tensor(p.rate_command)).item() == pytest.approx(
+        -0.03125, rel=1e-6
+    )
     # 0.5 * (0.15 (0.2 * 0.1 + 0.01) + 0.025 (0.2 * 0.4 + 0.16))
     a, b = torch.tensor([[0.1, 0.4, 0, 0, 0.0]]), torch.zeros(1, 5)
-    assert rewards.change(p, a, b, torch.tensor(p.command_change)).item() == pytest.approx(-0.00525, rel=1e-5)
-    assert rewards.landing(p, torch.tensor([0.4])).item() == pytest.approx(500 * math.exp(-1.0), rel=1e-6)
+    assert rewards.change(p, a, b, torch.tensor(p.command_change)).item() == pytest.approx(
+        -0.00525, rel=1e-5
+    )
+    assert rewards.landing(p, torch.tensor([0.4])).item() == pytest.approx(
+        500 * math.exp(-1.0), rel=1e-6
+    )
     assert rewards.proximity(p, torch.tensor([0.15]), 0.25).item() == pytest.approx(-10.0, rel=1e-5)
     assert rewards.proximity(p, torch.tensor([0.35]), 0.25).item() == 0.0
 
@@ -151,11 +191,16 @@ def test_ends_of_an_episode():
     low = pos - torch.tensor([0.0, 0.0, 0.4])
     status = torch.tensor([0, 0, 0, 0, 4], dtype=torch.int32)
     free = torch.zeros(5, dtype=torch.bool)
-    ended = terminations.negative(bounds, pos, level, low, status, free, torch.full((5,), 1.0), 0.04)
+    ended = terminations.negative(
+        bounds, pos, level, low, status, free, torch.full((5,), 1.0), 0.04
+    )
     assert ended.tolist() == [False, True, True, True, True]
     above = pos + torch.tensor([0.0, 0.0, 0.1])
     fine = torch.zeros(5, dtype=torch.int32)
-    for latched, expected in ((free, True), (~free, False)):  # once latched, only collision and bounds count
+    for latched, expected in (
+        (free, True),
+        (~free, False),
+    ):  # once latched, only collision and bounds count
         got = terminations.negative(
             bounds, pos[:1], level[:1], above[:1], fine[:1], latched[:1], torch.tensor([5.0]), 0.04
         )
@@ -166,11 +211,15 @@ def test_commands_and_their_inverse():
     rate = torch.tensor([10.0, 10.0, 4.0])
     action = torch.rand(100, 4) * 2 - 1
     command = actions.command_from_action(action, 14.0, rate)
-    torch.testing.assert_close(actions.action_from_command(command, 14.0, rate), action, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        actions.action_from_command(command, 14.0, rate), action, rtol=1e-5, atol=1e-5
+    )
     edge = actions.command_from_action(torch.tensor([[9.0, 9, -9, 9], [-9.0, 0, 0, 0]]), 14.0, rate)
     assert edge.tolist() == [[14.0, 10.0, -10.0, 4.0], [0.0, 0.0, 0.0, 0.0]]
     hover = torch.tensor([actions.hover_action(2.7, 14.0)])
-    assert actions.command_from_action(hover, 14.0, rate)[0, 0].item() == pytest.approx(2.7, rel=1e-5)
+    assert actions.command_from_action(hover, 14.0, rate)[0, 0].item() == pytest.approx(
+        2.7, rel=1e-5
+    )
     assert not actions.release_asked(hover, 0.95).item()
 
 
@@ -178,12 +227,16 @@ def test_measurements_are_as_old_as_the_latency():
     """With half a period of latency the actor sees the mean of the last two steps."""
     e = experiment(noise=False)
     late = dataclasses.replace(e.task.observation, latency=(PERIOD / 2, PERIOD / 2))
-    env = ThrowEnv(dataclasses.replace(e, task=dataclasses.replace(e.task, observation=late)), count=8)
+    env = ThrowEnv(
+        dataclasses.replace(e, task=dataclasses.replace(e.task, observation=late)), count=8
+    )
     env.step(torch.zeros(8, 5))
     before = env.views.state["pos_w"].clone()
     obs, _, done, _ = env.step(torch.zeros(8, 5))
     assert not done.any()
-    torch.testing.assert_close(obs["actor"][:, :3], (before + env.views.state["pos_w"]) / 2, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        obs["actor"][:, :3], (before + env.views.state["pos_w"]) / 2, rtol=0, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("kind", ["state", "vision"])

@@ -1,4 +1,6 @@
-"""The runner's observation is the training environment's, bit for bit, over a long recorded stream; and replays are exact."""
+"""The runner's observation is the training environment's, bit for bit, over a long recorded stream;
+and replays are exact.
+"""
 
 import dataclasses
 import math
@@ -22,19 +24,26 @@ from visthrow.onboard.policy import Policy, find_policy
 from visthrow.training.env import ThrowEnv
 
 CUDA = 1e-5
-"""Of an observation on the GPU: another order of additions, other functions of the standard library."""
+"""Of an observation on the GPU: another order of additions, other functions of the standard
+library.
+"""
 
 WIDE = ("gate.max_jump=100.0", "gate.max_speed=1000.0", "gate.max_turn=10.0", "observe=true")
 """Every pose of the stream is taken: it is to be seen, not judged."""
 
 
 def stream(streams: int, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Random flights, float32, shape (streams, steps, ...): tilts up to upside down, a payload that swings all about."""
+    """Random flights, float32, shape (streams, steps, ...): tilts up to upside down, a payload that
+    swings all about.
+    """
     rng = np.random.default_rng(seed)
     time = TICK * np.arange(steps)[:, None]
 
     def wave(size: float) -> np.ndarray:
-        phase, pace = 2 * np.pi * rng.random((streams, 1, 3)), 1.0 + 6.0 * rng.random((streams, 1, 3))
+        phase, pace = (
+            2 * np.pi * rng.random((streams, 1, 3)),
+            1.0 + 6.0 * rng.random((streams, 1, 3)),
+        )
         return size * rng.random((streams, 1, 3)) * np.sin(phase + pace * time)
 
     turn = wave(2.5)
@@ -43,9 +52,13 @@ def stream(streams: int, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
     pos = wave(1.5) + [0.0, 0.0, 1.4]
     swing = wave(1.0) + [0.0, 0.0, -0.8]
     made = {
-        "pos_w": pos, "quat_wb": quat / np.linalg.norm(quat, axis=-1, keepdims=True), "vel_w": wave(5.0), "rate_b": wave(9.0),
-        "payload": pos + 0.383 * swing / np.linalg.norm(swing, axis=-1, keepdims=True), "goal_w": wave(2.0) * [1, 1, 0],
-    }  # fmt: skip
+        "pos_w": pos,
+        "quat_wb": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        "vel_w": wave(5.0),
+        "rate_b": wave(9.0),
+        "payload": pos + 0.383 * swing / np.linalg.norm(swing, axis=-1, keepdims=True),
+        "goal_w": wave(2.0) * [1, 1, 0],
+    }
     return {name: values.astype(np.float32) for name, values in made.items()}
 
 
@@ -54,8 +67,12 @@ def recorded(flown: dict[str, np.ndarray], folder) -> dict[int, list[Pose]]:
     wanted = params("policy=state")
     recorder = Recorder(folder, wanted)
     count = flown["pos_w"].shape[0] * flown["pos_w"].shape[1]
-    flat = {name: values.reshape(count, -1).astype(float).tolist() for name, values in flown.items()}
-    idle = Runner(wanted, Policy.load(find_policy("state")), Spy()).tick(0.0, [], Status(True), OperatorInput())
+    flat = {
+        name: values.reshape(count, -1).astype(float).tolist() for name, values in flown.items()
+    }
+    idle = Runner(wanted, Policy.load(find_policy("state")), Spy()).tick(
+        0.0, [], Status(True), OperatorInput()
+    )
     for n in range(count):
         at = TICK * n
         views = (flat[name][n] for name in ("pos_w", "quat_wb", "vel_w", "rate_b"))
@@ -81,7 +98,9 @@ def seen_by_the_runner(flown, poses, policy: str) -> tuple[np.ndarray, np.ndarra
         actions.append(decision.action)
     assert not runner.errors
     shape = (streams, steps, -1)
-    return np.array(observations, np.float32).reshape(shape), np.array(actions, np.float32).reshape(shape)
+    return np.array(observations, np.float32).reshape(shape), np.array(actions, np.float32).reshape(
+        shape
+    )
 
 
 def shown_by_the_environment(flown, actions: np.ndarray, policy: str, device: str) -> np.ndarray:
@@ -98,13 +117,17 @@ def shown_by_the_environment(flown, actions: np.ndarray, policy: str, device: st
             states[name].copy_(torch.from_numpy(flown[name][:, t]))
         env.views.out["payload_pos_w"].copy_(torch.from_numpy(flown["payload"][:, t]))
         fresh = torch.full((streams,), t == 0, device=device)
-        previous = env._start_action.expand(streams, -1) if t == 0 else torch.from_numpy(actions[:, t - 1])
+        previous = (
+            env._start_action.expand(streams, -1) if t == 0 else torch.from_numpy(actions[:, t - 1])
+        )
         env._memory["previous"].copy_(previous)
         out.append(env._observe(fresh)["actor"].cpu().numpy())
     return np.stack(out, axis=1)
 
 
-def both(policy: str, streams: int, steps: int, folder, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
+def both(
+    policy: str, streams: int, steps: int, folder, device: str = "cpu"
+) -> tuple[np.ndarray, np.ndarray]:
     flown = stream(streams, steps)
     seen, actions = seen_by_the_runner(flown, recorded(flown, folder), policy)
     return seen, shown_by_the_environment(flown, actions, policy, device)
@@ -114,7 +137,9 @@ def test_ten_thousand_poses_of_the_vision_policy(tmp_path):
     seen, shown = both("vision", 100, 100, tmp_path / "a")
     assert seen.shape[:2] == (100, 100)
     np.testing.assert_array_equal(seen, shown)
-    layout = layout_of(SimpleNamespace(**Policy.load(find_policy("vision")).contract["observation"]))
+    layout = layout_of(
+        SimpleNamespace(**Policy.load(find_policy("vision")).contract["observation"])
+    )
     after = layout.located + layout.response * RESPONSE
     valid = seen[..., -after - layout.validity : -after]
     assert 0.1 < valid.mean() < 0.95, "points inside and outside of the field of view"
@@ -154,10 +179,16 @@ def patchy(rng: np.random.Generator):
 
 RUNS = {
     "drop-outs": {"poses": patchy(np.random.default_rng(1)), "seconds": 3.0},
-    "operator's abort": {"words": lambda t, s: OperatorInput(arm=s == "ready", abort=t > 1.0), "seconds": 2.0},
+    "operator's abort": {
+        "words": lambda t, s: OperatorInput(arm=s == "ready", abort=t > 1.0),
+        "seconds": 2.0,
+    },
     "mocap gone": {"poses": lambda t, poses: poses if t < 0.9 else [], "seconds": 2.0},
     "autopilot gone": {"status": lambda t: Status(t < 0.9, "silent"), "seconds": 2.0},
-    "back after a second": {"poses": lambda t, poses: [] if 0.3 < t < 1.6 else poses, "seconds": 6.0},
+    "back after a second": {
+        "poses": lambda t, poses: [] if 0.3 < t < 1.6 else poses,
+        "seconds": 6.0,
+    },
     "late ticks": {"late": lambda t: 0.03 * (math.sin(40.0 * t) > 0.9), "seconds": 2.0},
     "disk full": {"recording": lambda t: t < 0.9, "seconds": 2.0},
 }
@@ -167,7 +198,9 @@ QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", 
 SHORT = ("drop-outs", "mocap gone", "late ticks")
 
 
-@pytest.mark.parametrize("name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.slow) for name in RUNS])
+@pytest.mark.parametrize(
+    "name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.slow) for name in RUNS]
+)
 def test_any_run_replays_bit_for_bit(name, tmp_path):
     folder = tmp_path / "run"
     record_run(folder, "policy=vision", "observe=true", *QUICK, **RUNS[name])
@@ -177,8 +210,16 @@ def test_any_run_replays_bit_for_bit(name, tmp_path):
 
 
 def test_a_run_whose_policy_failed_replays(tmp_path):
-    """A policy that puts out nothing but 1: the fence ends it; the run is killed, and its folder read as it is."""
-    record_run(tmp_path / "a", saved_policy(tmp_path, (1.0, 1.0, -1.0, 1.0, -1.0)), *QUICK, seconds=3.0, close=False)
+    """A policy that puts out nothing but 1: the fence ends it; the run is killed, and its folder
+    read as it is.
+    """
+    record_run(
+        tmp_path / "a",
+        saved_policy(tmp_path, (1.0, 1.0, -1.0, 1.0, -1.0)),
+        *QUICK,
+        seconds=3.0,
+        close=False,
+    )
     found = replay(tmp_path / "a")
     assert found["differences"] == []
     assert "fence" in list(lines(tmp_path / "a" / "ticks.jsonl"))[-1]["reason"]

@@ -1,4 +1,6 @@
-"""Imports run one way, and what flies on board runs where neither simulator nor trainer is installed."""
+"""Imports run one way, and what flies on board runs where neither simulator nor trainer is
+installed.
+"""
 
 import ast
 import subprocess
@@ -10,7 +12,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
-ONBOARD = ("visthrow.config", "visthrow.common", "visthrow.onboard", "visthrow.logs", "visthrow.view")
+ONBOARD = (
+    "visthrow.config",
+    "visthrow.common",
+    "visthrow.onboard",
+    "visthrow.logs",
+    "visthrow.view",
+)
 """Rooms of visthrow that fly on board; they rest on each other and on camera alone."""
 
 MAY_USE = {
@@ -28,7 +36,9 @@ def sources(package: str) -> list[Path]:
 
 
 def imported(path: Path) -> set[str]:
-    """Return every absolute module name that a file imports anywhere, ``from a import b`` as ``a.b`` too."""
+    """Return every absolute module name that a file imports anywhere, ``from a import b`` as
+    ``a.b`` too.
+    """
     names = set()
     package = path.relative_to(ROOT).parent.parts
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -59,7 +69,10 @@ def test_packages_import_one_way(package):
 def modules(*rooms: str) -> list[str]:
     """Return the modules in rooms given by their dotted names."""
     paths = [path for room in rooms for path in sources(room.replace(".", "/"))]
-    return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in paths]
+    return [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in paths
+    ]
 
 
 def test_onboard_modules_import_only_onboard_modules():
@@ -85,7 +98,11 @@ def test_sim_uses_numpy_and_warp_only():
             banned.add("mujoco")
         else:
             banned.add("warp")
-        wrong += [f"{path.relative_to(ROOT)} imports {name}" for name in imported(path) if name.split(".")[0] in banned]
+        wrong += [
+            f"{path.relative_to(ROOT)} imports {name}"
+            for name in imported(path)
+            if name.split(".")[0] in banned
+        ]
     assert not wrong
 
 
@@ -101,7 +118,9 @@ def test_the_reference_plant_shares_only_the_parameters():
 
 
 def test_onboard_modules_run_without_simulator_and_trainer():
-    """Each onboard module and all of hil import in an interpreter where the heavy packages cannot be imported."""
+    """Each onboard module and all of hil import in an interpreter where the heavy packages cannot
+    be imported.
+    """
     names = modules("hil", *ONBOARD)
     code = f"""
 import importlib, sys
@@ -125,12 +144,16 @@ except ImportError:
 
 def test_importing_visthrow_and_the_command_line_is_cheap():
     code = "import sys, visthrow.cli; print(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert {"torch", "numpy", "warp", "cv2"}.isdisjoint(result.stdout.split())
 
 
 def test_a_process_that_throws_on_the_reference_plant_needs_no_trainer():
-    """Tensordict brings torch's compiler along, which takes about as long to import as torch itself; so did a pilot's first step."""
+    """Tensordict brings torch's compiler along, which takes about as long to import as torch
+    itself; so did a pilot's first step.
+    """
     code = """
 import sys
 import numpy as np
@@ -139,8 +162,12 @@ from visthrow.onboard.pilot import Pilot
 from visthrow.throws.loading import load_policy
 loaded = load_policy("vision")
 level, still = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
-Pilot(loaded.policy, loaded.experiment.camera).act(still, level, still, still, still - [0.0, 0.0, 0.4], still)
+payload = still - [0.0, 0.0, 0.4]
+pilot = Pilot(loaded.policy, loaded.experiment.camera)
+pilot.act(still, level, still, still, payload, still)
 print(*sys.modules)
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert {"tensordict", "rsl_rl", "torch._dynamo"}.isdisjoint(result.stdout.split())

@@ -1,4 +1,6 @@
-"""Every Warp kernel of the simulator states what its arguments are, in one order, under one set of headings."""
+"""Every Warp kernel of the simulator states what its arguments are, in one order, under one set of
+headings.
+"""
 
 import ast
 import io
@@ -35,7 +37,11 @@ def problems(text: str, kernel: ast.FunctionDef) -> list[str]:
     if not arguments:
         return []
     first, last = kernel.lineno, kernel.body[0].lineno
-    headings = [(line, word) for line, word in sorted(comments.items()) if first < line < last and word in GROUPS]
+    headings = [
+        (line, word)
+        for line, word in sorted(comments.items())
+        if first < line < last and word in GROUPS
+    ]
     found = [word for _, word in headings]
     wrong = []
     if found != sorted(set(found), key=GROUPS.index):
@@ -48,15 +54,23 @@ def problems(text: str, kernel: ast.FunctionDef) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "sim").rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "sim").rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT))
+)
 def test_arguments_of_kernels_are_grouped(path):
     text = path.read_text(encoding="utf-8")
-    wrong = [f"{path.name}: {kernel.name}: {problem}" for kernel in kernels(text) for problem in problems(text, kernel)]
+    wrong = [
+        f"{path.name}: {kernel.name}: {problem}"
+        for kernel in kernels(text)
+        for problem in problems(text, kernel)
+    ]
     assert not wrong
 
 
 def test_there_are_kernels_to_check():
-    found = [kernel.name for path in (ROOT / "sim").rglob("*.py") for kernel in kernels(path.read_text())]
+    found = [
+        kernel.name for path in (ROOT / "sim").rglob("*.py") for kernel in kernels(path.read_text())
+    ]
     assert found
 
 
@@ -79,12 +93,31 @@ def test_the_check_itself(arguments, count):
 
 def settings(text: str) -> set[str]:
     """Return the settings of Warp that a text assigns."""
-    targets = [target for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Assign) for target in node.targets]
-    return {ast.unparse(target) for target in targets if ast.unparse(target).startswith(("wp.config.", "warp.config."))}
+    targets = [
+        target
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+    ]
+    return {
+        ast.unparse(target)
+        for target in targets
+        if ast.unparse(target).startswith(("wp.config.", "warp.config."))
+    }
 
 
 def test_kernels_are_compiled_alike_in_all_processes():
-    """How they are is part of their hash: pictures were compiled a second time where no simulator had been imported before."""
-    files = [path for package in ("camera", "sim", "visthrow", "hil") for path in (ROOT / package).rglob("*.py")]
-    found = {path.relative_to(ROOT).as_posix() for path in files if settings(path.read_text(encoding="utf-8"))}
+    """How they are is part of their hash: pictures were compiled a second time where no simulator
+    had been imported before.
+    """
+    files = [
+        path
+        for package in ("camera", "sim", "visthrow", "hil")
+        for path in (ROOT / package).rglob("*.py")
+    ]
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in files
+        if settings(path.read_text(encoding="utf-8"))
+    }
     assert found == {"camera/warp_start.py"}

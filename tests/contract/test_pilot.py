@@ -1,4 +1,6 @@
-"""The pilot shows the actor what the training environment showed it, bit for bit, with a batch of one."""
+"""The pilot shows the actor what the training environment showed it, bit for bit, with a batch of
+one.
+"""
 
 import dataclasses
 import time
@@ -18,30 +20,49 @@ from visthrow.training.env import ThrowEnv
 
 STEPS = 200
 SLOWEST_CALL = 4e-3
-"""Median of a call [s]; 0.5 ms on an idle core, with room for a busy machine. A control period is 20 ms."""
+"""Median of a call [s]; 0.5 ms on an idle core, with room for a busy machine.
+
+A control period is 20 ms.
+"""
 
 
 def quiet(name: str) -> Experiment:
     """An experiment without any noise or latency."""
     experiment = config.load(Experiment, config.find("train", name))
     noise = dataclasses.replace(
-        experiment.task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
+        experiment.task.noise,
+        observation_step=0.0,
+        observation_bias=0.0,
+        command_step=0.0,
+        command_bias=0.0,
     )
     camera = dataclasses.replace(
         experiment.camera,
         noise=dataclasses.replace(
-            experiment.camera.noise, step_std=0.0, bias_std=0.0, drop_probability=0.0, latency=0.0, wrong_probability=0.0,
-            held_probability=0.0, scale_std=0.0,
+            experiment.camera.noise,
+            step_std=0.0,
+            bias_std=0.0,
+            drop_probability=0.0,
+            latency=0.0,
+            wrong_probability=0.0,
+            held_probability=0.0,
+            scale_std=0.0,
         ),
-        mount=dataclasses.replace(experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0),
+        mount=dataclasses.replace(
+            experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0
+        ),
     )
-    observation = dataclasses.replace(experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
+    observation = dataclasses.replace(
+        experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0
+    )
     task = dataclasses.replace(experiment.task, noise=noise, observation=observation)
     return dataclasses.replace(experiment, task=task, camera=camera)
 
 
 def random_policy(experiment: Experiment, seed: int = 0) -> Policy:
-    """A small network with outputs all over the range, release included, that reacts to every input."""
+    """A small network with outputs all over the range, release included, that reacts to every
+    input.
+    """
     torch.manual_seed(seed)
     contract = contract_of(experiment)
     width = contract["observation"]["dimension"]
@@ -59,7 +80,10 @@ def test_observation_equals_the_environments(name):
     shown = env.get_observations()["actor"]
     starts = released = 0
     for _ in range(STEPS):
-        state, goal = {key: value.numpy() for key, value in env.views.state.items()}, env.views.goal_w.numpy()
+        state, goal = (
+            {key: value.numpy() for key, value in env.views.state.items()},
+            env.views.goal_w.numpy(),
+        )
         payload = env.views.out["payload_pos_w"].numpy()
         outs = []
         for e, pilot in enumerate(pilots):
@@ -86,9 +110,10 @@ def test_command_equals_the_environments():
     pilot = Pilot(policy)
     state = {key: value.numpy().copy() for key, value in env.views.state.items()}
     out = pilot.act(
-        *(state[key] for key in ("pos_w", "quat_wb", "vel_w", "rate_b")), env.views.out["payload_pos_w"].numpy().copy(),
+        *(state[key] for key in ("pos_w", "quat_wb", "vel_w", "rate_b")),
+        env.views.out["payload_pos_w"].numpy().copy(),
         env.views.goal_w.numpy().copy(),
-    )  # fmt: skip
+    )
     env.step(policy.act(env.get_observations()["actor"]))
     np.testing.assert_array_equal(out.command, env.views.command.numpy())
     assert out.release[0] == bool(env.views.release[0])
@@ -98,7 +123,14 @@ def test_a_call_fits_many_times_into_a_control_period():
     experiment = quiet("vision")
     pilot = Pilot(random_policy(experiment), experiment.camera)
     still = np.zeros((1, 3))
-    views = (still + [0, 0, 1.3], np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, still + [0, 0, 0.95], [2.0, 0.0, 0.0])
+    views = (
+        still + [0, 0, 1.3],
+        np.array([[0.0, 0.0, 0.0, 1.0]]),
+        still,
+        still,
+        still + [0, 0, 0.95],
+        [2.0, 0.0, 0.0],
+    )
     taken = []
     for _ in range(60):
         begin = time.perf_counter()
@@ -115,7 +147,11 @@ def test_camera_conditions_are_those_of_the_contract():
 def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):
     camera = config.load(Experiment, config.find("train", "vision")).camera
     assert camera.noise.invalid_reads == "zero"
-    older = random_policy(config.load(Experiment, config.find("train", "vision_ideal"), ["camera.noise.invalid_reads=edge"]))
+    older = random_policy(
+        config.load(
+            Experiment, config.find("train", "vision_ideal"), ["camera.noise.invalid_reads=edge"]
+        )
+    )
     path = tmp_path / "older.npz"
     older.save(path)
     assert Pilot(Policy.load(path), camera).camera.edge_reads

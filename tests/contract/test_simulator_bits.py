@@ -1,4 +1,6 @@
-"""Equal bits: alone or in a batch, from a graph or launched, after a masked reset, from one seed or parameter."""
+"""Equal bits: alone or in a batch, from a graph or launched, after a masked reset, from one seed or
+parameter.
+"""
 
 import dataclasses
 
@@ -40,7 +42,10 @@ def vehicles(count: int) -> list:
     """Vehicles of different masses."""
     vehicle = paper_plant().vehicle
     masses = vehicle.body.mass * (1.0 + 0.02 * np.arange(count))
-    return [dataclasses.replace(vehicle, body=BodyParams(float(m), vehicle.body.inertia)) for m in masses]
+    return [
+        dataclasses.replace(vehicle, body=BodyParams(float(m), vehicle.body.inertia))
+        for m in masses
+    ]
 
 
 def ropes(count: int) -> list:
@@ -57,9 +62,12 @@ def poses(seed: int, count: int) -> dict[str, np.ndarray]:
     swing = np.cross(rng.normal(size=(count, segments, 3)), directions)
     quat = np.array([0.0, 0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=(count, 4))
     return {
-        "pos_w": rng.normal(size=(count, 3)), "quat_wb": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
-        "vel_w": rng.normal(size=(count, 3)), "rate_b": rng.normal(size=(count, 3)),
-        "cable_dir_w": directions, "cable_vel_w": swing,
+        "pos_w": rng.normal(size=(count, 3)),
+        "quat_wb": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        "vel_w": rng.normal(size=(count, 3)),
+        "rate_b": rng.normal(size=(count, 3)),
+        "cable_dir_w": directions,
+        "cable_vel_w": swing,
     }
 
 
@@ -71,23 +79,42 @@ def drive(sim: HybridSim, commands: np.ndarray, release: np.ndarray | None = Non
 
 @pytest.mark.parametrize("threads", [2, 3])
 def test_slices_on_several_threads_equal_the_whole(threads, monkeypatch):
-    """Starts, steps, releases and the payload of a batch that is cut into pieces, and of one that is not."""
+    """Starts, steps, releases and the payload of a batch that is cut into pieces, and of one that
+    is not.
+    """
     monkeypatch.setattr(hybrid, "FEWEST", 4)
     cut, launched = hybrid.in_pieces, []
-    monkeypatch.setattr(hybrid, "in_pieces", lambda launch, marks, n: launched.append((marks, n)) or cut(launch, marks, n))
+    monkeypatch.setattr(
+        hybrid,
+        "in_pieces",
+        lambda launch, marks, n: launched.append((marks, n)) or cut(launch, marks, n),
+    )
     count, spreads = 37, start_spreads()
     states = []
     for number in (1, threads):
-        sim = HybridSim(paper_plant(), count, seed=3, vehicles=vehicles(count), ropes=ropes(count), threads=number)
+        sim = HybridSim(
+            paper_plant(),
+            count,
+            seed=3,
+            vehicles=vehicles(count),
+            ropes=ropes(count),
+            threads=number,
+        )
         for episode in range(2):
             sim.randomize(spreads, wp.array(np.arange(count) % 3 != episode, dtype=wp.int32))
             drive(sim, random_commands(episode, STEPS, count), np.arange(count) % 2)
-        states.append(everything(sim) | {"episode": sim.episode.numpy(), "goal_w": sim.goal_w.numpy()})
+        states.append(
+            everything(sim) | {"episode": sim.episode.numpy(), "goal_w": sim.goal_w.numpy()}
+        )
         assert bool(launched) == (number > 1)
     assert_same(*states)
     assert {n for _, n in launched} == {threads}
-    assert all(len(kernel.module.execs) == 1 for kernel in (sim._step.step, sim._reset.randomize)), "compiled once"
-    assert all(marks[0] == 0 and marks[-1] == count and len(marks) > threads for marks, _ in launched)
+    assert all(
+        len(kernel.module.execs) == 1 for kernel in (sim._step.step, sim._reset.randomize)
+    ), "compiled once"
+    assert all(
+        marks[0] == 0 and marks[-1] == count and len(marks) > threads for marks, _ in launched
+    )
     assert not np.array_equal(states[0]["attached"], np.ones(count))
 
 
@@ -100,7 +127,9 @@ def test_a_batch_equals_its_members_alone():
     assert batch.get("attached").tolist() == (1 - release).tolist()
     whole = everything(batch)
     for e in range(COUNT):
-        alone = HybridSim(paper_plant(), 1, vehicles=vehicles(COUNT)[e : e + 1], ropes=ropes(COUNT)[e : e + 1])
+        alone = HybridSim(
+            paper_plant(), 1, vehicles=vehicles(COUNT)[e : e + 1], ropes=ropes(COUNT)[e : e + 1]
+        )
         alone.place(**{k: v[e : e + 1] for k, v in start.items()})
         drive(alone, commands[:, e : e + 1], release[e : e + 1])
         assert_same(everything(alone), whole, slice(None), slice(e, e + 1))
@@ -205,7 +234,9 @@ def test_the_queue_holds_hover_after_a_reset():
     plant = paper_plant()
     load = plant.rope.rope_mass + plant.rope.payload_mass
     weight = 9.81 * (plant.vehicle.body.mass * sim.get("mass_scale") + load)
-    np.testing.assert_allclose(queue[..., 0], np.tile(weight[:, None], (1, queue.shape[1])), rtol=1e-6)
+    np.testing.assert_allclose(
+        queue[..., 0], np.tile(weight[:, None], (1, queue.shape[1])), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 11])
@@ -230,7 +261,9 @@ def test_draws_do_not_depend_on_the_batch():
 
 @pytest.mark.parametrize("place", range(4))
 def test_a_bad_command_raises_a_bit_and_does_not_spread(place):
-    """Not a number in one environment: its bit is set, its last command is held, the others never notice."""
+    """Not a number in one environment: its bit is set, its last command is held, the others never
+    notice.
+    """
     sick, well = HybridSim(paper_plant(), 3), HybridSim(paper_plant(), 3)
     command = np.tile([4.0, 1.0, 0.5, 0.0], (3, 1))
     bad = command.copy()
@@ -261,7 +294,9 @@ def test_a_bad_state_raises_a_bit_and_is_put_back():
 
 
 @pytest.mark.parametrize("kind", ["hybrid", "alone"])
-@pytest.mark.parametrize("name", ["setpoint", "gyro", "integral", "motor_speed", "voltage", "charge_used", "rate_b"])
+@pytest.mark.parametrize(
+    "name", ["setpoint", "gyro", "integral", "motor_speed", "voltage", "charge_used", "rate_b"]
+)
 def test_no_part_of_the_state_may_be_bad(kind, name):
     sim = HybridSim(paper_plant(), 2) if kind == "hybrid" else quad(2)
     value = sim.get(name)
@@ -287,7 +322,18 @@ def test_quadrotors_alone_batch_and_reset():
             sim.set_command(command)
         batch.step()
         wp.capture_launch(capture.graph)
-    names = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed", "integral", "setpoint", "gyro", "voltage", "queue")
+    names = (
+        "pos_w",
+        "quat_wb",
+        "vel_w",
+        "rate_b",
+        "motor_speed",
+        "integral",
+        "setpoint",
+        "gyro",
+        "voltage",
+        "queue",
+    )
     for name in names:
         np.testing.assert_array_equal(batch.get(name), graphed.get(name), err_msg=name)
     alone = quad(1)
@@ -301,5 +347,9 @@ def test_quadrotors_alone_batch_and_reset():
     batch.reset(wp.array(mask, device="cpu"))
     new = quad(COUNT)
     for name in names:
-        np.testing.assert_array_equal(batch.get(name)[mask == 0], before[name][mask == 0], err_msg=name)
-        np.testing.assert_array_equal(batch.get(name)[mask == 1], new.get(name)[mask == 1], err_msg=name)
+        np.testing.assert_array_equal(
+            batch.get(name)[mask == 0], before[name][mask == 0], err_msg=name
+        )
+        np.testing.assert_array_equal(
+            batch.get(name)[mask == 1], new.get(name)[mask == 1], err_msg=name
+        )

@@ -1,4 +1,6 @@
-"""The same kernels on CUDA: graphs equal launches, members alone equal their batch, and the CPU agrees."""
+"""The same kernels on CUDA: graphs equal launches, members alone equal their batch, and the CPU
+agrees.
+"""
 
 import dataclasses
 
@@ -14,11 +16,16 @@ from tests.simulators import numerics, random_commands
 from visthrow import config
 from visthrow.task import TaskParams
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device"),
+]
 DEVICE = "cuda:0"
 COUNT, STEPS = 200, 15
 SAME = 1e-9
-"""In float64 the two compilers' sums differ in the last digits, and a second of flight makes thousands of those [m]."""
+"""In float64 the two compilers' sums differ in the last digits, and a second of flight makes
+thousands of those [m].
+"""
 
 
 def everything(sim: HybridSim) -> dict[str, np.ndarray]:
@@ -74,7 +81,10 @@ def test_cuda_agrees_with_the_cpu():
 
 
 def test_quadrotor_alone():
-    sims = [QuadSim(paper_plant().vehicle, COUNT, device=device, precision="float64") for device in (DEVICE, "cpu")]
+    sims = [
+        QuadSim(paper_plant().vehicle, COUNT, device=device, precision="float64")
+        for device in (DEVICE, "cpu")
+    ]
     for command in random_commands(2, STEPS, COUNT):
         for sim in sims:
             sim.set_command(command)

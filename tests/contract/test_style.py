@@ -1,8 +1,8 @@
-"""The house keeps its order: no import circle, no import upward, no long function, no crowded folder.
+"""The house keeps its order: no import circle, no import upward, no long function, no crowded
+folder.
 
-An import counts wherever it stands: at the top, under TYPE_CHECKING, or in a function that is meant to save start-up time. The
-rooms and their order are read from CONVENTIONS.md.
-"""
+An import counts wherever it stands: at the top, under TYPE_CHECKING, or in a function that is meant
+to save start-up time. The rooms and their order are read from CONVENTIONS.md."""
 
 import ast
 import re
@@ -21,13 +21,19 @@ MOST = 12
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN: set[str] = set()
-"""What is still to be mended. The list may only become shorter: an entry that is no longer needed fails too."""
+"""What is still to be mended.
+
+The list may only become shorter: an entry that is no longer needed fails too.
+"""
 
 
 def modules(root: Path, packages: Iterable[str]) -> dict[str, Path]:
     """Return dotted name -> file of every module."""
     files = (path for package in packages for path in sorted((root / package).rglob("*.py")))
-    return {".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+    return {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in files
+    }
 
 
 def imports(name: str, path: Path, known: Mapping[str, object]) -> set[str]:
@@ -52,7 +58,9 @@ def graph(root: Path, packages: Iterable[str] = PACKAGES) -> dict[str, set[str]]
 
 
 def circles(arrows: Mapping[str, set[str]]) -> list[list[str]]:
-    """Return the groups of modules that reach each other (Tarjan's strongly connected components of two or more)."""
+    """Return the groups of modules that reach each other (Tarjan's strongly connected components of
+    two or more).
+    """
     index: dict[str, int] = {}
     low: dict[str, int] = {}
     stack: list[str] = []
@@ -93,7 +101,12 @@ def room_of(name: str, order: Iterable[str]) -> str:
 def upward(arrows: Mapping[str, set[str]], order: list[str]) -> list[str]:
     """Return the imports from a room that stands above."""
     level = {name: order.index(room_of(name, order)) for name in arrows}
-    return [f"{a} -> {b}" for a, others in sorted(arrows.items()) for b in sorted(others) if level[b] > level[a]]
+    return [
+        f"{a} -> {b}"
+        for a, others in sorted(arrows.items())
+        for b in sorted(others)
+        if level[b] > level[a]
+    ]
 
 
 def long_functions(text: str) -> list[tuple[str, int]]:
@@ -104,7 +117,11 @@ def long_functions(text: str) -> list[tuple[str, int]]:
             ast.unparse(of).startswith(("wp.func", "wp.kernel")) for of in node.decorator_list
         )
 
-    functions = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
+    functions = [
+        n
+        for n in ast.walk(ast.parse(text))
+        if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
     plain = [n for n in functions if not any(warp(inner) for inner in ast.walk(n))]
     lines = [(n.name, n.end_lineno - n.lineno + 1) for n in plain]
     return [found for found in lines if found[1] > LONGEST]
@@ -112,14 +129,19 @@ def long_functions(text: str) -> list[tuple[str, int]]:
 
 def left(entry: Path) -> bool:
     """Whether a folder holds nothing but what an interpreter left there."""
-    return entry.is_dir() and all(path.is_dir() or "__pycache__" in path.parts for path in entry.rglob("*"))
+    return entry.is_dir() and all(
+        path.is_dir() or "__pycache__" in path.parts for path in entry.rglob("*")
+    )
 
 
 def crowded(root: Path, packages: Iterable[str] = PACKAGES) -> list[tuple[str, int]]:
     """Return each folder of modules that has too many entries."""
     folders = {path.parent for path in modules(root, packages).values()}
     counts = {
-        folder: sum(entry.name not in ASIDE and not entry.name.startswith(".") and not left(entry) for entry in folder.iterdir())
+        folder: sum(
+            entry.name not in ASIDE and not entry.name.startswith(".") and not left(entry)
+            for entry in folder.iterdir()
+        )
         for folder in folders
     }
     return sorted((str(f.relative_to(root)), count) for f, count in counts.items() if count > MOST)
@@ -130,7 +152,9 @@ ORDER = rooms((ROOT / "CONVENTIONS.md").read_text(encoding="utf-8"))
 
 @cache
 def arrows() -> dict[str, set[str]]:
-    """Return the product's :func:`graph`; not when this file is imported, which every worker does."""
+    """Return the product's :func:`graph`; not when this file is imported, which every
+    worker does.
+    """
     return graph(ROOT)
 
 
@@ -161,7 +185,11 @@ def test_the_list_of_what_is_to_be_mended_only_becomes_shorter():
 def test_every_part_of_the_product_is_in_a_room():
     """A new folder says where it stands; a room that is gone goes from the list."""
     parts = {".".join(name.split(".")[:2]) for name in arrows() if name.startswith("visthrow.")}
-    assert {part for part in parts if not any(room == part or room.startswith(part + ".") for room in ORDER)} == set()
+    assert {
+        part
+        for part in parts
+        if not any(room == part or room.startswith(part + ".") for room in ORDER)
+    } == set()
     assert {room for room in ORDER if room not in arrows()} == set()
     assert set(PACKAGES) <= set(ORDER)
 
@@ -207,11 +235,16 @@ def test_a_circle_and_an_upward_import_are_caught_wherever_they_stand(house, tmp
 def test_a_circle_of_three_is_caught_and_a_diamond_is_none():
     assert circles({"a": {"b", "c"}, "b": {"d"}, "c": {"d"}, "d": set()}) == []
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
-    assert circles({"a": {"b"}, "b": {"a", "c"}, "c": {"d"}, "d": {"c"}}) == [["a", "b"], ["c", "d"]]
+    assert circles({"a": {"b"}, "b": {"a", "c"}, "c": {"d"}, "d": {"c"}}) == [
+        ["a", "b"],
+        ["c", "d"],
+    ]
 
 
 def test_the_rooms_are_read_in_their_order():
-    assert rooms("# x\n1. `no`\n## Rooms\n\nWords.\n\n1. `a`\n2. `a.b` (c)\n\n## Next\n3. `d`\n") == ["a", "a.b"]
+    assert rooms(
+        "# x\n1. `no`\n## Rooms\n\nWords.\n\n1. `a`\n2. `a.b` (c)\n\n## Next\n3. `d`\n"
+    ) == ["a", "a.b"]
     assert room_of("a.bc.d", ["a", "a.b"]) == "a"
     assert room_of("a.b.d", ["a", "a.b"]) == "a.b"
     assert len(ORDER) == len(set(ORDER)) > 10
@@ -221,10 +254,14 @@ def test_a_long_function_is_caught_unless_it_builds_a_kernel():
     body = "    x = 1\n" * (LONGEST - 1)
     assert long_functions(f"def f():\n{body}") == []
     assert long_functions(f"def f():\n{body}    y = 2\n") == [("f", LONGEST + 1)]
-    assert long_functions(f"class A:\n    async def f(self):\n{body.replace('    ', '        ')}        y = 2\n") == [("f", LONGEST + 1)]
+    assert long_functions(
+        f"class A:\n    async def f(self):\n{body.replace('    ', '        ')}        y = 2\n"
+    ) == [("f", LONGEST + 1)]
     for of in ("wp.func", "wp.kernel", "wp.kernel(enable_backward=False)"):
         assert long_functions(f"def f():\n    @{of}\n    def g():\n        pass\n{body}") == []
-    assert long_functions(f"def f():\n    @cache\n    def g():\n        pass\n{body}") == [("f", LONGEST + 3)]
+    assert long_functions(f"def f():\n    @cache\n    def g():\n        pass\n{body}") == [
+        ("f", LONGEST + 3)
+    ]
 
 
 def test_a_crowded_folder_is_caught(house, tmp_path):

@@ -1,4 +1,6 @@
-"""What the task can do beyond the paper: moving goals, varied payloads; and flying under stated departures from a contract."""
+"""What the task can do beyond the paper: moving goals, varied payloads; and flying under stated
+departures from a contract.
+"""
 
 import dataclasses
 
@@ -36,7 +38,9 @@ def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():
     for step in range(1, 7):  # 0.11 s of lag end within the sixth period
         _, _, done, _ = env.step(ask)
         if step < 6:
-            np.testing.assert_allclose(env.views.goal_w, start + step * PERIOD * velocity, atol=1e-6)
+            np.testing.assert_allclose(
+                env.views.goal_w, start + step * PERIOD * velocity, atol=1e-6
+            )
     assert bool(done.all())
     landed_at = env.last["duration"]  # from the throw's start to the landing
     goal = start + landed_at[:, None] * velocity
@@ -46,9 +50,17 @@ def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():
 
 
 def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
-    """Without noise the actor's offset is to the goal of 10 ms ago, and the fit reaches the true velocity."""
-    quiet = ["task.noise.observation_step=0.0", "task.noise.observation_bias=0.0", "task.noise.command_step=0.0"]
-    env = ThrowEnv(experiment("state_moving", *quiet, "task.observation.latency=[0.01,0.01]"), count=32)
+    """Without noise the actor's offset is to the goal of 10 ms ago, and the fit reaches the true
+    velocity.
+    """
+    quiet = [
+        "task.noise.observation_step=0.0",
+        "task.noise.observation_bias=0.0",
+        "task.noise.command_step=0.0",
+    ]
+    env = ThrowEnv(
+        experiment("state_moving", *quiet, "task.observation.latency=[0.01,0.01]"), count=32
+    )
     hover = env.previous_action.clone()
     alive = torch.ones(32, dtype=torch.bool)
     for _ in range(12):
@@ -56,7 +68,9 @@ def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
         alive &= done == 0
     assert alive.sum() > 20
     actor, velocity = obs["actor"][alive], env._memory["goal_vel"][alive]
-    np.testing.assert_allclose(actor[:, -2:], velocity[:, :2], rtol=0.05, atol=0.01)  # the prior still pulls a little
+    np.testing.assert_allclose(
+        actor[:, -2:], velocity[:, :2], rtol=0.05, atol=0.01
+    )  # the prior still pulls a little
     goal_seen = actor[:, 20:22] + actor[:, 22:24] + actor[:, :2]
     expected = (env.views.goal_w[alive] - 0.01 * velocity)[:, :2]
     np.testing.assert_allclose(goal_seen, expected, atol=1e-5)
@@ -64,7 +78,9 @@ def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
 
 
 def test_goals_that_stand_still_cost_nothing():
-    """No numbers are drawn, nothing is added to the state: the shipped policies' throws keep their bits."""
+    """No numbers are drawn, nothing is added to the state: the shipped policies' throws keep their
+    bits.
+    """
     env = ThrowEnv(experiment("state"), count=4)
     assert not {"goal_vel", "goal_fit"} & env._memory.keys()
     assert env.get_observations()["critic"].shape == (4, 42)
@@ -78,8 +94,12 @@ def test_throws_at_moving_goals_keep_where_the_goal_was():
     assert good.all()
     moved = np.linalg.norm(throws.goal_w - [1.5, 0.0], axis=1)
     np.testing.assert_allclose(moved, 0.5 * throws.duration, rtol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(throws.landing_w - throws.goal_w, axis=1), throws.error, atol=1e-5)
-    assert throws.summary()["error_mean"] > 0.2, "a policy for goals that stand still throws to where it saw them"
+    np.testing.assert_allclose(
+        np.linalg.norm(throws.landing_w - throws.goal_w, axis=1), throws.error, atol=1e-5
+    )
+    assert throws.summary()["error_mean"] > 0.2, (
+        "a policy for goals that stand still throws to where it saw them"
+    )
 
 
 @pytest.mark.slow
@@ -89,7 +109,9 @@ def test_goals_move_on_the_reference_plant_too():
     assert result["success"].all()
     moved = np.linalg.norm(result["goal_w"] - [1.5, 0.0], axis=1)
     np.testing.assert_allclose(moved, 0.5 * result["duration"], rtol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(result["landing_w"] - result["goal_w"], axis=1), result["error"])
+    np.testing.assert_allclose(
+        np.linalg.norm(result["landing_w"] - result["goal_w"], axis=1), result["error"]
+    )
 
 
 def test_payloads_vary_in_every_combination():
@@ -102,7 +124,9 @@ def test_payloads_vary_in_every_combination():
     assert (masses.min(), masses.max()) == pytest.approx((0.8, 1.2))
     gyration = [r.payload_inertia / r.payload_mass for r in ropes]
     np.testing.assert_allclose(gyration, params.rope.payload_inertia / params.rope.payload_mass)
-    assert [r.length for r in ropes[:6]] == [r.length for r in tether_lengths(params.rope, params.task.start)]
+    assert [r.length for r in ropes[:6]] == [
+        r.length for r in tether_lengths(params.rope, params.task.start)
+    ]
     env = ThrowEnv(params, count=300)
     hanging = (env.views.out["payload_pos_w"] - env.views.state["pos_w"]).norm(dim=1)
     assert hanging.max() - hanging.min() > 0.05, "cables of 0.297 to 0.363 m"
@@ -124,17 +148,34 @@ def test_departures_are_refused_unless_allowed_and_then_named():
         load_policy("state", "state", change, allow=["vehicle"])
     with pytest.raises(MismatchError, match=r"vehicle\.motor\.time_constant"):
         load_policy("state", "state", change, allow=["rope.length", "vehicle.motor.kind"])
-    with pytest.raises(ConfigError, match=r"allow 'vehicle\.mot': .* did you mean 'vehicle\.motor'"):
+    with pytest.raises(
+        ConfigError, match=r"allow 'vehicle\.mot': .* did you mean 'vehicle\.motor'"
+    ):
         load_policy("state", allow=["vehicle.mot"])
     loaded = load_policy("state", "state", change, allow=["rope.length", "vehicle.motor"])
     assert loaded.departures == {"rope.length": 0.4, "vehicle.motor.time_constant": 0.05}
     assert load_policy("state").departures == {}
-    others = ["camera.mount", "rope.payload_drag", "vehicle.body.com[2]"]  # of vision, or at its default: a contract may have them
+    others = [
+        "camera.mount",
+        "rope.payload_drag",
+        "vehicle.body.com[2]",
+    ]  # of vision, or at its default: a contract may have them
     assert load_policy("state", allow=others).departures == {}
 
 
 def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):
-    words = ["compare", "state", "--config", "state", "--set", "rope.length=0.34", "--throws", "2", "--targets", "2.0"]
+    words = [
+        "compare",
+        "state",
+        "--config",
+        "state",
+        "--set",
+        "rope.length=0.34",
+        "--throws",
+        "2",
+        "--targets",
+        "2.0",
+    ]
     words += ["--device", "cpu", "--out", str(tmp_path)]
     assert cli.main(words) == 2
     assert cli.main([*words, "--allow", "rope"]) == 0
@@ -150,9 +191,14 @@ def test_releases_are_those_of_the_throws_and_a_rod_does_not_bow():
     throws = protocol.throw(loaded.experiment, loaded.policy.act, 2.0, 6, "cpu", 0)
     np.testing.assert_allclose(found.landing_w[:, :2], throws.landing_w, atol=1e-6)
     # a parabola from the release to the landing at 0.04 m
-    fall = (found.ball_vel_w[:, 2] + np.sqrt(found.ball_vel_w[:, 2] ** 2 + 2 * 9.81 * (found.ball_w[:, 2] - 0.04))) / 9.81
+    fall = (
+        found.ball_vel_w[:, 2]
+        + np.sqrt(found.ball_vel_w[:, 2] ** 2 + 2 * 9.81 * (found.ball_w[:, 2] - 0.04))
+    ) / 9.81
     np.testing.assert_allclose(found.time + fall, throws.duration, atol=1e-4)
-    np.testing.assert_allclose(found.ball_w[:, :2] + fall[:, None] * found.ball_vel_w[:, :2], throws.landing_w, atol=1e-4)
+    np.testing.assert_allclose(
+        found.ball_w[:, :2] + fall[:, None] * found.ball_vel_w[:, :2], throws.landing_w, atol=1e-4
+    )
     assert (found.bow > 1e-3).all()
     rod = load_policy("state", "state", ["rope.segments=1"], allow=["rope.segments"])
     assert releases(rod, 2.0, 2, "cpu", 0).bow.max() < 1e-6
@@ -169,9 +215,15 @@ def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
 
 def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_its_own():
     params = experiment("state_drag")
-    assert ReferenceAdapter(params, realistic=False)._plant.extras.payload_drag == params.rope.payload_drag > 0.0
+    assert (
+        ReferenceAdapter(params, realistic=False)._plant.extras.payload_drag
+        == params.rope.payload_drag
+        > 0.0
+    )
     assert ReferenceAdapter(experiment("state"), realistic=False)._plant.extras.payload_drag == 0.0
-    assert ReferenceAdapter(params, realistic=True)._plant.extras.payload_drag == pytest.approx(1.044e-3)
+    assert ReferenceAdapter(params, realistic=True)._plant.extras.payload_drag == pytest.approx(
+        1.044e-3
+    )
 
 
 def test_speeds_that_make_no_range_are_refused():
@@ -180,12 +232,20 @@ def test_speeds_that_make_no_range_are_refused():
 
 
 def test_a_policy_is_flown_without_what_only_its_training_had():
-    """``flown`` of its configuration comes before what the user names; a latency that it was trained for is no refusal."""
-    own, named = load_policy("vision"), load_policy("vision", overrides=["camera.noise.drop_probability=0.3"])
+    """``flown`` of its configuration comes before what the user names; a latency that it was
+    trained for is no refusal.
+    """
+    own, named = (
+        load_policy("vision"),
+        load_policy("vision", overrides=["camera.noise.drop_probability=0.3"]),
+    )
     trained = experiment("vision")
     assert trained.camera.noise.drop_probability == 0.1
     assert own.experiment.camera.noise == experiment("vision_ideal").camera.noise
     assert own.experiment.task.observation.latency == (0.008, 0.012)
-    assert (named.experiment.camera.noise.drop_probability, named.experiment.camera.noise.scale_std) == (0.3, 0.0)
+    assert (
+        named.experiment.camera.noise.drop_probability,
+        named.experiment.camera.noise.scale_std,
+    ) == (0.3, 0.0)
     with pytest.raises(MismatchError, match="latency"):
         load_policy("vision", overrides=["task.observation.latency=[0.06,0.06]"])

@@ -7,7 +7,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-BINARY = {".bbl", ".gz", ".png", ".jpg", ".gif", ".npz", ".rrd", ".parquet", ".onnx", ".ulg", ".pdf"}
+BINARY = {
+    ".bbl",
+    ".gz",
+    ".png",
+    ".jpg",
+    ".gif",
+    ".npz",
+    ".rrd",
+    ".parquet",
+    ".onnx",
+    ".ulg",
+    ".pdf",
+}
 
 MACHINE_PATHS = re.compile(
     r"(?<![\w.:/-])/(?:home|root|Users|workspace|work|opt|mnt|scratch)/\w+"  # absolute folders
@@ -21,7 +33,9 @@ EXEMPT = {"tests/contract/test_text.py", "tests/unit/on_visthrow/test_provenance
 
 def tracked() -> list[Path]:
     """Return the tracked files; in a copy without history, every file of the source folders."""
-    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True)
+    listed = subprocess.run(
+        ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True
+    )
     if listed.returncode == 0 and listed.stdout:
         files = [ROOT / name for name in listed.stdout.split("\0") if name]
     else:
@@ -55,11 +69,17 @@ def test_no_machine_paths():
 @pytest.mark.parametrize(
     ("line", "caught"),
     [
-        ("/home/me/x", True), ("see /root/x", True), ("--index-url x", True), ("https://pypi.org/simple", True),
-        ("../shared", False), ("/dev/null", False), ("#!/usr/bin/env bash", False),
-        ("N m/rad", False), ("/proc/cpuinfo", False),
+        ("/home/me/x", True),
+        ("see /root/x", True),
+        ("--index-url x", True),
+        ("https://pypi.org/simple", True),
+        ("../shared", False),
+        ("/dev/null", False),
+        ("#!/usr/bin/env bash", False),
+        ("N m/rad", False),
+        ("/proc/cpuinfo", False),
     ],
-)  # fmt: skip
+)
 def test_the_pattern_itself(line, caught):
     assert bool(MACHINE_PATHS.search(line)) == caught
 

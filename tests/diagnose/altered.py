@@ -1,4 +1,6 @@
-"""Logs of the same flights told otherwise: turned, seen in a mirror, at other times, in another order, mixed up."""
+"""Logs of the same flights told otherwise: turned, seen in a mirror, at other times, in another
+order, mixed up.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,15 +12,27 @@ from visthrow.logs.flightlog import FlightLog
 MIRRORED = {"motor_1": "motor_2", "motor_2": "motor_1", "motor_3": "motor_4", "motor_4": "motor_3"}
 """Effects that a left-right mirror exchanges."""
 NEGATED = {
-    "com_y", "mount_y", "wind_y", "frame_tilt_x", "frame_tilt_z", "marker_rot_x", "marker_rot_z", "marker_off_y",
-    "payload_marker_y", "kick_y",
-}  # fmt: skip
-"""Effects whose sign a left-right mirror changes: sideways vectors, and turns about axes in the mirror's plane."""
+    "com_y",
+    "mount_y",
+    "wind_y",
+    "frame_tilt_x",
+    "frame_tilt_z",
+    "marker_rot_x",
+    "marker_rot_z",
+    "marker_off_y",
+    "payload_marker_y",
+    "kick_y",
+}
+"""Effects whose sign a left-right mirror changes: sideways vectors, and turns about axes in the
+mirror's plane.
+"""
 
 Values = Callable[[np.ndarray], np.ndarray]
 
 
-def with_values(log: FlightLog, changes: dict[str, Values], time: Values = lambda t: t) -> FlightLog:
+def with_values(
+    log: FlightLog, changes: dict[str, Values], time: Values = lambda t: t
+) -> FlightLog:
     """A log with some channels' values changed, and the clock of all."""
     channels = {}
     for name, c in log.channels.items():
@@ -42,15 +56,23 @@ def turned(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
 
 
 def mirrored(log: FlightLog) -> FlightLog:
-    """The same flight seen in a mirror between left and right: y of places turns, and turns about x and z."""
+    """The same flight seen in a mirror between left and right: y of places turns, and turns about x
+    and z.
+    """
     place = lambda p: p * [1.0, -1.0, 1.0]  # noqa: E731
-    changes = {"pos_w": place, "payload_pos_w": place, "quat_wb": lambda q: q * [-1.0, 1.0, -1.0, 1.0]}
+    changes = {
+        "pos_w": place,
+        "payload_pos_w": place,
+        "quat_wb": lambda q: q * [-1.0, 1.0, -1.0, 1.0],
+    }
     return with_values(log, changes | {"command": lambda u: u * [1.0, -1.0, 1.0, -1.0]})
 
 
 def mirrored_theta(theta: dict[str, float]) -> dict[str, float]:
     """What a diagnosis of mirrored flights must say."""
-    return {MIRRORED.get(name, name): -size if name in NEGATED else size for name, size in theta.items()}
+    return {
+        MIRRORED.get(name, name): -size if name in NEGATED else size for name, size in theta.items()
+    }
 
 
 def later(log: FlightLog, seconds: float) -> FlightLog:
@@ -66,13 +88,17 @@ def scrambled(logs: Sequence[FlightLog]) -> list[FlightLog]:
     out = list(logs)
     for own in groups.values():
         for i, j in zip(own, own[1:] + own[:1]):
-            channels = dict(logs[i].channels) | {name: logs[j][name] for name in ("command", "release_command")}
+            channels = dict(logs[i].channels) | {
+                name: logs[j][name] for name in ("command", "release_command")
+            }
             out[i] = FlightLog(channels, dict(logs[i].meta))
     return out
 
 
 class Flipped:
-    """A model whose residuals have another sign in every other flight: noise as before, but no cause in common."""
+    """A model whose residuals have another sign in every other flight: noise as before, but no
+    cause in common.
+    """
 
     def __init__(self, model, seed: int) -> None:
         """Draw the flights' signs, as many of each as there can be."""
@@ -88,8 +114,14 @@ class Flipped:
     def windows(self, theta):
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         self._last = self.model.windows(theta)
-        return [replace(w, residual=w.residual + self._shift(w, b)) for w, b in zip(self._last, self._base)]
+        return [
+            replace(w, residual=w.residual + self._shift(w, b))
+            for w, b in zip(self._last, self._base)
+        ]
 
     def residuals(self, theta, about=None):
         """See :class:`visthrow.diagnose.models.interface.Model`."""
-        return [r + self._shift(w, b) for w, r, b in zip(self._last, self.model.residuals(theta, about), self._base)]
+        return [
+            r + self._shift(w, b)
+            for w, r, b in zip(self._last, self.model.residuals(theta, about), self._base)
+        ]

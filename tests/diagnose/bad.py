@@ -1,4 +1,6 @@
-"""Logs that are wrong: a verdict without a name, or an error that says what; kinds of :mod:`tests.diagnose.cases`."""
+"""Logs that are wrong: a verdict without a name, or an error that says what; kinds of
+:mod:`tests.diagnose.cases`.
+"""
 
 import json
 import subprocess
@@ -39,8 +41,13 @@ def values(**changes) -> Callable[[Logs], Logs]:
 
 def cut(log: FlightLog, count: int) -> FlightLog:
     """The first samples of every channel."""
-    return FlightLog({n: replace(c, time=c.time[:count], values=c.values[:count], valid=c.valid[:count])
-                      for n, c in log.channels.items()}, {})  # fmt: skip
+    return FlightLog(
+        {
+            n: replace(c, time=c.time[:count], values=c.values[:count], valid=c.valid[:count])
+            for n, c in log.channels.items()
+        },
+        {},
+    )
 
 
 def exchanged(log: FlightLog) -> FlightLog:
@@ -73,35 +80,58 @@ def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> 
     turn = 5e-4 * rng.standard_normal((len(t), 3))
     command = np.column_stack((np.full(len(sent), thrust), np.zeros((len(sent), 3))))
     place = np.array([0.0, 0.0, height])
-    return FlightLog({
-        "pos_w": Channel(t, place + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
-        "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
-        "command": Channel(sent, command, "N, rad/s", "body"),
-    }, {})  # fmt: skip
+    return FlightLog(
+        {
+            "pos_w": Channel(t, place + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
+            "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
+            "command": Channel(sent, command, "N, rad/s", "body"),
+        },
+        {},
+    )
 
 
 def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
-    """A hover that is never quite still, for so long: paths, attitudes and commands of a vehicle whose blades do not flap."""
+    """A hover that is never quite still, for so long: paths, attitudes and commands of a vehicle
+    whose blades do not flap.
+    """
     rng = np.random.default_rng(1)
     t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
-    speed, phase = np.array([0.31, 0.47]), np.array([0.3, 1.1])  # of the wander along x and y [rad/s], [rad]
+    speed, phase = (
+        np.array([0.31, 0.47]),
+        np.array([0.3, 1.1]),
+    )  # of the wander along x and y [rad/s], [rad]
 
     def lean(time: np.ndarray, rate: bool = False) -> np.ndarray:
         """Lean along x and y that the wander and the rotors' drag take, or its rate."""
         angle = speed * time[:, None] + phase + (0.5 * np.pi if rate else 0.0)
-        push = WANDER * speed * (DRAG * np.cos(angle) - MASS * speed * np.sin(angle)) / (MASS * GRAVITY)
+        push = (
+            WANDER
+            * speed
+            * (DRAG * np.cos(angle) - MASS * speed * np.sin(angle))
+            / (MASS * GRAVITY)
+        )
         return speed * push if rate else push
 
     x, y = lean(t).T
-    turn = 0.5 * np.column_stack((-y, x, np.zeros(len(t)))) + 2.5e-4 * rng.standard_normal((len(t), 3))
+    turn = 0.5 * np.column_stack((-y, x, np.zeros(len(t)))) + 2.5e-4 * rng.standard_normal(
+        (len(t), 3)
+    )
     path = np.column_stack((WANDER * np.sin(speed * t[:, None] + phase), np.full(len(t), 1.5)))
     rate_x, rate_y = lean(sent, rate=True).T
     thrust = MASS * GRAVITY * (1.0 + 0.5 * np.sum(lean(sent) ** 2, axis=1))
-    return FlightLog({
-        "pos_w": Channel(t, path + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
-        "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
-        "command": Channel(sent, np.column_stack((thrust, -rate_y, rate_x, np.zeros(len(sent)))), "N, rad/s", "body"),
-    }, {})  # fmt: skip
+    return FlightLog(
+        {
+            "pos_w": Channel(t, path + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
+            "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
+            "command": Channel(
+                sent,
+                np.column_stack((thrust, -rate_y, rate_x, np.zeros(len(sent)))),
+                "N, rad/s",
+                "body",
+            ),
+        },
+        {},
+    )
 
 
 def without(name: str) -> Callable[[Logs], Logs]:
@@ -126,18 +156,39 @@ class Bad:
             path = place / f"flight_{i:02d}.npz"
             log.save(path)
             path.write_bytes(path.read_bytes()[: int(self.cut_to * path.stat().st_size)])
-        done = subprocess.run([sys.executable, "-c", WITHOUT_TESTS, *command_for(len(logs), recipe)], cwd=place,
-                              capture_output=True, text=True, timeout=1500.0, env=environment(), check=False)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-c", WITHOUT_TESTS, *command_for(len(logs), recipe)],
+            cwd=place,
+            capture_output=True,
+            text=True,
+            timeout=1500.0,
+            env=environment(),
+            check=False,
+        )
         answer = place / "said.json"
-        verdict = json.loads(answer.read_text()) if answer.exists() else {"overall": "ERROR", "findings": []}
-        return {"passed": fair(done, verdict, self.right), "said": verdict, "output": (done.stdout + done.stderr)[-600:]}
+        verdict = (
+            json.loads(answer.read_text())
+            if answer.exists()
+            else {"overall": "ERROR", "findings": []}
+        )
+        return {
+            "passed": fair(done, verdict, self.right),
+            "said": verdict,
+            "output": (done.stdout + done.stderr)[-600:],
+        }
 
 
-def fair(done: subprocess.CompletedProcess, verdict: dict, right: frozenset[str] = frozenset()) -> bool:
+def fair(
+    done: subprocess.CompletedProcess, verdict: dict, right: frozenset[str] = frozenset()
+) -> bool:
     """No traceback, no name that is not right; and either a verdict or an error of one sentence."""
     if "Traceback" in done.stderr or set(verdict.get("theta") or {}) - right:
         return False
-    return done.returncode == 2 and bool(done.stderr.strip()) if verdict["overall"] == "ERROR" else done.returncode in (0, REFUSED)
+    return (
+        done.returncode == 2 and bool(done.stderr.strip())
+        if verdict["overall"] == "ERROR"
+        else done.returncode in (0, REFUSED)
+    )
 
 
 def doubled(logs: Logs) -> Logs:
@@ -177,12 +228,22 @@ BAD = {
     "share_of_thrust": Bad(command_values(lambda u: u * [1.0 / FULL_THRUST, 1.0, 1.0, 1.0])),
     "roll_for_pitch": Bad(command_values(lambda u: u[:, [0, 2, 1, 3]])),
     "pitch_reversed": Bad(command_values(lambda u: u * [1.0, 1.0, -1.0, 1.0])),
-    "east_for_north": Bad(values(pos_w=lambda p: p[:, [1, 0, 2]], payload_pos_w=lambda p: p[:, [1, 0, 2]])),
+    "east_for_north": Bad(
+        values(pos_w=lambda p: p[:, [1, 0, 2]], payload_pos_w=lambda p: p[:, [1, 0, 2]])
+    ),
     "scalar_first": Bad(values(quat_wb=lambda q: q[:, [3, 0, 1, 2]])),
     "world_to_body": Bad(values(quat_wb=lambda q: q * [-1.0, -1.0, -1.0, 1.0])),
-    "bodies_exchanged": Bad(each(exchanged)), "late_commands": Bad(each(late_commands)), "frozen": Bad(each(frozen)),
-    "copied": Bad(doubled), "mixed_up": Bad(scrambled), "three_samples": Bad(each(lambda log: cut(log, 3))),
-    "no_commands": Bad(without("command")), "no_attitude": Bad(without("quat_wb")), "truncated": Bad(as_they_are, cut_to=0.6),
-    "empty_files": Bad(as_they_are, cut_to=0.0), "standing": Bad(standing, flown=False),
-    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping"})), "two_hours_still": Bad(hours_still, flown=False),
-}  # fmt: skip
+    "bodies_exchanged": Bad(each(exchanged)),
+    "late_commands": Bad(each(late_commands)),
+    "frozen": Bad(each(frozen)),
+    "copied": Bad(doubled),
+    "mixed_up": Bad(scrambled),
+    "three_samples": Bad(each(lambda log: cut(log, 3))),
+    "no_commands": Bad(without("command")),
+    "no_attitude": Bad(without("quat_wb")),
+    "truncated": Bad(as_they_are, cut_to=0.6),
+    "empty_files": Bad(as_they_are, cut_to=0.0),
+    "standing": Bad(standing, flown=False),
+    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping"})),
+    "two_hours_still": Bad(hours_still, flown=False),
+}

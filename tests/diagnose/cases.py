@@ -1,10 +1,11 @@
-"""Cases whose right answer follows from another answer: symmetries of sealed worlds, mixed-up logs, the model altered.
+"""Cases whose right answer follows from another answer: symmetries of sealed worlds, mixed-up logs,
+the model altered.
 
-    python -m tests.diagnose.cases mirror=10 swap=10 idempotence=10 scramble=10 --jobs 8 --ledger cases.jsonl
+    python -m tests.diagnose.cases mirror=10 swap=10 idempotence=10 scramble=10 --jobs 8 --ledger
+    cases.jsonl
 
-Each case is a world of its own, on a plant that shares no code with the package; the tool runs apart, as in
-:mod:`tests.diagnose.sealed`.
-"""
+Each case is a world of its own, on a plant that shares no code with the package; the tool runs
+apart, as in :mod:`tests.diagnose.sealed`."""
 
 import argparse
 import json
@@ -38,13 +39,32 @@ BASE = "train/state.toml"
 def environment() -> dict[str, str]:
     """Of a process that finds the package wherever it runs."""
     root = Path(__file__).resolve().parents[2]
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
+    }
 
 
-def command_for(count: int, recipe: Recipe, action: str = "explain", plant: str | None = None) -> list[str]:
-    """Arguments that ask about so many logs of a folder, with the model that is the world's null."""
-    command = ["diagnose", action, *[f"flight_{i:02d}.npz" for i in range(count)], "--device", "cpu", "--json", "said.json"]
-    command += ["--out", "out", *(["--no-report"] if action == "explain" else []), *(["--plant", plant] if plant else [])]
+def command_for(
+    count: int, recipe: Recipe, action: str = "explain", plant: str | None = None
+) -> list[str]:
+    """Arguments that ask about so many logs of a folder, with the model that is the
+    world's null.
+    """
+    command = [
+        "diagnose",
+        action,
+        *[f"flight_{i:02d}.npz" for i in range(count)],
+        "--device",
+        "cpu",
+        "--json",
+        "said.json",
+    ]
+    command += [
+        "--out",
+        "out",
+        *(["--no-report"] if action == "explain" else []),
+        *(["--plant", plant] if plant else []),
+    ]
     for item in model_of(recipe):
         command += ["--set", item]
     return command
@@ -56,15 +76,31 @@ def tool(folder: Path, *arguments: str, timeout: float = 1500.0) -> str:
     Raises:
         RuntimeError: It failed.
     """
-    done = subprocess.run([sys.executable, "-c", WITHOUT_TESTS, *arguments], cwd=folder, capture_output=True, text=True,
-                          timeout=timeout, env=environment(), check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TESTS, *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env=environment(),
+        check=False,
+    )
     if done.returncode not in (0, REFUSED):
-        raise RuntimeError(f"visthrow {' '.join(arguments)} ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}")
+        raise RuntimeError(
+            f"visthrow {' '.join(arguments)} ended with"
+            f" {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}"
+        )
     return done.stdout
 
 
-def explained(folder: Path, logs: Sequence[FlightLog], recipe: Recipe, plant: str | None = None, action: str = "explain",
-              more: Sequence[str] = ()) -> dict:  # fmt: skip
+def explained(
+    folder: Path,
+    logs: Sequence[FlightLog],
+    recipe: Recipe,
+    plant: str | None = None,
+    action: str = "explain",
+    more: Sequence[str] = (),
+) -> dict:
     """The tool's JSON about logs.
 
     Args:
@@ -89,15 +125,21 @@ def names(verdict: dict) -> set[str]:
 
 
 def is_right(verdict: dict, name: str) -> bool:
-    """One cause named: this one, alone or in a class that holds it, or one that flights of this kind hardly tell from it."""
+    """One cause named: this one, alone or in a class that holds it, or one that flights of this
+    kind hardly tell from it.
+    """
     groups = named_by(verdict)
     near = {name}.union(*(a for a in ALIKE if name in a))
     return len(groups) == 1 and bool(groups[0] & near)
 
 
 def size_is(verdict: dict, name: str, size: float) -> bool:
-    """Whether a named effect has this size within its deviation; true where another of its class was named."""
-    found = [f for f in verdict["findings"] if f["name"] == name and f["verdict"] in ("FOUND", "CLASS")]
+    """Whether a named effect has this size within its deviation; true where another of its class
+    was named.
+    """
+    found = [
+        f for f in verdict["findings"] if f["name"] == name and f["verdict"] in ("FOUND", "CLASS")
+    ]
     return all(abs(f["estimate"] - size) < NEAR * max(f["sd"], f["floor"]) for f in found)
 
 
@@ -105,9 +147,11 @@ def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: t
     """Whether two verdicts name the same effects with the same sizes, and say the same overall."""
     expected, came = sizes(one.get("theta") or {}), other.get("theta") or {}
     sd = {f["name"]: max(f["sd"], f["floor"]) for f in other["findings"]}
-    return one["overall"] == other["overall"] and set(expected) == set(came) and all(
-        abs(came[name] - size) < sd[name] for name, size in expected.items()
-    )  # fmt: skip
+    return (
+        one["overall"] == other["overall"]
+        and set(expected) == set(came)
+        and all(abs(came[name] - size) < sd[name] for name, size in expected.items())
+    )
 
 
 def configured(theta: dict[str, float], path: Path) -> str:
@@ -139,13 +183,17 @@ def _bare(recipe: Recipe) -> Recipe:
 def mirror(recipe: Recipe, folder: Path) -> dict:
     """The world is nominal and the model has what the recipe says: the opposite correction."""
     name, size = hidden(recipe)
-    verdict = explained(folder, logs_of(_bare(recipe)), recipe, configured(recipe.effects, folder / "model.toml"))
+    verdict = explained(
+        folder, logs_of(_bare(recipe)), recipe, configured(recipe.effects, folder / "model.toml")
+    )
     return {"passed": is_right(verdict, name) and size_is(verdict, name, -size), "said": verdict}
 
 
 def swap(recipe: Recipe, folder: Path) -> dict:
     """The effect is in both: nothing to be found."""
-    verdict = explained(folder, logs_of(recipe), recipe, configured(recipe.effects, folder / "model.toml"))
+    verdict = explained(
+        folder, logs_of(recipe), recipe, configured(recipe.effects, folder / "model.toml")
+    )
     return {"passed": verdict["overall"] == "NO EFFECT", "said": verdict}
 
 
@@ -155,14 +203,25 @@ def idempotence(recipe: Recipe, folder: Path) -> dict:
     first = explained(folder, logs, recipe)
     (folder / "first.json").write_text(json.dumps(first))
     tool(folder, "diagnose", "apply", "first.json", "--out", "extended.toml", "--plants", "1")
-    again = explained(folder, logs, recipe, str(folder / "extended.toml")) if names(first) else first
-    return {"passed": bool(names(first)) and again["overall"] == "NO EFFECT", "said": again, "before": first}
+    again = (
+        explained(folder, logs, recipe, str(folder / "extended.toml")) if names(first) else first
+    )
+    return {
+        "passed": bool(names(first)) and again["overall"] == "NO EFFECT",
+        "said": again,
+        "before": first,
+    }
 
 
 def scramble(recipe: Recipe, folder: Path) -> dict:
     """Commands of one flight with poses of another: no name."""
     verdict = explained(folder, altered.scrambled(logs_of(recipe)), recipe)
-    return {"passed": not names(verdict) and verdict["overall"] in ("DATA INCONSISTENT", "OUT OF DOMAIN"), "said": verdict}
+    return {
+        "passed": (
+            not names(verdict) and verdict["overall"] in ("DATA INCONSISTENT", "OUT OF DOMAIN")
+        ),
+        "said": verdict,
+    }
 
 
 def flip(recipe: Recipe, _: Path) -> dict:
@@ -179,10 +238,17 @@ def flip(recipe: Recipe, _: Path) -> dict:
     return {"passed": not names(verdict), "said": verdict}
 
 
-def _twice(recipe: Recipe, folder: Path, change: Callable[[list[FlightLog]], list[FlightLog]], sizes=lambda theta: theta) -> dict:
+def _twice(
+    recipe: Recipe,
+    folder: Path,
+    change: Callable[[list[FlightLog]], list[FlightLog]],
+    sizes=lambda theta: theta,
+) -> dict:
     logs = logs_of(recipe)
     first, second = explained(folder, logs, recipe), explained(folder, change(logs), recipe)
-    found = any(is_right(first, name) for name in recipe.effects)  # what is missed here must be missed alike
+    found = any(
+        is_right(first, name) for name in recipe.effects
+    )  # what is missed here must be missed alike
     return {"passed": same(first, second, sizes), "found": found, "said": second, "before": first}
 
 
@@ -191,15 +257,27 @@ def turn(recipe: Recipe, folder: Path) -> dict:
 
     def sizes(theta):
         quarter = {"wind_x": ("wind_y", 1.0), "wind_y": ("wind_x", -1.0)}
-        quarter |= {name.replace("wind", "frame_tilt"): (to.replace("wind", "frame_tilt"), s) for name, (to, s) in quarter.items()}
-        return {quarter.get(n, (n, 1))[0]: quarter.get(n, (n, 1))[1] * size for n, size in theta.items()}
+        quarter |= {
+            name.replace("wind", "frame_tilt"): (to.replace("wind", "frame_tilt"), s)
+            for name, (to, s) in quarter.items()
+        }
+        return {
+            quarter.get(n, (n, 1))[0]: quarter.get(n, (n, 1))[1] * size for n, size in theta.items()
+        }
 
-    return _twice(recipe, folder, lambda logs: [altered.turned(log, 0.5 * np.pi, (2.0, -1.0, 0.0)) for log in logs], sizes)
+    return _twice(
+        recipe,
+        folder,
+        lambda logs: [altered.turned(log, 0.5 * np.pi, (2.0, -1.0, 0.0)) for log in logs],
+        sizes,
+    )
 
 
 def leftright(recipe: Recipe, folder: Path) -> dict:
     """The flights seen in a mirror: the verdict seen in a mirror."""
-    return _twice(recipe, folder, lambda logs: [altered.mirrored(log) for log in logs], altered.mirrored_theta)
+    return _twice(
+        recipe, folder, lambda logs: [altered.mirrored(log) for log in logs], altered.mirrored_theta
+    )
 
 
 def permute(recipe: Recipe, folder: Path) -> dict:
@@ -210,19 +288,31 @@ def permute(recipe: Recipe, folder: Path) -> dict:
 
 def shift(recipe: Recipe, folder: Path) -> dict:
     """All clocks of each flight set forward, each by its own time."""
-    return _twice(recipe, folder, lambda logs: [altered.later(log, 1234.5 + 77.7 * i) for i, log in enumerate(logs)])
+    return _twice(
+        recipe,
+        folder,
+        lambda logs: [altered.later(log, 1234.5 + 77.7 * i) for i, log in enumerate(logs)],
+    )
 
 
 def copy(recipe: Recipe, folder: Path) -> dict:
     """A flight handed over twice, its clock set forward, counts once."""
     out = _twice(recipe, folder, lambda logs: [*logs, altered.later(logs[-1], 50.0)])
-    sd = [{f["name"]: f["sd"] for f in verdict["findings"]} for verdict in (out["before"], out["said"])]
-    alike = all(abs(sd[1][name] / sd[0][name] - 1.0) < 0.02 for name in names(out["said"]) if name in sd[0])
+    sd = [
+        {f["name"]: f["sd"] for f in verdict["findings"]}
+        for verdict in (out["before"], out["said"])
+    ]
+    alike = all(
+        abs(sd[1][name] / sd[0][name] - 1.0) < 0.02 for name in names(out["said"]) if name in sd[0]
+    )
     copied = out["said"].get("duplicates")
     return out | {"passed": bool(out["passed"] and alike and copied), "copied": copied}
 
 
-KINDS = {f.__name__: f for f in (mirror, swap, idempotence, scramble, flip, turn, leftright, permute, shift, copy)}
+KINDS = {
+    f.__name__: f
+    for f in (mirror, swap, idempotence, scramble, flip, turn, leftright, permute, shift, copy)
+}
 
 
 @dataclass(frozen=True)
@@ -235,7 +325,9 @@ class Task:
 
 
 def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
-    """World of a case: an effect and a plant from a seed; nothing where logs are spoiled, in a pair what belongs to it."""
+    """World of a case: an effect and a plant from a seed; nothing where logs are spoiled, in a pair
+    what belongs to it.
+    """
     from tests.diagnose.bad import BAD
     from tests.diagnose.degenerate import PAIRS
 
@@ -244,18 +336,30 @@ def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
         return Recipe(seed, str(rng.choice(PLANTS)), **SIZE)
     if kind in PAIRS:
         pair = PAIRS[kind]
-        return Recipe(seed, str(rng.choice(("rod", "string"))), {pair.effect: pair.size * float(rng.choice(pair.signs))}, **SIZE)
+        return Recipe(
+            seed,
+            str(rng.choice(("rod", "string"))),
+            {pair.effect: pair.size * float(rng.choice(pair.signs))},
+            **SIZE,
+        )
     name = str(rng.choice(list(FLOORS)))
     sign = 1.0 if name in ONE_SIDED else float(rng.choice([-1.0, 1.0]))
-    return Recipe(seed, str(rng.choice(PLANTS)), {name: sign * floors * FLOORS[name]}, floors, **SIZE)
+    return Recipe(
+        seed, str(rng.choice(PLANTS)), {name: sign * floors * FLOORS[name]}, floors, **SIZE
+    )
 
 
 def brief(verdict: dict) -> dict:
     """What a ledger keeps of a verdict."""
     found = [f for f in verdict["findings"] if f["verdict"] in ("FOUND", "CLASS")]
     keep = ("name", "verdict", "estimate", "sd", "partners")
-    return {"overall": verdict["overall"], "reasons": verdict.get("reasons"), "theta": verdict.get("theta"),
-            "findings": [{k: f[k] for k in keep} for f in found], "seconds": verdict.get("seconds")}  # fmt: skip
+    return {
+        "overall": verdict["overall"],
+        "reasons": verdict.get("reasons"),
+        "theta": verdict.get("theta"),
+        "findings": [{k: f[k] for k in keep} for f in found],
+        "seconds": verdict.get("seconds"),
+    }
 
 
 def run_case(task: Task) -> dict | None:
@@ -285,10 +389,17 @@ def main() -> None:
     """Run cases and add them to a ledger; cases that are there are not run again."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="+", metavar="KIND=COUNT", help=f"of {', '.join(KINDS)}")
-    parser.add_argument("--seed", type=int, help="of the first; drawn by the system where not given")
+    parser.add_argument(
+        "--seed", type=int, help="of the first; drawn by the system where not given"
+    )
     parser.add_argument("--ledger", type=Path, default=Path("cases.jsonl"))
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--slot", type=int, default=0, help="which of the machine's cores the first job takes (default: 0)")
+    parser.add_argument(
+        "--slot",
+        type=int,
+        default=0,
+        help="which of the machine's cores the first job takes (default: 0)",
+    )
     parser.add_argument("--minutes", type=float, default=1e6, help="begin no case later than this")
     args = parser.parse_args()
     first = int.from_bytes(os.urandom(4), "little") if args.seed is None else args.seed
@@ -296,11 +407,19 @@ def main() -> None:
     until = time.time() + 60.0 * args.minutes
     tasks = []
     for k, (kind, count) in enumerate(item.split("=") for item in args.cases):
-        tasks += [(i, Task(kind, draw(kind, first + 10_000 * k + 10 * i), until)) for i in range(int(count))]
+        tasks += [
+            (i, Task(kind, draw(kind, first + 10_000 * k + 10 * i), until))
+            for i in range(int(count))
+        ]
     done = set()
     if args.ledger.exists():
-        done = {(line["kind"], line["truth_sha256"]) for line in map(json.loads, args.ledger.read_text().splitlines())}
-    tasks = [task for _, task in sorted(tasks, key=lambda item: item[0])]  # one of each kind before the second of any
+        done = {
+            (line["kind"], line["truth_sha256"])
+            for line in map(json.loads, args.ledger.read_text().splitlines())
+        }
+    tasks = [
+        task for _, task in sorted(tasks, key=lambda item: item[0])
+    ]  # one of each kind before the second of any
     tasks = [task for task in tasks if (task.kind, task.recipe.digest()) not in done]
     tally: dict[str, Counter] = {}
     context = mp.get_context("spawn")
@@ -310,7 +429,9 @@ def main() -> None:
                 continue
             with args.ledger.open("a") as out:
                 out.write(json.dumps(line) + "\n")
-            tally.setdefault(line["kind"], Counter()).update(["cases"] + ["passed"] * bool(line["passed"]))
+            tally.setdefault(line["kind"], Counter()).update(
+                ["cases"] + ["passed"] * bool(line["passed"])
+            )
             said = line.get("said", {})
             told = said.get("overall"), said.get("theta"), line["seconds"], line.get("error", "")
             world = line["recipe"]["plant"], line["recipe"]["effects"]

@@ -1,4 +1,6 @@
-"""Logs of small vehicles with equations and integrators of their own: a thrown ball, and a quadrotor with or without a payload."""
+"""Logs of small vehicles with equations and integrators of their own: a thrown ball, and a
+quadrotor with or without a payload.
+"""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -14,13 +16,31 @@ LATE = -0.005
 
 
 def attitude(time: np.ndarray) -> Rotation:
-    angles = np.column_stack([0.6 * np.sin(0.5 * time), 0.35 * np.sin(2.3 * time + 1), 0.35 * np.sin(1.7 * time)])
+    angles = np.column_stack(
+        [0.6 * np.sin(0.5 * time), 0.35 * np.sin(2.3 * time + 1), 0.35 * np.sin(1.7 * time)]
+    )
     return Rotation.from_euler("ZYX", angles)
 
 
-def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slope=0.0, noise=2e-4, seed=0, *, wind=0.0, late=0.0,
-        fade=0.0, swirl=0.0, beat=0.0) -> FlightLog:  # fmt: skip
-    """A vehicle with an attitude of closed form and motors that hold it up; equations and integrator of the test's own."""
+def fly(
+    seconds=6.0,
+    gain=1.0,
+    drag=0.0,
+    cable=None,
+    payload_drag=0.0,
+    volts_slope=0.0,
+    noise=2e-4,
+    seed=0,
+    *,
+    wind=0.0,
+    late=0.0,
+    fade=0.0,
+    swirl=0.0,
+    beat=0.0,
+) -> FlightLog:
+    """A vehicle with an attitude of closed form and motors that hold it up; equations and
+    integrator of the test's own.
+    """
     rng = np.random.default_rng(seed)
     mass, payload, step = 0.03, 0.008, 0.005
     load = mass + (payload if cable else 0.0)
@@ -28,14 +48,23 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
     half = np.arange(0.0, seconds + step, 0.5 * step)
     begin = 10.0 * seed  # no two flights turn alike
     rot = attitude(half + begin).as_matrix()
-    told = load * G / rot[:, 2, 2] * (1.0 + 0.15 * np.sin(3.1 * half + phases[0]) + 0.1 * np.sin(1.3 * half + phases[1]))
+    told = (
+        load
+        * G
+        / rot[:, 2, 2]
+        * (1.0 + 0.15 * np.sin(3.1 * half + phases[0]) + 0.1 * np.sin(1.3 * half + phases[1]))
+    )
     volts = 4.1 - 0.05 * half
     level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
 
     def slope(i, state):
         p, v, thrust = state[:3], state[3:6], state[6]
         body = rot[i].T @ (v - [wind, 0.0, 0.0])
-        force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [0, 0, mass * G]
+        force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [
+            0,
+            0,
+            mass * G,
+        ]
         force = force + [swirl * v[1], beat * np.sin(4.5 * half[i]) - swirl * v[0], 0.0]
         lag = [(told[i] - thrust) / 0.03]
         if cable is None:
@@ -43,10 +72,17 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
         vp = state[10:13]
         along = (state[7:10] - p) / np.sqrt(np.sum((state[7:10] - p) ** 2))
         weight = -payload_drag * np.sqrt(vp @ vp) * vp - [0, 0, payload * G]
-        pull = (along @ (weight / payload - force / mass) + (vp - v) @ (vp - v) / cable) / (1 / mass + 1 / payload)
-        return np.concatenate([v, (force + pull * along) / mass, lag, vp, (weight - pull * along) / payload])
+        pull = (along @ (weight / payload - force / mass) + (vp - v) @ (vp - v) / cable) / (
+            1 / mass + 1 / payload
+        )
+        return np.concatenate(
+            [v, (force + pull * along) / mass, lag, vp, (weight - pull * along) / payload]
+        )
 
-    state = np.array([0, 0, 5.0, 0, 0, 0, told[0]] + ([0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99), 0, 0, 0] if cable else []))
+    state = np.array(
+        [0, 0, 5.0, 0, 0, 0, told[0]]
+        + ([0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99), 0, 0, 0] if cable else [])
+    )
     path = [state]
     for i in range(0, len(half) - 2, 2):
         k1 = slope(i, state)
@@ -62,14 +98,17 @@ def fly(seconds=6.0, gain=1.0, drag=0.0, cable=None, payload_drag=0.0, volts_slo
         return Channel(time, columns + rng.normal(0, noise, (len(time), 3)), "m", "world")
 
     channels = {
-        "pos_w": seen(path[:, :3]), "quat_wb": Channel(time, attitude(time + begin - late).as_quat(), "1", "world"),
+        "pos_w": seen(path[:, :3]),
+        "quat_wb": Channel(time, attitude(time + begin - late).as_quat(), "1", "world"),
         "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
         "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
-    }  # fmt: skip
+    }
     return FlightLog(channels | ({"payload_pos_w": seen(path[:, 7:10])} if cable else {}))
 
 
-def ball_log(drag=0.0, wind=(0.0, 0.0), spin=(0.0, 0.0, 0.0), noise=1e-4, seed=0, heading=0.0) -> FlightLog:
+def ball_log(
+    drag=0.0, wind=(0.0, 0.0), spin=(0.0, 0.0, 0.0), noise=1e-4, seed=0, heading=0.0
+) -> FlightLog:
     """A throw, held before and after: scipy's integrator."""
     rng = np.random.default_rng(seed)
     speed = rng.uniform(2.5, 4.0)
@@ -84,4 +123,6 @@ def ball_log(drag=0.0, wind=(0.0, 0.0), spin=(0.0, 0.0, 0.0), noise=1e-4, seed=0
     rest = np.arange(1, 60) / 240
     time = np.concatenate([time, 0.8 + rest])
     path = np.concatenate([path, np.tile(path[-1], (len(rest), 1))])
-    return FlightLog({"payload_pos_w": Channel(time, path + rng.normal(0, noise, path.shape), "m", "world")})
+    return FlightLog(
+        {"payload_pos_w": Channel(time, path + rng.normal(0, noise, path.shape), "m", "world")}
+    )

@@ -1,12 +1,14 @@
-"""What optimised excitation is worth on flights: the optimised manoeuvre beside the best fixed one, flown as long, effects hidden.
+"""What optimised excitation is worth on flights: the optimised manoeuvre beside the best fixed one,
+flown as long, effects hidden.
 
-    python -m tests.diagnose.planned [--seed 1] [--steps 6]            a throw's vehicle, on an independent plant
-    python -m tests.diagnose.planned --setup cf_payload                a setup's, on the training simulator
+    python -m tests.diagnose.planned [--seed 1] [--steps 6]            a throw's vehicle, on an
+    independent plant python -m tests.diagnose.planned --setup cf_payload                a setup's,
+    on the training simulator
 
-From hovers without hidden effects the next flight is planned for some effects. Then one after the other is hidden at 10 floors, both
-manoeuvres are flown twice beside the hovers, and the search is asked. A line for each effect: the 95 % interval's width in floors, its
-nats, and whether it was named, alone, with the fixed manoeuvre and with the optimised one.
-"""
+From hovers without hidden effects the next flight is planned for some effects. Then one after the
+other is hidden at 10 floors, both manoeuvres are flown twice beside the hovers, and the search is
+asked. A line for each effect: the 95 % interval's width in floors, its nats, and whether it was
+named, alone, with the fixed manoeuvre and with the optimised one."""
 
 import argparse
 import json
@@ -30,7 +32,14 @@ from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of
 
 SIZE, TWICE = 10.0, 2
-THROW = ("yaw_drag_coeff", "inertia_z", "rotor_gyro", "translational_lift", "flapping", "marker_rot_z")
+THROW = (
+    "yaw_drag_coeff",
+    "inertia_z",
+    "rotor_gyro",
+    "translational_lift",
+    "flapping",
+    "marker_rot_z",
+)
 SETUP = ("rotor_drag_xy", "rotor_drag_z", "motor_tau", "parasitic", "translational_lift")
 HOVER = next(m for m in catalogue() if m.name == "hover")
 
@@ -62,7 +71,9 @@ def of_setup(name: str, seed: int) -> Flown:
     noise = {params.position: 3e-4, "payload_pos_w": 3e-4, "rate_b": 2e-2}
 
     def flown(effects: Mapping[str, float], manoeuvres: Sequence[Manoeuvre], number: int) -> Model:
-        flights = fly(altered(plant, effects), [carried(m, params) for m in manoeuvres], seed + number)
+        flights = fly(
+            altered(plant, effects), [carried(m, params) for m in manoeuvres], seed + number
+        )
         return FlyerModel([flight.setup_log(params, noise) for flight in flights], params)
 
     return flown
@@ -76,7 +87,13 @@ def altered(plant: PlantParams, effects: Mapping[str, float]) -> PlantParams:
         if name == "motor_tau":
             v = replace(v, motor=replace(v.motor, time_constant=v.motor.time_constant + size))
         else:
-            v = replace(v, aero=replace(v.aero, **{field: getattr(v.aero, field) + size for field in more.get(name, (name,))}))
+            v = replace(
+                v,
+                aero=replace(
+                    v.aero,
+                    **{field: getattr(v.aero, field) + size for field in more.get(name, (name,))},
+                ),
+            )
     return replace(plant, vehicle=v)
 
 
@@ -87,23 +104,42 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=6)
     parser.add_argument("--setup", default="")
     args = parser.parse_args()
-    names, flown = (SETUP, of_setup(args.setup, args.seed)) if args.setup else (THROW, of_throw(args.seed))
+    names, flown = (
+        (SETUP, of_setup(args.setup, args.seed)) if args.setup else (THROW, of_throw(args.seed))
+    )
     model = flown({}, [HOVER] * 2, 0)
     diagnosis = search.explain(model, laws=False)
     aim = Aim(diagnosis, names)
     made = (lambda logs: FlyerModel(logs, model.params)) if args.setup else None
     simulate, flies = simulator_of(model, diagnosis, made, seed=args.seed)
     able = [m for m in map(flies, catalogue()) if m is not None]
-    told = [(aim.nats(aim.information(s.model)) / m.seconds, m) for m, s in zip(able, simulate(able)) if s.model is not None]
-    found = optimise(aim, max(told, key=lambda each: each[0])[1], simulate, Limits(), seed=args.seed, steps=args.steps)
+    told = [
+        (aim.nats(aim.information(s.model)) / m.seconds, m)
+        for m, s in zip(able, simulate(able))
+        if s.model is not None
+    ]
+    found = optimise(
+        aim,
+        max(told, key=lambda each: each[0])[1],
+        simulate,
+        Limits(),
+        seed=args.seed,
+        steps=args.steps,
+    )
     print(json.dumps(found.said()), flush=True)
     for i, name in enumerate(names):
         floor = next(e.floor for e in model.effects if e.name == name)
         line = {"effect": name}
         for kind, manoeuvre in (("fixed", found.base), ("optimised", found.manoeuvre)):
-            said = search.explain(flown({name: SIZE * floor}, [HOVER] * 2 + [manoeuvre] * TWICE, i + 1), laws=False)
+            said = search.explain(
+                flown({name: SIZE * floor}, [HOVER] * 2 + [manoeuvre] * TWICE, i + 1), laws=False
+            )
             own = said[name]
-            line[kind] = {"width": (own.high - own.low) / floor, "nats": own.nats, "right": said.named == (name,)}
+            line[kind] = {
+                "width": (own.high - own.low) / floor,
+                "nats": own.nats,
+                "right": said.named == (name,),
+            }
         print(json.dumps(line), flush=True)
 
 

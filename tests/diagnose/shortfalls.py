@@ -11,10 +11,11 @@ from visthrow.diagnose.models.interface import Model
 
 
 def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:
-    """How much worse than by the last of some sizes flights are explained that none of them was found in.
+    """How much worse than by the last of some sizes flights are explained that none of them was
+    found in.
 
-    Initial states and gusts are integrated out (a forecast without gusts would mostly measure those); the levels of noise and
-    gusts are those of the last sizes.
+    Initial states and gusts are integrated out (a forecast without gusts would mostly measure
+    those); the levels of noise and gusts are those of the last sizes.
 
     Returns:
         Nats by which each likelihood falls short of the last one, and the number of samples.
@@ -26,5 +27,9 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     squares = []
     for windows, grams in zip(told, raw):
         shaped = designs.correlated_of(grams, windows, noise.correlation_time, "cpu")
-        squares.append(sum(share.square for share in integrals(shaped, noise).shares(shaped, noise)))
-    return [float(0.5 * (square - squares[-1])) for square in squares], sum(len(w.residual) for w in told[-1])
+        squares.append(
+            sum(share.square for share in integrals(shaped, noise).shares(shaped, noise))
+        )
+    return [float(0.5 * (square - squares[-1])) for square in squares], sum(
+        len(w.residual) for w in told[-1]
+    )

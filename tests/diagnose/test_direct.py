@@ -1,4 +1,6 @@
-"""A camera's keypoints: the worlds' camera against the package's, and what the diagnosis takes from a detector's marks."""
+"""A camera's keypoints: the worlds' camera against the package's, and what the diagnosis takes from
+a detector's marks.
+"""
 
 import dataclasses
 from types import SimpleNamespace
@@ -38,7 +40,11 @@ class Eyes:
         self.setting = Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera)
         flights = [record_of(log, i) for i, log in enumerate(self.logs)]
         release = self.setting.plant.release
-        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, release.lag, release.landing_height, True)]
+        cuts = [
+            c
+            for i, f in enumerate(flights)
+            for c in cut(f, i, release.lag, release.landing_height, True)
+        ]
         self.view = CameraView(self.logs, flights, cuts, self.setting)
         self.windows = sorted(self.view.windows)
 
@@ -51,8 +57,13 @@ class Eyes:
         """The same of an effect, a unit of it, by the step that the model takes."""
         step = catalogue()[name].step * catalogue()[name].floor
         other = catalogue()[name].apply(self.setting, step)
-        pairs = [(self.view.predicted(w, other) - self.view.predicted(w, self.setting), self.view.samples(w)[2])
-                 for w in self.windows]  # fmt: skip
+        pairs = [
+            (
+                self.view.predicted(w, other) - self.view.predicted(w, self.setting),
+                self.view.samples(w)[2],
+            )
+            for w in self.windows
+        ]
         return np.concatenate([change / sigma for change, sigma in pairs]) / step
 
 
@@ -69,12 +80,19 @@ def test_the_worlds_camera_sees_what_the_packages_sees():
     pos = rng.uniform(-1.0, 1.0, (count, 3)) + [0.0, 0.0, 2.0]
     ball = pos + rng.normal(size=(count, 3)) * 0.1 + [0.0, 0.0, -0.38]
     goal = np.array([1.0, 0.5, 0.0])
-    flight = SimpleNamespace(time=np.arange(count) * 1e-3, pos=pos[None], quat=quat[None], ball=ball[None])
+    flight = SimpleNamespace(
+        time=np.arange(count) * 1e-3, pos=pos[None], quat=quat[None], ball=ball[None]
+    )
     found, seen = marks(flight, 0, flight.time, goal, hide({}))
 
-    lens = KeypointCamera(config.load(Experiment, config.find("train", "state")).camera, dtype=torch.float64)
+    lens = KeypointCamera(
+        config.load(Experiment, config.find("train", "state")).camera, dtype=torch.float64
+    )
     arrays = pos, matrix(quat), np.tile(goal, (count, 1)), ball
-    points, valid = (x.numpy() for x in keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(x)) for x in arrays]))
+    points, valid = (
+        x.numpy()
+        for x in keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(x)) for x in arrays])
+    )
     pixels = points * FOCAL * HALF_VIEW + CENTRE
     np.testing.assert_array_equal(seen[:, :4], valid[:, :4])
     np.testing.assert_allclose(pixels[:, :4][seen[:, :4]], found[:, :4][seen[:, :4]], atol=1e-9)
@@ -84,7 +102,9 @@ def test_the_worlds_camera_sees_what_the_packages_sees():
 
 @pytest.mark.parametrize("name", CAMERA_FLOORS)
 def test_every_effect_of_the_camera_is_measured_by_keypoints_alone(flown, name):
-    """With a track that jumps at the ends of its pieces the latency was a tenth of what was hidden."""
+    """With a track that jumps at the ends of its pieces the latency was a tenth of what
+    was hidden.
+    """
     truth = SIZE * CAMERA_FLOORS[name]
     assert CAMERA_FLOORS[name] == catalogue()[name].floor
     eyes = Eyes(flown, {name: truth})

@@ -1,4 +1,6 @@
-"""What is hidden must be found: the tool passes the suite of :mod:`tests.diagnose.finding`, and four spoilt tools do not."""
+"""What is hidden must be found: the tool passes the suite of :mod:`tests.diagnose.finding`, and
+four spoilt tools do not.
+"""
 
 import os
 from collections import Counter
@@ -14,7 +16,9 @@ SPOILT = {
     "always NO EFFECT": lambda kinds, real: finding.blind,
     "always the most common name": lambda kinds, real: finding.always(most_common(kinds)),
     "reads file names": lambda kinds, real: finding.reader_of_file_names,
-    "takes two effects for each other": lambda kinds, real: finding.exchanged(kinds[0].hidden[0], kinds[1].hidden[0], real),
+    "takes two effects for each other": lambda kinds, real: finding.exchanged(
+        kinds[0].hidden[0], kinds[1].hidden[0], real
+    ),
 }
 """What is wrong with a tool -> it, made for these kinds of worlds and from the real one."""
 
@@ -53,8 +57,14 @@ def test_a_spoilt_tool_is_caught(name, suite, real):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_what_is_hidden_is_found_in_more_worlds(seed):
     """Further suites, and a plant of MuJoCo, whose flights take longer."""
-    chain = [finding.Kind((), "chain"), finding.Kind(("com_x",), "chain"), finding.Kind(("cmd_delay",), "chain")]
-    finding.require(finding.explain, [*finding.kinds(np.random.default_rng(seed)), *chain], 1_000_000 * seed)
+    chain = [
+        finding.Kind((), "chain"),
+        finding.Kind(("com_x",), "chain"),
+        finding.Kind(("cmd_delay",), "chain"),
+    ]
+    finding.require(
+        finding.explain, [*finding.kinds(np.random.default_rng(seed)), *chain], 1_000_000 * seed
+    )
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
-"""The foreign generator: null worlds are the tool's model but for the noise, hidden ones are not; answers are judged as they should be."""
+"""The foreign generator: null worlds are the tool's model but for the noise, hidden ones are not;
+answers are judged as they should be.
+"""
 
 import numpy as np
 import pytest
@@ -30,22 +32,40 @@ def test_a_world_without_a_hidden_effect_is_what_its_owner_expects(vehicle):
 
 
 def test_worlds_differ_and_every_effect_is_hidden_by_some_seed():
-    assert {foreign.drawn(seed)[1] for seed in range(600)} == {"", *foreign.FOREIGN, *foreign.HIDDEN}
+    assert {foreign.drawn(seed)[1] for seed in range(600)} == {
+        "",
+        *foreign.FOREIGN,
+        *foreign.HIDDEN,
+    }
     for seed in range(40):
         _, hidden, world = foreign.drawn(seed)
         base = foreign.CRAFT[foreign.drawn(seed)[0]] | {"gain": 1.0}
-        changed = {key for key, value in world.items() if key != "J" and value != base.get(key, 0.0)}
-        assert changed == ({hidden} if hidden in foreign.FOREIGN else {foreign.HIDDEN[hidden]} if hidden else set())
+        changed = {
+            key for key, value in world.items() if key != "J" and value != base.get(key, 0.0)
+        }
+        assert changed == (
+            {hidden} if hidden in foreign.FOREIGN else {foreign.HIDDEN[hidden]} if hidden else set()
+        )
 
 
 @pytest.mark.parametrize(
     ("hidden", "groups", "overall", "judged"),
-    [("", [], "NO EFFECT", "right"), ("", [], "UNKNOWN", "unsure"), ("", [{"wind_x"}], "KNOWN", "false"),
-     ("beat", [{"wind_x"}], "EXPLAINED IN PART", "part"), ("wake", [{"wind_x"}], "UNKNOWN", "part"), ("swirl", [], "UNKNOWN", "unknown"),
-     ("swirl", [], "NO EFFECT", "missed"), ("swirl", [{"wind_x"}], "KNOWN", "false"), ("lag", [], "NO EFFECT", "missed"),
-     ("mass_quad", [{"mass_quad"}], "KNOWN", "right"), ("mass_quad", [{"mass_quad", "thrust_gain"}], "KNOWN", "class"),
-     ("mass_quad", [{"mass_quad", "wind_x"}], "KNOWN", "false"), ("mass_quad", [{"mass_quad"}, {"wind_x"}], "KNOWN", "false"),
-     ("mass_quad", [{"thrust_gain"}], "KNOWN", "false")],
-)  # fmt: skip
+    [
+        ("", [], "NO EFFECT", "right"),
+        ("", [], "UNKNOWN", "unsure"),
+        ("", [{"wind_x"}], "KNOWN", "false"),
+        ("beat", [{"wind_x"}], "EXPLAINED IN PART", "part"),
+        ("wake", [{"wind_x"}], "UNKNOWN", "part"),
+        ("swirl", [], "UNKNOWN", "unknown"),
+        ("swirl", [], "NO EFFECT", "missed"),
+        ("swirl", [{"wind_x"}], "KNOWN", "false"),
+        ("lag", [], "NO EFFECT", "missed"),
+        ("mass_quad", [{"mass_quad"}], "KNOWN", "right"),
+        ("mass_quad", [{"mass_quad", "thrust_gain"}], "KNOWN", "class"),
+        ("mass_quad", [{"mass_quad", "wind_x"}], "KNOWN", "false"),
+        ("mass_quad", [{"mass_quad"}, {"wind_x"}], "KNOWN", "false"),
+        ("mass_quad", [{"thrust_gain"}], "KNOWN", "false"),
+    ],
+)
 def test_answers_are_judged(hidden, groups, overall, judged):
     assert foreign.judged(hidden, groups, overall) == judged

@@ -19,23 +19,49 @@ def world(effects: dict, named: list, kind: str = "1x10", **more) -> dict:
     """A line of a ledger."""
     recipe = {"effects": effects, "plant": "rod", "seed": 1}
     overall = "KNOWN" if named else "NO EFFECT"
-    return {"kind": kind, "recipe": recipe, "named": named, "overall": overall, "explain_s": 1.0} | more
+    return {
+        "kind": kind,
+        "recipe": recipe,
+        "named": named,
+        "overall": overall,
+        "explain_s": 1.0,
+    } | more
 
 
 def told(overall: str, recipe: dict, named=(), **more) -> bool:
     made = world(recipe.pop("effects", {}), list(named), **more)
-    return ledger.right(made | {"overall": overall, "unknown": overall == "UNKNOWN", "recipe": made["recipe"] | recipe})
+    return ledger.right(
+        made
+        | {
+            "overall": overall,
+            "unknown": overall == "UNKNOWN",
+            "recipe": made["recipe"] | recipe,
+        }
+    )
 
 
-@pytest.mark.parametrize(("recipe", "right", "more", "wrong"), [
-    ({}, "NO EFFECT", {}, "KNOWN"),
-    ({"effects": {"law_ball_swirl": 0.02}}, "UNKNOWN", {}, "NO EFFECT"),
-    ({"lost": 0.1}, "KNOWN", {"varies": ["dropped_commands"]}, "UNKNOWN"),
-    ({"varies": {"cmd_delay": 0.01}}, "KNOWN", {"varies": ["cmd_jitter"]}, "UNKNOWN"),
-    ({"varies": {"mass_payload": 0.01}}, "KNOWN", {"varies": ["mass_payload_by_flight"]}, "NO EFFECT"),
-    ({"varies": {"cmd_delay": 0.01}, "days": 4}, "KNOWN", {"varies": ["cmd_jitter"], "drifts": [["cmd_delay"]]}, "UNKNOWN"),
-    ({"effects": {"com_x": 0.01}}, "KNOWN", {"class": True}, "UNKNOWN"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("recipe", "right", "more", "wrong"),
+    [
+        ({}, "NO EFFECT", {}, "KNOWN"),
+        ({"effects": {"law_ball_swirl": 0.02}}, "UNKNOWN", {}, "NO EFFECT"),
+        ({"lost": 0.1}, "KNOWN", {"varies": ["dropped_commands"]}, "UNKNOWN"),
+        ({"varies": {"cmd_delay": 0.01}}, "KNOWN", {"varies": ["cmd_jitter"]}, "UNKNOWN"),
+        (
+            {"varies": {"mass_payload": 0.01}},
+            "KNOWN",
+            {"varies": ["mass_payload_by_flight"]},
+            "NO EFFECT",
+        ),
+        (
+            {"varies": {"cmd_delay": 0.01}, "days": 4},
+            "KNOWN",
+            {"varies": ["cmd_jitter"], "drifts": [["cmd_delay"]]},
+            "UNKNOWN",
+        ),
+        ({"effects": {"com_x": 0.01}}, "KNOWN", {"class": True}, "UNKNOWN"),
+    ],
+)
 def test_what_is_told_as_what_it_is(recipe, right, more, wrong):
     assert told(right, dict(recipe), **more)
     assert not told(wrong, dict(recipe), **more)
@@ -58,13 +84,27 @@ def drawn_curve(rng, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_hidden_effects_that_look_alike_count_once_each():
-    """Thrust and mass, hidden together: each name stands for its own, a class for one, and no name for two."""
+    """Thrust and mass, hidden together: each name stands for its own, a class for one, and no name
+    for two.
+    """
     both = {"thrust_gain", "mass_quad"}
     assert sealed.matched([{"mass_quad"}, {"thrust_gain"}], both) == ["mass_quad", "thrust_gain"]
-    assert sealed.matched([{"thrust_gain", "mass_quad"}, {"mass_quad"}], both) == ["thrust_gain", "mass_quad"]
+    assert sealed.matched([{"thrust_gain", "mass_quad"}, {"mass_quad"}], both) == [
+        "thrust_gain",
+        "mass_quad",
+    ]
     assert sealed.matched([{"air_density"}], both) == ["mass_quad"]
-    assert sealed.matched([{"thrust_gain"}, {"air_density"}, {"wind_x"}], {"thrust_gain"}) == ["thrust_gain", "", ""]
-    assert ledger.names(world(dict.fromkeys(both, 0.01), [["mass_quad"], ["thrust_gain"]])) == (2, 2, 2, 2)
+    assert sealed.matched([{"thrust_gain"}, {"air_density"}, {"wind_x"}], {"thrust_gain"}) == [
+        "thrust_gain",
+        "",
+        "",
+    ]
+    assert ledger.names(world(dict.fromkeys(both, 0.01), [["mass_quad"], ["thrust_gain"]])) == (
+        2,
+        2,
+        2,
+        2,
+    )
 
 
 def test_a_completeness_curve_is_found_again():
@@ -98,7 +138,9 @@ def test_sizes_that_were_all_named_leave_the_limit_open_below_and_few_worlds_lea
     assert none[1] > 20.0
 
 
-def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_camera_apart(tmp_path):
+def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_camera_apart(
+    tmp_path,
+):
     floors = np.geomspace(1.0, 15.0, 12)
     sizes = {"camera_tilt_x": 1.0, "marker_rot_x": 1.0, "payload_drag": 2.0}
     worlds = []
@@ -107,13 +149,20 @@ def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_
             one = world({name: float(scale * f * ALL_FLOORS[name])}, [[name]] if f > 4.0 else [])
             one["recipe"]["camera"] = name != "payload_drag"
             worlds.append(one)
-    rows = {line.split(" | ")[0].strip("| "): line.split(" | ") for line in ledger.completeness(worlds)[2:]}
+    rows = {
+        line.split(" | ")[0].strip("| "): line.split(" | ")
+        for line in ledger.completeness(worlds)[2:]
+    }
     tilt = rows["camera_tilt_x"]
     assert tilt[4] == "deg"
-    assert float(tilt[6].split()[0].strip("<>")) == pytest.approx(math.degrees(4.0 * ALL_FLOORS["camera_tilt_x"]), rel=0.4)
+    assert float(tilt[6].split()[0].strip("<>")) == pytest.approx(
+        math.degrees(4.0 * ALL_FLOORS["camera_tilt_x"]), rel=0.4
+    )
     assert tilt[7] == "0.2"
     assert rows["payload_drag"][7] == "0.3"
-    assert float(rows["payload_drag"][2].split()[0]) == pytest.approx(2e-4 * 0.51 / 1.04e-3, rel=0.02)
+    assert float(rows["payload_drag"][2].split()[0]) == pytest.approx(
+        2e-4 * 0.51 / 1.04e-3, rel=0.02
+    )
     assert "marker_rot_x, camera" in rows
     assert rows["marker_rot_x"][1] == "0"
     assert rows["rope_length"][-1].startswith("too few worlds")
@@ -121,20 +170,34 @@ def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_
     assert (tmp_path / "completeness.png").stat().st_size > 10_000
 
 
-SHIPPED = {name: [json.loads(line) for line in (Path(__file__).parent / name).read_text().splitlines()]
-           for name in ("ledger.jsonl", "ledger-earlier.jsonl")}  # fmt: skip
+SHIPPED = {
+    name: [json.loads(line) for line in (Path(__file__).parent / name).read_text().splitlines()]
+    for name in ("ledger.jsonl", "ledger-earlier.jsonl")
+}
 PAGE = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis_trust.md").read_text()
 TRUST = PAGE.split("## Hidden worlds")[1].split("\n## ")[0]
 KINDS = {
-    "nothing; noise": "null", "one effect, 15": "1x15", "one effect, 10 floors |": "1x10", "one effect, 6": "1x6", "one effect, 3": "curve",
-    "a delay": "limit:cmd_delay", "thrust, off": "limit:thrust_gain", "two effects": "2x12", "three effects": "3x12", "a law": "law",
-    "1 to 15 floors": "sight", "nothing, and some": "null+dust", "one effect, 10 floors, and": "1x10+dust",
-}  # fmt: skip
+    "nothing; noise": "null",
+    "one effect, 15": "1x15",
+    "one effect, 10 floors |": "1x10",
+    "one effect, 6": "1x6",
+    "one effect, 3": "curve",
+    "a delay": "limit:cmd_delay",
+    "thrust, off": "limit:thrust_gain",
+    "two effects": "2x12",
+    "three effects": "3x12",
+    "a law": "law",
+    "1 to 15 floors": "sight",
+    "nothing, and some": "null+dust",
+    "one effect, 10 floors, and": "1x10+dust",
+}
 
 
 @pytest.mark.parametrize(("begins", "kind"), KINDS.items())
 def test_the_page_says_what_the_shipped_ledger_says(begins, kind):
-    """Worlds, found, names up to class, exact, more names than causes: cell by cell; none is left out of any row."""
+    """Worlds, found, names up to class, exact, more names than causes: cell by cell; none is left
+    out of any row.
+    """
     group = [w for w in ledger.answered(SHIPPED["ledger.jsonl"]) if w["kind"] == kind]
     (row,) = [line for line in TRUST.splitlines() if line.startswith(f"| {begins}")]
     cells = [cell.strip() for cell in row.strip("|").split("|")][1:]
@@ -145,8 +208,15 @@ def test_the_page_says_what_the_shipped_ledger_says(begins, kind):
     if kind == "law":
         ranks = [(w["laws"] + [None])[:3] for w in group]
         terms = [sealed.TERMS[next(iter(w["recipe"]["effects"]))] for w in group]
-        first, among = sum(r[0] == t for r, t in zip(ranks, terms)), sum(t in r for r, t in zip(ranks, terms))
-        expected = [f"UNKNOWN in {len(group)}", f"true term first in {first}, among three in {among}", "-"]
+        first, among = (
+            sum(r[0] == t for r, t in zip(ranks, terms)),
+            sum(t in r for r, t in zip(ranks, terms)),
+        )
+        expected = [
+            f"UNKNOWN in {len(group)}",
+            f"true term first in {first}, among three in {among}",
+            "-",
+        ]
         expected += ["wrong names beside it in one [0, 5]"]
         assert [w.get("unknown") for w in group] == [True] * len(group)
         assert more == 1
@@ -165,7 +235,10 @@ def test_the_page_says_what_the_ledgers_intervals_hold_and_whose_worlds_are_coun
         (line,) = [line for line in ledger.coverage(group) if line.startswith("- 95")]
         assert line.split(": ")[1].replace("/", " of ") in TRUST
     before = [w for w in SHIPPED["ledger-earlier.jsonl"] if w["commit"] == "88f7402"]
-    counts = {name: len(size) for name, (size, _) in ledger.singles(ledger.answered(kept + before)).items()}
+    counts = {
+        name: len(size)
+        for name, (size, _) in ledger.singles(ledger.answered(kept + before)).items()
+    }
     assert f"over {sum(counts.values())} worlds with one effect" in TRUST
     assert f"| rope length | 1.6 mm | {counts['rope_length']} |" in TRUST
     assert f"| thrust | 0.99 % [0.94, 1.1] | {counts['thrust_gain']} |" in TRUST
@@ -173,15 +246,29 @@ def test_the_page_says_what_the_ledgers_intervals_hold_and_whose_worlds_are_coun
 
 def test_names_are_counted_up_to_class_and_alone():
     pair = {"rope_length": 0.01, "wind_x": 0.3}
-    assert ledger.names(world(pair, [["payload_offset", "rope_length"], ["wind_x"]])) == (2, 2, 1, 2)
+    assert ledger.names(world(pair, [["payload_offset", "rope_length"], ["wind_x"]])) == (
+        2,
+        2,
+        1,
+        2,
+    )
     assert ledger.names(world(pair, [["payload_offset"], ["com_x"]])) == (2, 1, 0, 1)
-    assert ledger.names(world(pair, [["rope_length"], ["payload_offset"]])) == (2, 1, 1, 1)  # a cause counts once
+    assert ledger.names(world(pair, [["rope_length"], ["payload_offset"]])) == (
+        2,
+        1,
+        1,
+        1,
+    )  # a cause counts once
     assert ledger.names(world({"law_ball_swirl": 0.02}, [["wind_x"]])) == (1, 0, 0, 0)
 
 
 def test_a_failure_counts_as_a_miss_and_a_world_not_waited_for_as_nothing():
     effect = {"wind_x": 0.3}
-    worlds = [world(effect, [["wind_x"]]), world(effect, [], error="it broke"), world(effect, [], error=NOT_WAITED)]
+    worlds = [
+        world(effect, [["wind_x"]]),
+        world(effect, [], error="it broke"),
+        world(effect, [], error=NOT_WAITED),
+    ]
     row = next(line for line in ledger.accuracy(worlds) if line.startswith("| 1x10"))
     assert row.startswith("| 1x10 | 2 | 1 | 1 | 1/2 = 50 %")
     text = ledger.summary(worlds)
@@ -190,13 +277,28 @@ def test_a_failure_counts_as_a_miss_and_a_world_not_waited_for_as_nothing():
 
 
 def test_coverage_counts_what_the_intervals_hold():
-    """Errors of a normal distribution of the stated deviation: each level must come out as itself."""
+    """Errors of a normal distribution of the stated deviation: each level must come out
+    as itself.
+    """
     rng, floor = np.random.default_rng(0), ALL_FLOORS["wind_x"]
     rows = []
     for z in rng.standard_normal(2000):
-        e = {"name": "wind_x", "truth": 0.3, "estimate": 0.3 + z * floor, "sd": floor, "named": True}
-        rows.append(world({"wind_x": 0.3}, [["wind_x"]], errors=[e | {"low": e["estimate"] - 1.96 * floor,
-                                                                     "high": e["estimate"] + 1.96 * floor}]))  # fmt: skip
+        e = {
+            "name": "wind_x",
+            "truth": 0.3,
+            "estimate": 0.3 + z * floor,
+            "sd": floor,
+            "named": True,
+        }
+        rows.append(
+            world(
+                {"wind_x": 0.3},
+                [["wind_x"]],
+                errors=[
+                    e | {"low": e["estimate"] - 1.96 * floor, "high": e["estimate"] + 1.96 * floor}
+                ],
+            )
+        )
     shares = [float(line.split("= ")[1].split(" %")[0]) for line in ledger.coverage(rows)[:3]]
     assert shares == pytest.approx([50, 80, 95], abs=3)
     assert "median 0.6" in ledger.coverage(rows)[3]  # 0.674 deviations
@@ -217,11 +319,19 @@ def test_worlds_with_some_of_every_effect_hide_what_was_drawn_besides():
 
 def test_worlds_with_some_of_every_effect_are_counted_apart():
     error = {"name": "wind_x", "truth": 0.3, "named": True, "sd": 0.1}
-    held = world({"wind_x": 0.3}, [["wind_x"]], errors=[error | {"estimate": 0.3, "low": 0.2, "high": 0.4}])
-    missed = world({"wind_x": 0.3}, [["wind_x"]], errors=[error | {"estimate": 0.9, "low": 0.8, "high": 1.0}])
+    held = world(
+        {"wind_x": 0.3}, [["wind_x"]], errors=[error | {"estimate": 0.3, "low": 0.2, "high": 0.4}]
+    )
+    missed = world(
+        {"wind_x": 0.3}, [["wind_x"]], errors=[error | {"estimate": 0.9, "low": 0.8, "high": 1.0}]
+    )
     missed["recipe"] |= {"dust": 0.5}
     lines = "\n".join(ledger.intervals([held, missed]))
-    assert lines.index("nothing else") < lines.index("95 % intervals hold the truth: 1/1") < lines.index("some of every other")
+    assert (
+        lines.index("nothing else")
+        < lines.index("95 % intervals hold the truth: 1/1")
+        < lines.index("some of every other")
+    )
     assert "95 % intervals hold the truth: 0/1" in lines
     assert sum(map(len, (size for size, _ in ledger.singles([held, missed]).values()))) == 1
 
@@ -229,8 +339,13 @@ def test_worlds_with_some_of_every_effect_are_counted_apart():
 def test_gain_is_a_share_of_the_oracles_and_harm_is_told():
     assert ledger.gain_ratio({"before": 100.0, "after": 10.0, "oracle": 0.0}) == pytest.approx(0.9)
     assert math.isnan(ledger.gain_ratio({"before": 2.0, "after": 0.0, "oracle": 0.0}))
-    assert math.isnan(ledger.gain_ratio({"before": 100.0, "after": 10.0}))  # a law: nobody knows the truth's size
-    held = ({"before": 50.0, "after": 5.0, "oracle": 0.0}, {"before": 50.0, "after": 60.0, "oracle": 0.0})
+    assert math.isnan(
+        ledger.gain_ratio({"before": 100.0, "after": 10.0})
+    )  # a law: nobody knows the truth's size
+    held = (
+        {"before": 50.0, "after": 5.0, "oracle": 0.0},
+        {"before": 50.0, "after": 60.0, "oracle": 0.0},
+    )
     worlds = [world({"wind_x": 0.3}, [["wind_x"]], held=h | {"samples": 10000}) for h in held]
     row = ledger.gains(worlds)[-1]
     assert "1/2 = 50 %" in row.split("|")[6]  # by 3 nats

@@ -1,4 +1,7 @@
-"""The tool spoiled on purpose: for each mutation a test of the default run must fail. A suite that survives is no test."""
+"""The tool spoiled on purpose: for each mutation a test of the default run must fail.
+
+A suite that survives is no test.
+"""
 
 from dataclasses import replace
 
@@ -21,7 +24,9 @@ def swapped_names(monkeypatch) -> None:
     """Two effects are called by each other's names."""
     names = {"effect_03": "effect_09", "effect_09": "effect_03"}
     plain = selector.Selector.name
-    monkeypatch.setattr(selector.Selector, "name", lambda self, j: names.get(plain(self, j), plain(self, j)))
+    monkeypatch.setattr(
+        selector.Selector, "name", lambda self, j: names.get(plain(self, j), plain(self, j))
+    )
 
 
 def no_latent_forces(monkeypatch) -> None:
@@ -30,16 +35,25 @@ def no_latent_forces(monkeypatch) -> None:
 
     def gram(window, floors, channels):
         none = np.zeros(0)
-        bare = replace(window, latent=np.zeros((len(window.residual), 0)), latent_block=none.astype(int),
-                       latent_axis=none.astype(int), latent_time=none)  # fmt: skip
+        bare = replace(
+            window,
+            latent=np.zeros((len(window.residual), 0)),
+            latent_block=none.astype(int),
+            latent_axis=none.astype(int),
+            latent_time=none,
+        )
         return whole(bare, floors, channels)
 
     monkeypatch.setattr(designs, "gram_of", gram)
-    monkeypatch.setattr(noise, "without_outliers", lambda windows, *_: list(windows))  # gusts would be told by their columns
+    monkeypatch.setattr(
+        noise, "without_outliers", lambda windows, *_: list(windows)
+    )  # gusts would be told by their columns
 
 
 def no_floors(monkeypatch) -> None:
-    """What is not named is not there at all: neither in the evidence, nor in the null worlds, nor in what a name must exceed."""
+    """What is not named is not there at all: neither in the evidence, nor in the null worlds, nor
+    in what a name must exceed.
+    """
     monkeypatch.setattr(evidence, "SPIKE", 1e-3)
 
 
@@ -55,7 +69,9 @@ def no_bounds(monkeypatch) -> None:
 
 
 def jackknife_of_one_flight(monkeypatch) -> None:
-    """One flight stands for all, many times: intervals of the gain are those of the scatter within it."""
+    """One flight stands for all, many times: intervals of the gain are those of the scatter within
+    it.
+    """
     plain = held_out.jackknifed
 
     def one(before, after):
@@ -67,7 +83,11 @@ def jackknife_of_one_flight(monkeypatch) -> None:
 def truth_in_the_log(monkeypatch) -> None:
     """The recording gives away what is hidden: the seed from which the world was drawn."""
     plain = sealed.flight_log
-    monkeypatch.setattr(test_cases.cases, "flight_log", lambda record: FlightLog(plain(record).channels, {"seed": 11}))
+    monkeypatch.setattr(
+        test_cases.cases,
+        "flight_log",
+        lambda record: FlightLog(plain(record).channels, {"seed": 11}),
+    )
 
 
 def logs_are_clean() -> None:
@@ -111,8 +131,16 @@ def test_the_tool_cannot_ask_the_tests(tmp_path):
     import subprocess
     import sys
 
-    spoiled = sealed.WITHOUT_TESTS.replace("from visthrow.cli import main", "import tests.worlds.world\nmain = lambda _: 0")
-    done = subprocess.run([sys.executable, "-c", spoiled], cwd=tmp_path, capture_output=True, text=True, check=False,
-                          env=test_cases.cases.environment())  # fmt: skip
+    spoiled = sealed.WITHOUT_TESTS.replace(
+        "from visthrow.cli import main", "import tests.worlds.world\nmain = lambda _: 0"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", spoiled],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=test_cases.cases.environment(),
+    )
     assert done.returncode != 0
     assert "the tool asked for the tests" in done.stderr

@@ -1,4 +1,6 @@
-"""Flights of ``visthrow fly`` against the simulator that flew them: there is nothing to find, and nothing is."""
+"""Flights of ``visthrow fly`` against the simulator that flew them: there is nothing to find, and
+nothing is.
+"""
 
 import numpy as np
 import pytest
@@ -29,25 +31,39 @@ def told(loaded, logs) -> search.Diagnosis:
 
 
 def test_flights_of_fly_hide_nothing(flown):
-    """They did where measured poses were stamped when the pilot read them, 10 ms late: a release lag, and UNKNOWN."""
+    """They did where measured poses were stamped when the pilot read them, 10 ms late: a release
+    lag, and UNKNOWN.
+    """
     diagnosis = told(*flown)
     assert (diagnosis.overall, dict(diagnosis.theta), diagnosis.events) == ("NO EFFECT", {}, ())
 
 
 def test_flights_without_noise_hide_nothing(flown):
-    """A latent force of 16 uN stands out from a phase that has next to none; it moves no landing."""
+    """A latent force of 16 uN stands out from a phase that has next to none; it moves
+    no landing.
+    """
     loaded, logs = flown
-    exact = [FlightLog({k: c for k, c in log.channels.items() if not k.startswith("measured_")}, log.meta) for log in logs]
+    exact = [
+        FlightLog(
+            {k: c for k, c in log.channels.items() if not k.startswith("measured_")}, log.meta
+        )
+        for log in logs
+    ]
     diagnosis = told(loaded, exact)
     assert (diagnosis.overall, dict(diagnosis.theta)) == ("NO EFFECT", {})
 
 
 @pytest.mark.parametrize("name", MEASURED)
 def test_measured_channels_were_true_when_they_are_stamped(flown, name):
-    """Their error is the noise alone: it has no part along the motion, where 10 ms of age would be 10 ms of it."""
+    """Their error is the noise alone: it has no part along the motion, where 10 ms of age would be
+    10 ms of it.
+    """
     for log in flown[1]:
         true, measured = log[name], log[f"measured_{name}"]
         moved = np.gradient(true.values, true.time, axis=0)
-        off = np.array([np.interp(measured.time, true.time, column) for column in true.values.T]).T - measured.values
+        off = (
+            np.array([np.interp(measured.time, true.time, column) for column in true.values.T]).T
+            - measured.values
+        )
         age = (off * moved).sum() / (moved**2).sum()
         assert abs(age) < 0.2 * LATE[0]

@@ -1,4 +1,6 @@
-"""Laws in the models of setups: told where an independent generator hid one, written into the setup, and worth it on flights never seen."""
+"""Laws in the models of setups: told where an independent generator hid one, written into the
+setup, and worth it on flights never seen.
+"""
 
 import json
 from dataclasses import replace
@@ -25,13 +27,17 @@ from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
-TURNING = replace(FLYER, torque=TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0)))
+TURNING = replace(
+    FLYER, torque=TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
+)
 
 
 def slung() -> NumericModel:
     """A quadrotor with a ball on a cable."""
     world = foreign.drawn(0)[2]
-    return FlyerModel([foreign.flown(world, np.random.default_rng(0), 4.0)], foreign.known("crazyflie"))
+    return FlyerModel(
+        [foreign.flown(world, np.random.default_rng(0), 4.0)], foreign.known("crazyflie")
+    )
 
 
 def turning() -> NumericModel:
@@ -40,15 +46,18 @@ def turning() -> NumericModel:
     time, quat = log["quat_wb"].samples()
     turned = Rotation.from_quat(quat)
     rates = (turned[:-1].inv() * turned[1:]).as_rotvec() / np.diff(time)[:, None]
-    return FlyerModel([FlightLog({**log.channels, "rate_b": Channel(time[:-1], rates, "rad/s", "body")})], TURNING)
+    return FlyerModel(
+        [FlightLog({**log.channels, "rate_b": Channel(time[:-1], rates, "rad/s", "body")})], TURNING
+    )
 
 
 MODELS = {
     "ball": lambda: BallModel([ball_log(drag=0.04, spin=(0.0, 0.0, 0.3), seed=1)], BALL),
-    "flyer": turning, "slung": slung,
+    "flyer": turning,
+    "slung": slung,
     "pendulum": lambda: small.model_of("pendulum", small.logs_of("pendulum", "", 3, 1)),
     "trim": lambda: small.model_of("trim", small.logs_of("trim", "", 3, 1)),
-}  # fmt: skip
+}
 ACTING = [
     ("ball", LawParams("payload force", ("payload_speed",), "vertical_cross_vel", 0.01)),
     ("flyer", LawParams("vehicle force", ("speed",), "axis_cross_vel", 1e-3)),
@@ -65,15 +74,24 @@ ACTING = [
 
 @pytest.mark.parametrize(("kind", "law"), ACTING)
 def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
-    """Two ways to the same: forces at the knots through the latents' derivatives, and the law in every step."""
+    """Two ways to the same: forces at the knots through the latents' derivatives, and the law in
+    every step.
+    """
     model = MODELS[kind]()
     term = term_of(law)
-    effect = TermEffect(term.formula, "", "", "", law.block, (-1.0, 1.0), 1.0, 1.0, (), "", term=term)
+    effect = TermEffect(
+        term.formula, "", "", "", law.block, (-1.0, 1.0), 1.0, 1.0, (), "", term=term
+    )
     windows, there = model.windows({}), model.with_laws([law]).residuals({})
     column, change = [], []
     for window, residual in zip(windows, there):
         basis = np.linalg.qr(window.nuisance)[0]  # initial states are fitted in both
-        told = np.column_stack([window.latent @ forces(window, [effect])[:, 0] * law.coefficient, window.residual - residual])
+        told = np.column_stack(
+            [
+                window.latent @ forces(window, [effect])[:, 0] * law.coefficient,
+                window.residual - residual,
+            ]
+        )
         told = (told - basis @ (basis.T @ told)) / window.sigma[:, None]
         column.append(told[:, 0])
         change.append(told[:, 1])
@@ -91,27 +109,73 @@ def test_nothing_hidden_is_no_effect(kind):
     assert not diagnosis.laws
 
 
-@pytest.mark.parametrize(("kind", "law"), [("trim", "ground"), pytest.param("pendulum", "brake", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "law"), [("trim", "ground"), pytest.param("pendulum", "brake", marks=pytest.mark.slow)]
+)
 def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_path, capsys):
     plain, extended, out = tmp_path / "plain.toml", tmp_path / "extended.toml", tmp_path / "out"
     logs = [str(tmp_path / f"{i}.npz") for i in range(6)]
     for path, log in zip(logs, small.logs_of(kind, law, 1, 6)):
         log.save(path)
-    plain.write_text(config.dumps(setups.Setup("flights of others", **{kind: small.WORLDS[kind][2]})))
-    assert cli.main(["diagnose", "explain", *logs[:4], "--config", str(plain), "--no-blind", "--out", str(out)]) == 0
+    plain.write_text(
+        config.dumps(setups.Setup("flights of others", **{kind: small.WORLDS[kind][2]}))
+    )
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "explain",
+                *logs[:4],
+                "--config",
+                str(plain),
+                "--no-blind",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     report = json.loads((out / "diagnosis.json").read_text())
     assert report["overall"] == "UNKNOWN"
     assert not report["theta"]
     assert report["laws"][0]["formula"] == small.formula(kind, law)
-    assert cli.main(["diagnose", "apply", str(out / "diagnosis.json"), "--laws", "1", "--out", str(extended)]) == 0
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "apply",
+                str(out / "diagnosis.json"),
+                "--laws",
+                "1",
+                "--out",
+                str(extended),
+            ]
+        )
+        == 0
+    )
     (written,) = setups.load(extended).laws
     told = report["explanations"][0][0]
     assert written.coefficient == told["coefficient"]
     assert f"{told['sd'] ** 2: .3e}" in extended.read_text()
     capsys.readouterr()
     worth = tmp_path / "worth.json"
-    assert cli.main(["diagnose", "explain", *logs[:4], "--config", str(extended), "--no-report", "--json", str(worth), "--test",
-                     *logs[4:]]) == 0  # fmt: skip
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "explain",
+                *logs[:4],
+                "--config",
+                str(extended),
+                "--no-report",
+                "--json",
+                str(worth),
+                "--test",
+                *logs[4:],
+            ]
+        )
+        == 0
+    )
     assert "on the tested flights" in capsys.readouterr().out
     again = json.loads(worth.read_text())
     assert again["overall"] == "NO EFFECT"
@@ -130,13 +194,18 @@ def test_a_swirl_on_a_slung_load_is_won_back():
     assert [law.formula for law in diagnosis.explanations[0]] == ["F = c (e_z x v)"]
     others = FlyerModel(logs[4:], foreign.known(name))
     written = [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
-    for before, after, noise in on_others(others, others.with_laws(written), {}, diagnosis).values():
+    for before, after, noise in on_others(
+        others, others.with_laws(written), {}, diagnosis
+    ).values():
         assert before > 10.0 * noise
         assert before - after > 0.8 * (before - noise)
 
 
 def test_what_cannot_act_is_refused():
-    torque, pull = LawParams("vehicle torque", (), "rate", 1e-6), LawParams("payload force", ("tension",), "payload_vel", 0.1)
+    torque, pull = (
+        LawParams("vehicle torque", (), "rate", 1e-6),
+        LawParams("payload force", ("tension",), "payload_vel", 0.1),
+    )
     with pytest.raises(LogError, match="M = c ω cannot act here: this model has no vehicle torque"):
         FlyerModel([fly(4.0)], FLYER).extend({}, [torque])
     with pytest.raises(LogError, match="this model has no tension"):
@@ -148,8 +217,17 @@ def test_what_cannot_act_is_refused():
 
 
 def test_an_unknown_of_a_model_without_laws_says_so(capsys):
-    tests = Path(__file__).resolve().parents[1] / "data" / "real" / "motor_prop_stand" / "all_tests.csv.gz"
-    assert cli.main(["diagnose", "explain", f"{tests}:a1_*", "--config", "motor_stand", "--no-report"]) == 0
+    tests = (
+        Path(__file__).resolve().parents[1]
+        / "data"
+        / "real"
+        / "motor_prop_stand"
+        / "all_tests.csv.gz"
+    )
+    assert (
+        cli.main(["diagnose", "explain", f"{tests}:a1_*", "--config", "motor_stand", "--no-report"])
+        == 0
+    )
     said = capsys.readouterr().out
     assert "UNKNOWN" in said
     assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
@@ -157,11 +235,38 @@ def test_an_unknown_of_a_model_without_laws_says_so(capsys):
 
 @pytest.mark.parametrize("kind", ["gimbal", "stand"])
 def test_models_without_laws_say_why(kind, tmp_path, capsys):
-    law = {"formula": "F = c z", "block": "vehicle force", "factors": [], "vector": "world_z", "coefficient": 1.0, "sd": 0.1}
-    given = {"model": kind, "config": "slungload_camera", "theta": {}, "covariance": [], "findings": [], "explanations": [[law]]}
+    law = {
+        "formula": "F = c z",
+        "block": "vehicle force",
+        "factors": [],
+        "vector": "world_z",
+        "coefficient": 1.0,
+        "sd": 0.1,
+    }
+    given = {
+        "model": kind,
+        "config": "slungload_camera",
+        "theta": {},
+        "covariance": [],
+        "findings": [],
+        "explanations": [[law]],
+    }
     (tmp_path / "diagnosis.json").write_text(json.dumps(given))
     out = tmp_path / "extended.toml"
-    assert cli.main(["diagnose", "apply", str(tmp_path / "diagnosis.json"), "--laws", "1", "--out", str(out)]) == 2
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "apply",
+                str(tmp_path / "diagnosis.json"),
+                "--laws",
+                "1",
+                "--out",
+                str(out),
+            ]
+        )
+        == 2
+    )
     said = capsys.readouterr().err
     assert f"no law can act in the model '{kind}'" in said
     assert setups.MODELS[kind].lawless in said

@@ -1,4 +1,6 @@
-"""Kinds of blocks that a model lacks: what tells of them is told between two fits, not between a fit and a transient."""
+"""Kinds of blocks that a model lacks: what tells of them is told between two fits, not between a
+fit and a transient.
+"""
 
 import numpy as np
 import pytest
@@ -10,18 +12,27 @@ from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of
 
 LEFT = 0.1
-"""Part of the misfit, in its square, that may be left once the other kind of block has its column: noise, gusts, initial states."""
+"""Part of the misfit, in its square, that may be left once the other kind of block has its column:
+noise, gusts, initial states.
+"""
 
 
 @pytest.mark.parametrize(
     ("lacks", "name"),
-    [("vehicle.motor.kind='instant'", "motor_lag"), ("vehicle.controller.kind='geometric'", "controller_kind")],
+    [
+        ("vehicle.motor.kind='instant'", "motor_lag"),
+        ("vehicle.controller.kind='geometric'", "controller_kind"),
+    ],
 )
 def test_a_missing_block_is_worth_its_whole_size(lacks, name):
-    """The plant has the block, the model lacks it: the column at theta = 0 explains the residuals with a theta near 1."""
+    """The plant has the block, the model lacks it: the column at theta = 0 explains the residuals
+    with a theta near 1.
+    """
     recipe = Recipe(31, "rod", {}, free=0, throws=2, held=0)
     logs = [flight_log(r) for r in recorded(recipe, fly_recipe(recipe))]
-    plant = plant_of(config.load(Experiment, config.find("train", "state"), [*model_of(recipe), lacks]))
+    plant = plant_of(
+        config.load(Experiment, config.find("train", "state"), [*model_of(recipe), lacks])
+    )
     model = ThrowModel(logs, plant, only=[name])
     throws = [w for w in model.windows({}) if w.phase == "throw"]
     misfit = left = 0.0

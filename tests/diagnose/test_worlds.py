@@ -1,4 +1,6 @@
-"""The worlds of the tests: they import nothing of the package, and without a hidden effect they move as the simulator does."""
+"""The worlds of the tests: they import nothing of the package, and without a hidden effect they
+move as the simulator does.
+"""
 
 import ast
 import dataclasses
@@ -18,10 +20,14 @@ WORLDS = Path(__file__).resolve().parents[1] / "worlds"
 PACKAGES = {"sim", "camera", "visthrow", "hil"}
 AGREEMENT = {
     "rod": 1e-5,  # the same equations for one rod, solved otherwise; RK4 at 0.5 ms
-    "string": 2e-4,  # 24 point masses stand for 24 slender rods; a hard throw bends them differently
+    "string": (
+        2e-4
+    ),  # 24 point masses stand for 24 slender rods; a hard throw bends them differently
     "chain": 3e-4,  # MuJoCo at 0.5 ms, actuators by the midpoint rule
 }
-"""Largest distance to the simulator at 0.25 ms [m], vehicle or ball, until the separation of a hard throw."""
+"""Largest distance to the simulator at 0.25 ms [m], vehicle or ball, until the separation of a hard
+throw.
+"""
 FREE_RATE, LOWEST = 9.0, 0.8
 """Body rate [rad/s] and height [m] that a calm pilot keeps to in free flight about 1.9 m."""
 
@@ -59,7 +65,9 @@ def test_a_world_without_effect_moves_as_the_simulator(plant):
 
     params = paper_plant()
     segments = {"rod": 1, "string": 24, "chain": 15}[plant]
-    rope = dataclasses.replace(params.rope, segments=segments, payload_inertia=max(world.ball_inertia, 1e-9))
+    rope = dataclasses.replace(
+        params.rope, segments=segments, payload_inertia=max(world.ball_inertia, 1e-9)
+    )
     numerics = dataclasses.replace(params.sim, substep=2.5e-4, precision="float64")
     sim = HybridSim(dataclasses.replace(params, rope=rope, sim=numerics), 2)
     sim.place(np.array([throw.at(0.0)[0] for throw in throws]), battery_used=0.1)
@@ -79,19 +87,40 @@ def test_a_world_without_effect_moves_as_the_simulator(plant):
 
 
 def test_every_hidden_effect_shows_in_the_flight():
-    """A change that moves nothing would make a world that cannot be diagnosed count as one that was missed."""
-    large = {"motor_tau": 0.01, "cmd_delay": 0.01, "release_lag": 0.02, "mount_x": 0.01, "mass_quad": 0.01}
+    """A change that moves nothing would make a world that cannot be diagnosed count as one that was
+    missed.
+    """
+    large = {
+        "motor_tau": 0.01,
+        "cmd_delay": 0.01,
+        "release_lag": 0.02,
+        "mount_x": 0.01,
+        "mass_quad": 0.01,
+    }
     quiet = fly_recipe(Recipe(3, "rod", {}, free=2, free_seconds=3.0, throws=2))
-    for name in ("thrust_gain", "com_x", "rope_length", "payload_drag", "wind_y", "lag_tension", "kick_x", *large):
+    for name in (
+        "thrust_gain",
+        "com_x",
+        "rope_length",
+        "payload_drag",
+        "wind_y",
+        "lag_tension",
+        "kick_x",
+        *large,
+    ):
         theta = large.get(name, 0.02)
         flown = fly_recipe(Recipe(3, "rod", {name: theta}, free=2, free_seconds=3.0, throws=2))
         moved = max(np.abs(a.ball - b.ball).max() for a, b in zip(quiet, flown))
         assert moved > 1e-3, name
 
 
-@pytest.mark.parametrize("effects", [{}, {"cmd_delay": 0.02}, {"motor_tau": 0.02}, {"rate_gain": -0.3}])
+@pytest.mark.parametrize(
+    "effects", [{}, {"cmd_delay": 0.02}, {"motor_tau": 0.02}, {"rate_gain": -0.3}]
+)
 def test_the_pilot_stays_calm_whatever_is_hidden(effects):
-    """A bank draws such sizes; with a nervous pilot the vehicle swings at 12 rad/s and comes down to the floor."""
+    """A bank draws such sizes; with a nervous pilot the vehicle swings at 12 rad/s and comes down
+    to the floor.
+    """
     free, throws = fly_recipe(Recipe(11, "rod", effects, free=3, free_seconds=6.0, throws=4))
     assert np.abs(free.rate).max() < FREE_RATE
     assert 0.4 < free.rate[..., :2].std() < 2.5  # and yet excites

@@ -1,4 +1,6 @@
-"""The ArduPilot back-end against the fake autopilot: what is followed, what is answered, what is never sent."""
+"""The ArduPilot back-end against the fake autopilot: what is followed, what is answered, what is
+never sent.
+"""
 
 import math
 
@@ -24,7 +26,13 @@ AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
 
 def pair(answer="accepted", **options):
     here, there = pipe()
-    fake = FakeArduPilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(answer=answer, **options))
+    fake = FakeArduPilot(
+        LevelPlant(),
+        Link(there, *VEHICLE_ID),
+        MocapParams(loss=0.0),
+        0,
+        Options(answer=answer, **options),
+    )
     link = Link(here)
     return ArduPilot(link, PARAMS), link, fake
 
@@ -56,7 +64,9 @@ def test_units_and_axes_of_the_command():
     assert fake.followed == 1
 
 
-@pytest.mark.parametrize("change", [{"type_mask": 132}, {"type_mask": 192}, {"type_mask": 0}, {"target_system": 2}, {}])
+@pytest.mark.parametrize(
+    "change", [{"type_mask": 132}, {"type_mask": 192}, {"type_mask": 0}, {"target_system": 2}, {}]
+)
 def test_the_fake_ignores_what_the_real_one_ignores(change):
     _, link, fake = pair()
     message = attitude_target(0.0, (1, 1), 0.5, (0.0, 0.0, 0.0))
@@ -82,7 +92,12 @@ def test_silence_levels_the_fake():
 
 @pytest.mark.parametrize(
     ("answer", "state", "sends"),
-    [("accepted", "accepted", 1), ("in-progress", "failed", 1), ("denied", "failed", 1), ("silent", "failed", 13)],
+    [
+        ("accepted", "accepted", 1),
+        ("in-progress", "failed", 1),
+        ("denied", "failed", 1),
+        ("silent", "failed", 13),
+    ],
 )
 def test_release_and_its_answers(answer, state, sends):
     backend, link, fake = pair(answer)
@@ -129,7 +144,9 @@ def test_a_payload_that_stayed_on_is_seen_in_its_own_poses():
     summary, _, told = throw(plant, answer="stuck", loaded=AT_ONCE, seconds=5.0)
     assert (summary["latches"], summary["landings"], summary["stuck"]) == (1, [], 1)
     assert plant.released is None
-    assert ("abort", "the release was refused or not answered") in [(d.state, d.reason) for d in told]
+    assert ("abort", "the release was refused or not answered") in [
+        (d.state, d.reason) for d in told
+    ]
 
 
 def test_a_throw_with_a_plain_plant_releases_in_time():
@@ -144,6 +161,13 @@ def test_a_throw_with_a_plain_plant_releases_in_time():
 
 
 def test_plants_that_are_none():
-    for target in ("nowhere:make", "visthrow.throws.wire_plant:none", "visthrow.throws.wire_plant", "", "os:system", "math:pi"):
+    for target in (
+        "nowhere:make",
+        "visthrow.throws.wire_plant:none",
+        "visthrow.throws.wire_plant",
+        "",
+        "os:system",
+        "math:pi",
+    ):
         with pytest.raises(RunError, match="expected module:function"):
             load_plant(target, "state", 0)

@@ -1,7 +1,8 @@
-"""The bridge to ArduPilot's JSON interface against a fake of the other side, which sends servo outputs and waits for the state.
+"""The bridge to ArduPilot's JSON interface against a fake of the other side, which sends servo
+outputs and waits for the state.
 
-Each waits for the other as long as it takes, so that frames alone move the simulator's clock, however busy the machine is.
-"""
+Each waits for the other as long as it takes, so that frames alone move the simulator's clock,
+however busy the machine is."""
 
 import json
 import socket
@@ -22,7 +23,9 @@ from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 
 HOVER = 1437
-"""Output at which the rotors carry the vehicle [us]: the square root of its weight over four motors of 3.5 N, a little more."""
+"""Output at which the rotors carry the vehicle [us]: the square root of its weight over four motors
+of 3.5 N, a little more.
+"""
 
 PATIENCE = 60.0
 """After which a side that says nothing is broken [s]."""
@@ -68,20 +71,28 @@ def fly(bridge, frames):
 
 
 def test_each_frame_is_flown_once_and_answered_with_the_state_after_it(bridge):
-    """A frame that comes again moves nothing; time goes by the period; the vehicle stands until its rotors carry it."""
+    """A frame that comes again moves nothing; time goes by the period; the vehicle stands until its
+    rotors carry it.
+    """
     frames = [(n, servos(1000, 1000, 1000, 1000)) for n in (1, 2, 2, 3)]
     states = fly(bridge, frames)
     assert [round(state["timestamp"], 6) for state in states] == [0.002, 0.004, 0.004, 0.006]
     assert (bridge.frames, bridge.repeated, bridge.restarts) == (3, 1, 0)
     assert bridge.plant.held
-    np.testing.assert_allclose(states[-1]["position"], [1.0, -1.0, -1.0] * bridge.plant.state["pos_w"], atol=1e-6)
+    np.testing.assert_allclose(
+        states[-1]["position"], [1.0, -1.0, -1.0] * bridge.plant.state["pos_w"], atol=1e-6
+    )
     np.testing.assert_allclose(states[-1]["imu"]["accel_body"], [0.0, 0.0, -9.81], atol=0.1)
 
 
 @pytest.mark.parametrize(
     ("change", "axis"),
     [((-30, 0, 0, -30), 0), ((0, -30, 0, -30), 1), ((60, 60, -30, -30), 2)],
-    ids=["right side lower: rolls right", "rear lower: pitches up", "1 and 2, counter-clockwise, faster: yaws right"],
+    ids=[
+        "right side lower: rolls right",
+        "rear lower: pitches up",
+        "1 and 2, counter-clockwise, faster: yaws right",
+    ],
 )
 def test_motors_turn_the_vehicle_as_ardupilot_means_them(bridge, change, axis):
     """Outputs are front right, rear left, front left, rear right; rates forward, right, down."""

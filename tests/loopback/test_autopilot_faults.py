@@ -1,8 +1,8 @@
-"""What goes wrong on the autopilot's side, over the wire: what the runner did, and how soon; what the vehicle did without it.
+"""What goes wrong on the autopilot's side, over the wire: what the runner did, and how soon; what
+the vehicle did without it.
 
-In every one the fake watches that no command arrives that is not finite or within limits, and that the release comes once at
-most, from an armed vehicle inside its fence.
-"""
+In every one the fake watches that no command arrives that is not finite or within limits, and that
+the release comes once at most, from an armed vehicle inside its fence."""
 
 import dataclasses
 import errno
@@ -20,7 +20,13 @@ from tests.loopback.wire import cut, peers
 from visthrow.onboard.actions import hover_action
 
 KINDS = ("ardupilot", "px4", "betaflight")
-QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5", "states.land=0.5")
+QUICK = (
+    "states.check_hold=0.2",
+    "states.armed_least=0.1",
+    "states.quiet=0.1",
+    "states.abort=0.5",
+    "states.land=0.5",
+)
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0))
 AT_ONCE = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
@@ -42,9 +48,23 @@ class OneWord:
         return OperatorInput(arm=state == "ready", abort=self.clock.now() >= self.abort)
 
 
-def run(kind, seconds, loaded=NEVER, watch=None, operator=None, overrides=(), plant=None, recorder=None, **options):
-    """A run in lock step; ``watch(now, runner, fake)`` is called before every tick. Fake, summary, changes of state."""
-    made = peers(plant or LevelPlant(), kind=kind, loaded=loaded, overrides=(*QUICK, *overrides), **options)
+def run(
+    kind,
+    seconds,
+    loaded=NEVER,
+    watch=None,
+    operator=None,
+    overrides=(),
+    plant=None,
+    recorder=None,
+    **options,
+):
+    """A run in lock step; ``watch(now, runner, fake)`` is called before every tick. Fake, summary,
+    changes of state.
+    """
+    made = peers(
+        plant or LevelPlant(), kind=kind, loaded=loaded, overrides=(*QUICK, *overrides), **options
+    )
     runner, source, clock, fake = made
     operator = operator or OneWord()
     operator.clock, told, tick = clock, [], runner.tick
@@ -83,7 +103,9 @@ def test_silent(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_pilot_takes_over(kind):
-    """Abort at the next sign of life; from then on not one command is sent, no mode is asked for."""
+    """Abort at the next sign of life; from then on not one command is sent, no mode is
+    asked for.
+    """
 
     def watch(now, runner, fake):
         if now >= START + 0.3:
@@ -105,7 +127,9 @@ def test_disarmed_and_not_ours_to_arm(kind):
     assert fake.witness.commands == 0
 
 
-@pytest.mark.parametrize(("kind", "override"), [("ardupilot", "ardupilot.arm=true"), ("px4", "px4.arm=true")])
+@pytest.mark.parametrize(
+    ("kind", "override"), [("ardupilot", "ardupilot.arm=true"), ("px4", "px4.arm=true")]
+)
 def test_refuses_arming(kind, override):
     """Asked to arm it is in READY; the refusal ends the run, with what the autopilot said."""
     notes = []
@@ -129,25 +153,45 @@ def test_arms_where_it_was_told_to(kind):
 
 
 def test_betaflight_refuses_arming():
-    fake, _, told = run("betaflight", 4.0, armed=False, arming=False, all_channels=True,
-                        overrides=("betaflight.arm_channel=1", "states.idle=1.5"))  # fmt: skip
-    assert reason(told, "abort") == "autopilot not ready (arming disabled: tilted more than small_angle (flags 0x100)), for 1.5 s"
+    fake, _, told = run(
+        "betaflight",
+        4.0,
+        armed=False,
+        arming=False,
+        all_channels=True,
+        overrides=("betaflight.arm_channel=1", "states.idle=1.5"),
+    )
+    assert (
+        reason(told, "abort")
+        == "autopilot not ready (arming disabled: tilted more than small_angle (flags 0x100)), for"
+        " 1.5 s"
+    )
     assert not fake.armed
 
 
 RELEASES = {
-    ("ardupilot", "stuck"): 0.5, ("px4", "stuck"): 1.5, ("betaflight", "stuck"): 0.5,
-    ("ardupilot", "in-progress"): 0.5, ("px4", "in-progress"): 1.5,
-    ("ardupilot", "silent"): 0.5, ("px4", "silent"): 1.5, ("betaflight", "silent"): 0.5,
-    ("ardupilot", "denied"): 0.0, ("px4", "denied"): 0.0,
-}  # fmt: skip
-"""By kind and answer: the time after the latch at which the release has failed [s]; "denied" at once."""
+    ("ardupilot", "stuck"): 0.5,
+    ("px4", "stuck"): 1.5,
+    ("betaflight", "stuck"): 0.5,
+    ("ardupilot", "in-progress"): 0.5,
+    ("px4", "in-progress"): 1.5,
+    ("ardupilot", "silent"): 0.5,
+    ("px4", "silent"): 1.5,
+    ("betaflight", "silent"): 0.5,
+    ("ardupilot", "denied"): 0.0,
+    ("px4", "denied"): 0.0,
+}
+"""By kind and answer: the time after the latch at which the release has failed [s]; "denied" at
+once.
+"""
 
 
 @pytest.mark.parametrize(("kind", "answer"), RELEASES)
 def test_a_release_that_does_not_happen(kind, answer):
-    """ACK without movement, IN_PROGRESS for ever, silence, refusal: the run is aborted, and it is never sent again. The vehicle
-    is quiet again long before, which does not count while the answer is out."""
+    """ACK without movement, IN_PROGRESS for ever, silence, refusal: the run is aborted, and it is
+    never sent again. The vehicle is quiet again long before, which does not count while the answer
+    is out.
+    """
     limit = RELEASES[kind, answer]
     last = []
 
@@ -156,9 +200,13 @@ def test_a_release_that_does_not_happen(kind, answer):
             last.extend([now] * (fake.witness.releases - len(last)))
 
     fake, summary, told = run(
-        kind, 6.0, AT_ONCE, watch, answer=answer,
+        kind,
+        6.0,
+        AT_ONCE,
+        watch,
+        answer=answer,
         overrides=("px4.release_timeout=1.5",),
-    )  # fmt: skip
+    )
     (latch,) = summary["latch_times"]
     assert reason(told, "abort") == "the release was refused or not answered"
     assert latch + limit <= when(told, "abort") <= latch + limit + 3 * TICK
@@ -170,7 +218,8 @@ def test_a_release_that_does_not_happen(kind, answer):
 
 @pytest.mark.parametrize(
     ("kind", "value"),
-    [(kind, math.nan) for kind in KINDS] + [pytest.param(kind, math.inf, marks=pytest.mark.slow) for kind in KINDS],
+    [(kind, math.nan) for kind in KINDS]
+    + [pytest.param(kind, math.inf, marks=pytest.mark.slow) for kind in KINDS],
 )
 def test_a_policy_that_puts_out_no_numbers(kind, value):
     def spoil(now, runner, fake):
@@ -190,7 +239,9 @@ def test_a_policy_that_puts_out_no_numbers(kind, value):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_policy_at_its_limits_stays_within_them(kind):
-    """All of thrust and rates: as much arrives and no more; on a vehicle that obeyed, the fence would end it."""
+    """All of thrust and rates: as much arrives and no more; on a vehicle that obeyed, the fence
+    would end it.
+    """
     fake, _, _ = run(kind, START + 0.5, loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)))
     np.testing.assert_allclose(fake.witness.worst, (14.0, 10.0, 10.0, 4.0), rtol=3e-3)
 
@@ -199,18 +250,37 @@ def test_a_policy_at_its_limits_stays_within_them(kind):
 def test_the_fence_ends_a_policy_at_its_limits():
     from visthrow.throws.wire_plant import make
 
-    fake, _, told = run("ardupilot", 4.0, loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)), plant=make("state", 0),
-                        overrides=("states.quiet=0.02",))  # fmt: skip
+    fake, _, told = run(
+        "ardupilot",
+        4.0,
+        loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)),
+        plant=make("state", 0),
+        overrides=("states.quiet=0.02",),
+    )
     assert reason(told, "abort").startswith("fence: ")
     assert when(told, "abort") - when(told, "throw") < 0.6
     assert fake.witness.releases == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("length", "event"), [(0.15, None), (0.8, {"ardupilot": "levelled: no set-points",
-                         "px4": "left OFFBOARD: no set-points", "betaflight": "override: the pilot's sticks count again"})])  # fmt: skip
+@pytest.mark.parametrize(
+    ("length", "event"),
+    [
+        (0.15, None),
+        (
+            0.8,
+            {
+                "ardupilot": "levelled: no set-points",
+                "px4": "left OFFBOARD: no set-points",
+                "betaflight": "override: the pilot's sticks count again",
+            },
+        ),
+    ],
+)
 def test_a_tick_overrun(kind, length, event):
-    """A short one is flown through with ticks counted as missed; a long one finds the autopilot's own failsafe at work."""
+    """A short one is flown through with ticks counted as missed; a long one finds the autopilot's
+    own failsafe at work.
+    """
 
     def dawdle(now, runner, fake):
         if now >= START and not late:
@@ -224,16 +294,22 @@ def test_a_tick_overrun(kind, length, event):
     events = [text for _, text in fake.events]
     if event is None:
         assert told[-1][0] == "throw"
-        assert not any(word in text for text in events for word in ("levelled", "left", "failsafe", "override"))
+        assert not any(
+            word in text for text in events for word in ("levelled", "left", "failsafe", "override")
+        )
     else:
         assert event[kind] in events
         if kind == "px4":
-            assert reason(told, "abort").startswith(GONE), "out of OFFBOARD by a failsafe: it is not taken back in mid throw"
+            assert reason(told, "abort").startswith(GONE), (
+                "out of OFFBOARD by a failsafe: it is not taken back in mid throw"
+            )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_ctrl_c_in_mid_throw(kind):
-    """The operator's abort: the autopilot's landing is asked for within a tick; Betaflight is brought down by the runner."""
+    """The operator's abort: the autopilot's landing is asked for within a tick; Betaflight is
+    brought down by the runner.
+    """
     fake, summary, told = run(kind, START + 0.6, operator=OneWord(abort=START))
     assert reason(told, "abort") == "the operator said abort"
     assert when(told, "abort") <= START + 2 * TICK
@@ -256,9 +332,13 @@ KILLED = {
 
 @pytest.mark.parametrize("way", KILLED)
 def test_the_runner_is_killed_in_mid_throw(way):
-    """It falls silent between two ticks and never comes back; the fake flies on and shows what its failsafes do."""
+    """It falls silent between two ticks and never comes back; the fake flies on and shows what its
+    failsafes do.
+    """
     kind, all_channels = way.split(",")[0], "all" in way
-    more = {"all_channels": True, "overrides": ("betaflight.arm_channel=1",)} if all_channels else {}
+    more = (
+        {"all_channels": True, "overrides": ("betaflight.arm_channel=1",)} if all_channels else {}
+    )
     fake, _, told = run(kind, START + 0.6 * all_channels, **more)
     assert told[-1][0] == "throw"
     fake.step()  # hears the last one
@@ -277,7 +357,10 @@ def test_the_runner_is_killed_in_mid_throw(way):
 
 @pytest.mark.parametrize("full_at", [0.0, START])
 def test_the_disk_is_full(tmp_path, full_at):
-    """Before the throw: none is armed. In mid throw: it is flown to its end, and said in the summary."""
+    """Before the throw: none is armed.
+
+    In mid throw: it is flown to its end, and said in the summary.
+    """
     params = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)[0].params
     recorder = Recorder(tmp_path / "run", params)
 

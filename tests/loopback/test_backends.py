@@ -1,4 +1,6 @@
-"""Each back-end against its fake, in lock step: commands, modes, hand-over, parameters, release, and whose hands it is in."""
+"""Each back-end against its fake, in lock step: commands, modes, hand-over, parameters, release,
+and whose hands it is in.
+"""
 
 import numpy as np
 import pytest
@@ -15,12 +17,20 @@ from tests.level import LevelPlant
 from tests.loopback.wire import peers, throw
 
 KINDS = ("ardupilot", "px4", "betaflight")
-QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5", "states.land=0.5")
+QUICK = (
+    "states.check_hold=0.2",
+    "states.armed_least=0.1",
+    "states.quiet=0.1",
+    "states.abort=0.5",
+    "states.land=0.5",
+)
 AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
 HOVER = (2.668, 0.0, 0.0, 0.0)
 
 SEPARATION = 5e-4
-"""Latch to separation against the trained lag [s]: 5 ms are asked for; the clock is simulated, so that nothing else is late."""
+"""Latch to separation against the trained lag [s]: 5 ms are asked for; the clock is simulated, so
+that nothing else is late.
+"""
 
 
 class Desk:
@@ -63,26 +73,41 @@ class Desk:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_units_and_axes_of_commands(kind):
-    """A quarter of a turn a second about each axis alone, and a thrust, arrive as they were meant."""
+    """A quarter of a turn a second about each axis alone, and a thrust, arrive as they
+    were meant.
+    """
     desk = Desk(kind).follow()
-    for command in ((7.0, 1.0, 0.0, 0.0), (1.0, 0.0, 2.0, 0.0), (2.668, 0.0, 0.0, -3.0), (13.0, -9.0, 8.0, 2.0)):
+    for command in (
+        (7.0, 1.0, 0.0, 0.0),
+        (1.0, 0.0, 2.0, 0.0),
+        (2.668, 0.0, 0.0, -3.0),
+        (13.0, -9.0, 8.0, 2.0),
+    ):
         desk.turn(0.06, command)
         np.testing.assert_allclose(desk.fake.plant.commands[-1], command, atol=0.012, rtol=2e-3)
     assert desk.fake.witness.breaches == []
 
 
 def test_what_the_fakes_make_of_a_positive_rate_stands_in_their_own_axes():
-    """Nose down is stick forward for Betaflight: the raw channels, in the order aileron, elevator, throttle, rudder."""
+    """Nose down is stick forward for Betaflight: the raw channels, in the order aileron, elevator,
+    throttle, rudder.
+    """
     desk = Desk("betaflight").follow()
     desk.turn(0.06, (2.668, 1.0, 2.0, 1.0))
     roll, pitch, throttle, yaw = desk.fake.channels[:4]
-    assert (roll - 1500, pitch - 1500, yaw - 1500) == (round(500 * 57.2958 / 600), round(500 * 114.5916 / 600), -95)
+    assert (roll - 1500, pitch - 1500, yaw - 1500) == (
+        round(500 * 57.2958 / 600),
+        round(500 * 114.5916 / 600),
+        -95,
+    )
     assert throttle == round(1050 + 0.1906 * 950)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_hands(kind):
-    """Pilot, runner, the autopilot's own hold and landing; then the pilot again, who is not fought."""
+    """Pilot, runner, the autopilot's own hold and landing; then the pilot again, who is
+    not fought.
+    """
     desk = Desk(kind).follow()
     assert desk.status.connected
     if not desk.backend.holds:
@@ -134,7 +159,10 @@ def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
 def test_px4_is_asked_for_offboard_only_after_a_second_of_set_points():
     desk = Desk("px4")
     desk.turn(0.5)
-    assert (desk.status.connected, desk.status.mode) == (True, HOLD), "in Position mode it may be taken"
+    assert (desk.status.connected, desk.status.mode) == (
+        True,
+        HOLD,
+    ), "in Position mode it may be taken"
     start = desk.now
     while desk.status.mode != FOLLOW:
         desk.turn(0.02, HOVER, FOLLOW)
@@ -175,7 +203,9 @@ def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_
     desk = Desk("betaflight", "betaflight.arm_channel=1", all_channels=True)
     desk.turn(0.5)
     assert not desk.fake.armed
-    assert desk.fake.witness.commands > 10, "it is spoken to before it is taken: a silent receiver cannot be armed"
+    assert desk.fake.witness.commands > 10, (
+        "it is spoken to before it is taken: a silent receiver cannot be armed"
+    )
     desk.follow()
     assert desk.fake.armed
     desk.turn(0.1, HOVER)
@@ -186,13 +216,34 @@ def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_
 
 
 TRAPS = {
-    "ardupilot": {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0, "GUID_TIMEOUT": 3.0, "EK3_SRC1_POSXY": 3.0,
-                  "GRIP_ENABLE": 0.0, "SERVO9_FUNCTION": 33.0},
-    "px4": {"COM_OF_LOSS_T": 5.0, "COM_OBL_RC_ACT": 0.0, "EKF2_EV_CTRL": 0.0, "PD_GRIPPER_EN": 0.0, "PD_GRIPPER_TO": 6.0,
-            "PWM_AUX_FUNC1": 301.0, "PWM_AUX_MIN1": 900.0},
-    "betaflight": {"rates_type": 0, "roll_rc_rate": 7, "pitch_rate": 67, "yaw_expo": 50, "deadband": 5, "min_check": 1000,
-                   "mid_rc": 1510, "failsafe_delay": 2.0},
-}  # fmt: skip
+    "ardupilot": {
+        "GUID_OPTIONS": 0.0,
+        "ATC_ANGLE_BOOST": 1.0,
+        "GUID_TIMEOUT": 3.0,
+        "EK3_SRC1_POSXY": 3.0,
+        "GRIP_ENABLE": 0.0,
+        "SERVO9_FUNCTION": 33.0,
+    },
+    "px4": {
+        "COM_OF_LOSS_T": 5.0,
+        "COM_OBL_RC_ACT": 0.0,
+        "EKF2_EV_CTRL": 0.0,
+        "PD_GRIPPER_EN": 0.0,
+        "PD_GRIPPER_TO": 6.0,
+        "PWM_AUX_FUNC1": 301.0,
+        "PWM_AUX_MIN1": 900.0,
+    },
+    "betaflight": {
+        "rates_type": 0,
+        "roll_rc_rate": 7,
+        "pitch_rate": 67,
+        "yaw_expo": 50,
+        "deadband": 5,
+        "min_check": 1000,
+        "mid_rc": 1510,
+        "failsafe_delay": 2.0,
+    },
+}
 
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in KINDS for name in TRAPS[kind]])
@@ -212,9 +263,12 @@ def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
 
 @pytest.mark.parametrize(
     ("kind", "names"),
-    [("ardupilot", set(TRAPS["ardupilot"])), ("px4", set(TRAPS["px4"]) - {"PD_GRIPPER_TO", "PWM_AUX_MIN1"}),
-     ("betaflight", {"rates_type", "roll_rc_rate", "pitch_rate", "yaw_expo"})],
-)  # fmt: skip
+    [
+        ("ardupilot", set(TRAPS["ardupilot"])),
+        ("px4", set(TRAPS["px4"]) - {"PD_GRIPPER_TO", "PWM_AUX_MIN1"}),
+        ("betaflight", {"rates_type", "roll_rc_rate", "pitch_rate", "yaw_expo"}),
+    ],
+)
 def test_write_parameters_mends_them(kind, names):
     desk = Desk(kind, parameters={name: TRAPS[kind][name] for name in names}, write=True)
     if kind == "betaflight":
@@ -232,17 +286,23 @@ def test_betaflight_is_not_written_while_it_is_armed():
 
 
 def test_a_run_ends_at_once_on_a_wrong_parameter():
-    summary, fake, told = throw(LevelPlant(), loaded=AT_ONCE, seconds=5.0, parameters={"GUID_OPTIONS": 0.0})
+    summary, fake, told = throw(
+        LevelPlant(), loaded=AT_ONCE, seconds=5.0, parameters={"GUID_OPTIONS": 0.0}
+    )
     assert (summary["aborted"], fake.witness.commands) == (True, 0)
     assert summary["reason"] == "parameter audit: GUID_OPTIONS wrong, see the table"
     assert told[-1].time < 1.0
 
 
 def test_without_the_audit_the_traps_are_what_they_are():
-    """What the audit is for: thrust as a climb rate, thrust that grows with tilt, a servo that is acknowledged and stays."""
+    """What the audit is for: thrust as a climb rate, thrust that grows with tilt, a servo that is
+    acknowledged and stays.
+    """
     desk = Desk("ardupilot", "ardupilot.audit=false", parameters={"GUID_OPTIONS": 0.0}).follow()
     desk.turn(0.1, (7.0, 0.0, 0.0, 0.0))
-    assert desk.fake.plant.commands[-1][0] == pytest.approx(2.668, rel=1e-3), "half thrust: no climb"
+    assert desk.fake.plant.commands[-1][0] == pytest.approx(2.668, rel=1e-3), (
+        "half thrust: no climb"
+    )
     desk = Desk("ardupilot", "ardupilot.audit=false", 'ardupilot.release="servo"').follow()
     desk.backend.release(desk.now)
     desk.turn(0.7, HOVER)
@@ -296,10 +356,11 @@ def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("mechanism", [0.11, 0.06, 0.002])
 def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
-    """Measured by the fake, which knows the true separation; a faster mechanism waits for the difference.
+    """Measured by the fake, which knows the true separation; a faster mechanism waits for the
+    difference.
 
-    A latch counts from when the policy's commands of its tick act: the state that it decided on was carried forward to then.
-    """
+    A latch counts from when the policy's commands of its tick act: the state that it decided on was
+    carried forward to then."""
     plant, overrides = LevelPlant(lag=mechanism), (*QUICK, f"{kind}.mechanism_lag={mechanism}")
     runner, source, clock, fake = peers(plant, kind=kind, loaded=AT_ONCE, overrides=overrides)
     summary = Loop(runner, source, clock, AutoOperator()).fly(3.5)
@@ -308,24 +369,45 @@ def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     assert (summary["latches"], fake.witness.breaches) == (1, [])
 
 
-@pytest.mark.parametrize(("kind", "prompt"), [*((kind, True) for kind in KINDS), ("ardupilot", False), ("px4", False)])
+@pytest.mark.parametrize(
+    ("kind", "prompt"), [*((kind, True) for kind in KINDS), ("ardupilot", False), ("px4", False)]
+)
 def test_a_complete_throw(kind, prompt):
     """Also where a change of mode is seen in a heartbeat up to a second later."""
     plant = LevelPlant()
     quick = QUICK if prompt else (*QUICK[:-1], "states.land=2.0", "states.quiet=1.2")
-    summary, fake, told = throw(plant, kind=kind, loaded=AT_ONCE, seconds=9.5, overrides=quick, prompt=prompt)
-    assert (summary["latches"], len(summary["landings"]), summary["stuck"], summary["errors"]) == (1, 1, 0, [])
+    summary, fake, told = throw(
+        plant, kind=kind, loaded=AT_ONCE, seconds=9.5, overrides=quick, prompt=prompt
+    )
+    assert (summary["latches"], len(summary["landings"]), summary["stuck"], summary["errors"]) == (
+        1,
+        1,
+        0,
+        [],
+    )
     assert (fake.witness.releases, fake.witness.breaches) == (1, [])
-    assert [d.state for d in told][:7] == ["idle", "check", "ready", "armed", "throw", "recover", "land"]
+    assert [d.state for d in told][:7] == [
+        "idle",
+        "check",
+        "ready",
+        "armed",
+        "throw",
+        "recover",
+        "land",
+    ]
     if kind == "betaflight":
         assert fake.override, "it is flown by the runner to the end"
     else:
         modes = [text for _, text in fake.events if text.startswith("mode")]
-        assert modes == (["mode 17", "mode 9"] if kind == "ardupilot" else ["mode 6.0", "mode 4.3", "mode 4.6"])
+        assert modes == (
+            ["mode 17", "mode 9"] if kind == "ardupilot" else ["mode 6.0", "mode 4.3", "mode 4.6"]
+        )
 
 
 def test_two_throws_with_the_autopilots_own_hold_between_them():
-    """From the hold the runner takes the vehicle back for the next throw, and the release is new."""
+    """From the hold the runner takes the vehicle back for the next throw, and the
+    release is new.
+    """
     plant = LevelPlant()
 
     class HangOn:
@@ -337,7 +419,9 @@ def test_two_throws_with_the_autopilots_own_hold_between_them():
                 fake.witness._answered = False
             return OperatorInput(arm=state == "ready")
 
-    runner, source, clock, fake = peers(plant, kind="ardupilot", loaded=AT_ONCE, overrides=(*QUICK, "throws=2"))
+    runner, source, clock, fake = peers(
+        plant, kind="ardupilot", loaded=AT_ONCE, overrides=(*QUICK, "throws=2")
+    )
     summary = Loop(runner, source, clock, HangOn()).fly(9.0)
     assert (summary["latches"], fake.witness.releases, fake.witness.breaches) == (2, 2, [])
     assert [text for _, text in fake.events] == ["mode 17", "mode 4", "mode 17", "mode 9"]
@@ -357,18 +441,24 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
         for pose in desk.source.poll(desk.now):
             desk.runner.tracks[pose.body].update(pose)
         check.tick(desk.now, desk.runner)
-    (found, text) = check.results(desk.now, desk.runner.mass)[-1]
+    found, text = check.results(desk.now, desk.runner.mass)[-1]
     assert found == good, text
     assert check.meter.share == pytest.approx(hover, rel=0.01)
 
 
 @pytest.mark.slow
 def test_a_hover_that_does_not_take_the_weight_arms_no_throw():
-    """The vehicle needs a tenth more than its weight by the config: the hover controller finds out, and no throw begins."""
+    """The vehicle needs a tenth more than its weight by the config: the hover controller finds out,
+    and no throw begins.
+    """
     from visthrow.throws.wire_plant import make
 
-    summary, fake, told = throw(make("state", 0), loaded=AT_ONCE, seconds=6.0,
-                                overrides=("ardupilot.thrust.hover=0.169", *QUICK[:1], "states.armed=2.5"))  # fmt: skip
+    summary, fake, told = throw(
+        make("state", 0),
+        loaded=AT_ONCE,
+        seconds=6.0,
+        overrides=("ardupilot.thrust.hover=0.169", *QUICK[:1], "states.armed=2.5"),
+    )
     assert (summary["throws"], fake.witness.releases) == (0, 0)
     assert any("hovering takes 1.1" in d.reason + d.waits for d in told), "and says why"
     assert not any("swing" in d.reason for d in told)
@@ -376,7 +466,10 @@ def test_a_hover_that_does_not_take_the_weight_arms_no_throw():
 
 def test_an_answer_that_nobody_asked_for_changes_nothing():
     desk = Desk("betaflight").follow()
-    for frame in (msp.Frame(msp.SERVO, b"\xd0\x07", msp.ANSWER), msp.Frame(msp.RC, bytes([0xD0, 7] * 12), msp.ANSWER)):
+    for frame in (
+        msp.Frame(msp.SERVO, b"\xd0\x07", msp.ANSWER),
+        msp.Frame(msp.RC, bytes([0xD0, 7] * 12), msp.ANSWER),
+    ):
         desk.fake.port.write(msp.pack(frame))
     desk.turn(0.1, HOVER)
     assert desk.status.release == "idle"
@@ -419,7 +512,9 @@ def test_what_speaks_against_arming_is_said_in_words():
 
 
 def test_px4_without_the_gripper_switch_flies_and_with_it_off_does_not():
-    """PD_GRIPPER_EN is gone since 1.17; older firmware has it, and answers no DO_GRIPPER without it."""
+    """PD_GRIPPER_EN is gone since 1.17; older firmware has it, and answers no DO_GRIPPER without
+    it.
+    """
     desk = Desk("px4")
     desk.turn(1.5)
     assert (desk.backend.audit.done, desk.status.fault) == (True, None)
@@ -430,11 +525,19 @@ def test_px4_without_the_gripper_switch_flies_and_with_it_off_does_not():
 
 
 def test_px4s_gripper_opens_at_the_minimum_of_its_output():
-    """A config that takes the closed end for the open one is found at connect; without the audit a jam does not pass as a release."""
+    """A config that takes the closed end for the open one is found at connect; without the audit a
+    jam does not pass as a release.
+    """
     wrong = Desk("px4", "px4.servo_open_us=2000")
     wrong.turn(1.5)
     assert wrong.backend.audit.problems == ["PWM_AUX_MIN1 is 1000; expected 2000 (servo_open_us)"]
-    jammed = Desk("px4", "px4.servo_open_us=2000", "px4.audit=false", "px4.release_timeout=1.5", answer="stuck").follow()
+    jammed = Desk(
+        "px4",
+        "px4.servo_open_us=2000",
+        "px4.audit=false",
+        "px4.release_timeout=1.5",
+        answer="stuck",
+    ).follow()
     jammed.backend.release(jammed.now)
     jammed.turn(2.0, HOVER)
     assert jammed.status.release == "failed"
@@ -451,7 +554,9 @@ def test_a_mode_is_seen_soon_though_the_heartbeat_is_slow(kind):
 
 
 def test_idle_says_at_once_why_it_waits():
-    runner, source, clock, _ = peers(LevelPlant(), loaded=AT_ONCE, overrides=("states.idle=1.0",), armed=False)
+    runner, source, clock, _ = peers(
+        LevelPlant(), loaded=AT_ONCE, overrides=("states.idle=1.0",), armed=False
+    )
     told = []
     Loop(runner, source, clock, AutoOperator(), None, told.append).fly(5.0)
     waits = {d.waits: d.time for d in told if d.state == "idle"}

@@ -1,4 +1,6 @@
-"""The Crazyflie's back-end and its fake: a whole throw over CRTP in lock step, signs, and what each refuses."""
+"""The Crazyflie's back-end and its fake: a whole throw over CRTP in lock step, signs, and what each
+refuses.
+"""
 
 import math
 import sys
@@ -34,11 +36,16 @@ class Desk:
 
     def __init__(self, **options):
         self.number, poses = free_port(), free_port()
-        over = [f'crazyflie.device="udpout:127.0.0.1:{self.number}"', f'link.device="udp:127.0.0.1:{poses}"']
+        over = [
+            f'crazyflie.device="udpout:127.0.0.1:{self.number}"',
+            f'link.device="udp:127.0.0.1:{poses}"',
+        ]
         self.params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
         port = AnsweringPort(Device("udp", "127.0.0.1", self.number))
         link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
-        self.fake = FakeCrazyflie(make("vision", 0), link, MocapParams(), 0, Options(**options), port=port)
+        self.fake = FakeCrazyflie(
+            make("vision", 0), link, MocapParams(), 0, Options(**options), port=port
+        )
         self.backend = make_backend(self.params)
 
     def turn(self, seconds, command=None, ask=None):
@@ -73,11 +80,15 @@ def desk():
 
 
 def test_a_whole_throw(desk, tmp_path):
-    """Taken, armed, thrown, released and recovered by the runner; the vehicle's poses go to its estimator."""
+    """Taken, armed, thrown, released and recovered by the runner; the vehicle's poses go to its
+    estimator.
+    """
     one = desk()
     clock = FlightClock(one.fake)
     source, _, _ = open_source(one.params, tmp_path, clock)
-    runner = Runner(one.params, Policy.load(find_policy("vision")), one.backend, mechanism_lag(one.params))
+    runner = Runner(
+        one.params, Policy.load(find_policy("vision")), one.backend, mechanism_lag(one.params)
+    )
     runner.watcher = one.backend.place
     loop = Loop(runner, source, clock, AutoOperator())
     while one.fake.plant.time < 9.0 and one.fake.plant.landing["landing_time"] is None:
@@ -118,7 +129,10 @@ def test_silence_levels_and_then_stops_the_motors(desk):
     assert told[:3] == ["armed", "commander: level", "motors off"]
 
 
-@pytest.mark.parametrize(("answer", "state", "note"), [("denied", FAILED, "not known"), ("silent", FAILED, "no final answer")])
+@pytest.mark.parametrize(
+    ("answer", "state", "note"),
+    [("denied", FAILED, "not known"), ("silent", FAILED, "no final answer")],
+)
 def test_a_release_that_is_not_answered_well_has_failed(desk, answer, state, note):
     one = desk(answer=answer)
     one.turn(0.5, (0.0, 0.0, 0.0, 0.0), FOLLOW)

@@ -1,5 +1,7 @@
-"""Every way for a run to end, in hover and in throw, with each autopilot's fake: it lands or does what its table says, nothing
-is released, and the summary is there. Lock step; `test_processes` does the same with processes."""
+"""Every way for a run to end, in hover and in throw, with each autopilot's fake: it lands or does
+what its table says, nothing is released, and the summary is there. Lock step; `test_processes` does
+the same with processes.
+"""
 
 import os
 import signal
@@ -27,7 +29,9 @@ LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
 
 
 class Told:
-    """The terminal's signals, the loop's parts that raise, the end of the time: done a few ticks into a state."""
+    """The terminal's signals, the loop's parts that raise, the end of the time: done a few ticks
+    into a state.
+    """
 
     def __init__(self, way: str, state: str, parts, monkeypatch):
         self.runner, source, self.clock, self.fake = parts
@@ -53,7 +57,9 @@ class Told:
         self.runner.tick, source.poll = ticked, polled
         try:
             most = OVER if way == "time over" else float("inf")
-            self.summary = Loop(self.runner, source, self.clock, operator, None, self.tell).fly(most)
+            self.summary = Loop(self.runner, source, self.clock, operator, None, self.tell).fly(
+                most
+            )
         finally:
             for number, handler in self.saved.items():
                 signal.signal(number, handler)
@@ -70,7 +76,11 @@ class Told:
     @property
     def after(self):
         """What the vehicle did from then on, with the time since."""
-        return [(round(at - self.done_at, 2), text) for at, text in self.fake.events if at >= self.done_at - 1e-6]
+        return [
+            (round(at - self.done_at, 2), text)
+            for at, text in self.fake.events
+            if at >= self.done_at - 1e-6
+        ]
 
 
 def with_fake(kind: str, state: str):
@@ -80,10 +90,13 @@ def with_fake(kind: str, state: str):
 
 
 REASONS = {
-    "SIGINT": "the operator said abort (Ctrl-C)", "SIGTERM": "the process was told to end (SIGTERM)",
-    "SIGHUP": "the process was told to end (SIGHUP)", "SIGQUIT": "the process was told to end (SIGQUIT)",
-    "time over": "the time of the run is over", "source raises": "OSError: the network card has gone",
-}  # fmt: skip
+    "SIGINT": "the operator said abort (Ctrl-C)",
+    "SIGTERM": "the process was told to end (SIGTERM)",
+    "SIGHUP": "the process was told to end (SIGHUP)",
+    "SIGQUIT": "the process was told to end (SIGQUIT)",
+    "time over": "the time of the run is over",
+    "source raises": "OSError: the network card has gone",
+}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -91,7 +104,11 @@ REASONS = {
 @pytest.mark.parametrize("way", REASONS)
 def test_it_ends_by_landing(way, state, kind, monkeypatch):
     run = Told(way, state, with_fake(kind, state), monkeypatch)
-    assert (run.summary["aborted"], run.summary["reason"], run.summary["state"]) == (True, REASONS[way], "done")
+    assert (run.summary["aborted"], run.summary["reason"], run.summary["state"]) == (
+        True,
+        REASONS[way],
+        "done",
+    )
     assert (run.fake.witness.breaches, run.fake.witness.releases) == ([], 0)
     if kind == "betaflight":
         assert run.fake.override, "it is the runner that brings it down"
@@ -134,6 +151,9 @@ def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(kind, monkeyp
 @pytest.mark.parametrize("kind", KINDS)
 def test_output_that_raises_ends_a_throw_by_landing(kind, monkeypatch):
     run = Told("output raises", "throw", with_fake(kind, "throw"), monkeypatch)
-    assert (run.summary["aborted"], run.summary["reason"]) == (True, "BrokenPipeError: nobody reads")
+    assert (run.summary["aborted"], run.summary["reason"]) == (
+        True,
+        "BrokenPipeError: nobody reads",
+    )
     if kind != "betaflight":
         assert LANDS[kind] in [text for _, text in run.fake.events]

@@ -1,4 +1,6 @@
-"""Bytes and messages from anywhere, signals, and the start: nothing of it makes the runner command."""
+"""Bytes and messages from anywhere, signals, and the start: nothing of it makes the
+runner command.
+"""
 
 import os
 import resource
@@ -20,15 +22,24 @@ from tests.loopback.wire import HERE, cut, peers, throw
 from visthrow.onboard.actions import hover_action
 
 READY = 8.0
-"""Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s on a free core, 3 s are
-asked for. Wall time says nothing on a busy machine."""
+"""Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s
+on a free core, 3 s are asked for. Wall time says nothing on a busy machine.
+"""
 
 
 def flood(count: int, kind: str, seed: int) -> None:
-    """Messages of every kind with any bits in their fields, spoiled poses, and noise, to a runner that nobody armed."""
-    runner, source, clock, fake = peers(LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0)))
+    """Messages of every kind with any bits in their fields, spoiled poses, and noise, to a runner
+    that nobody armed.
+    """
+    runner, source, clock, fake = peers(
+        LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0))
+    )
     rng, inbox, commands = np.random.default_rng(seed), source._link.port.inbox, []
-    fake.link.listen(lambda message, arrival: commands.append((message.get_type(), getattr(message, "command", None))))
+    fake.link.listen(
+        lambda message, arrival: commands.append(
+            (message.get_type(), getattr(message, "command", None))
+        )
+    )
     for _ in range(20):  # it is the vehicle's own address that all of it comes from
         fake.step()
     source.poll(clock.now())
@@ -67,26 +78,36 @@ KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 MOST_THROWS = 8
 
 AT_ONCE = 200
-"""Packets beside each look at the link: together with the true ones less than are read in one go."""
+"""Packets beside each look at the link: together with the true ones less than are read in one go.
+"""
 
 
 def lies() -> list:
-    """What an attacker would say with the vehicle's ids: it is elsewhere, disarmed, in another mode, has released, is well set up."""
+    """What an attacker would say with the vehicle's ids: it is elsewhere, disarmed, in another
+    mode, has released, is well set up.
+    """
     quat = [1.0, 0.0, 0.0, 0.0]
     return [
-        mav.MAVLink_att_pos_mocap_message(5_000_000, quat, 0.4, 0.2, -1.2), mav.MAVLink_heartbeat_message(2, 3, 0, 5, 4, 3),
-        mav.MAVLink_heartbeat_message(2, 12, 128, 4, 4, 3), mav.MAVLink_heartbeat_message(2, 3, 128, 9, 4, 3),
-        mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 0), mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 4),
-        mav.MAVLink_param_value_message(b"GUID_OPTIONS", 0.0, 9, 1, 0), mav.MAVLink_timesync_message(77, 78),
-        mav.MAVLink_timesync_message(0, 79), mav.MAVLink_servo_output_raw_message(5, 0, *([1900] * 16)),
-        mav.MAVLink_param_error_message(245, 191, b"GUID_OPTIONS", -1, 1), mav.MAVLink_named_value_int_message(0, b"SIMULATED", 0),
+        mav.MAVLink_att_pos_mocap_message(5_000_000, quat, 0.4, 0.2, -1.2),
+        mav.MAVLink_heartbeat_message(2, 3, 0, 5, 4, 3),
+        mav.MAVLink_heartbeat_message(2, 12, 128, 4, 4, 3),
+        mav.MAVLink_heartbeat_message(2, 3, 128, 9, 4, 3),
+        mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 0),
+        mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 4),
+        mav.MAVLink_param_value_message(b"GUID_OPTIONS", 0.0, 9, 1, 0),
+        mav.MAVLink_timesync_message(77, 78),
+        mav.MAVLink_timesync_message(0, 79),
+        mav.MAVLink_servo_output_raw_message(5, 0, *([1900] * 16)),
+        mav.MAVLink_param_error_message(245, 191, b"GUID_OPTIONS", -1, 1),
+        mav.MAVLink_named_value_int_message(0, b"SIMULATED", 0),
         mav.MAVLink_attitude_target_message(0, 0, quat, 0.0, 0.0, 0.0, 0.9),
-    ]  # fmt: skip
+    ]
 
 
 def forger(rng, signed: bool, captured: list[bytes]):
-    """Makes one packet and its sender: spoofed, stray, noise; with signing also from the vehicle's own address, unsigned, signed
-    with another key, or sent once more."""
+    """Makes one packet and its sender: spoofed, stray, noise; with signing also from the vehicle's
+    own address, unsigned, signed with another key, or sent once more.
+    """
     said, packers = lies(), {ids: mav.MAVLink(None, *ids) for ids in ((1, 1), (1, 25))}
     forged = {ids: Signed(OTHER_KEY, *ids) for ids in packers}
 
@@ -109,18 +130,40 @@ def forger(rng, signed: bool, captured: list[bytes]):
 
 
 def flown(seed: int, count: int, kind: str, signed: bool):
-    """A throw in lock step beside so many forged packets: what was decided, what the vehicle took, what was refused."""
+    """A throw in lock step beside so many forged packets: what was decided, what the vehicle took,
+    what was refused.
+    """
     kwargs = {"key": KEY} if signed else {}
     hover = hover_action(9.81 * 0.272, 14.0)[0]
-    quick = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.land=0.5")
-    runner, source, clock, fake = peers(LevelPlant(), kind=kind, loaded=simple_policy((hover, 0, 0, 0, 1.0)), overrides=quick, **kwargs)
+    quick = (
+        "states.check_hold=0.2",
+        "states.armed_least=0.1",
+        "states.quiet=0.1",
+        "states.land=0.5",
+    )
+    runner, source, clock, fake = peers(
+        LevelPlant(),
+        kind=kind,
+        loaded=simple_policy((hover, 0, 0, 0, 1.0)),
+        overrides=quick,
+        **kwargs,
+    )
     rng, port, captured = np.random.default_rng(seed), source.links[0].port, []
-    make, left, decisions, poll, tick = forger(rng, signed, captured), [count], [], source.poll, runner.tick
+    make, left, decisions, poll, tick = (
+        forger(rng, signed, captured),
+        [count],
+        [],
+        source.poll,
+        runner.tick,
+    )
 
     def polled(now):
-        # Whoever speaks first with the right ids is the vehicle, where nothing is signed: so strangers come when it is known.
+        # Whoever speaks first with the right ids is the vehicle, where nothing is signed: so
+        # strangers come when it is known.
         known = signed or len(source.links[0].roster.at) == len(source.links[0].roster.parties)
-        captured.extend(data for data in list(port.inbox)[:2] if len(captured) < 100 and isinstance(data, bytes))
+        captured.extend(
+            data for data in list(port.inbox)[:2] if len(captured) < 100 and isinstance(data, bytes)
+        )
         if known and left[0] > 0:
             left[0] -= AT_ONCE
             true, forged = list(port.inbox), [make() for _ in range(AT_ONCE)]
@@ -138,14 +181,22 @@ def flown(seed: int, count: int, kind: str, signed: bool):
 
 
 def unmoved(seed: int, count: int) -> None:
-    """Forged packets, over as many throws as it takes, change no bit of what is decided, and none of what the vehicle takes."""
+    """Forged packets, over as many throws as it takes, change no bit of what is decided, and none
+    of what the vehicle takes.
+    """
     kind, signed = ("ardupilot", "px4")[seed % 2], seed % 4 >= 2
     alone, _, plain, _, _, _ = flown(seed, 0, kind, signed)
     left = count
     for part in range(MOST_THROWS):
-        decisions, summary, fake, roster, rest, runner = flown(1000 * part + seed, left, kind, signed)
+        decisions, summary, fake, roster, rest, runner = flown(
+            1000 * part + seed, left, kind, signed
+        )
         assert decisions == alone
-        assert (fake.witness.commands, fake.witness.releases, fake.witness.breaches) == (plain.witness.commands, 1, [])
+        assert (fake.witness.commands, fake.witness.releases, fake.witness.breaches) == (
+            plain.witness.commands,
+            1,
+            [],
+        )
         assert fake.events == plain.events
         assert (summary["latches"], summary["errors"], runner.errors) == (1, [], [])
         assert roster.refused > 0.5 * (left - rest), "the rest is noise"
@@ -167,10 +218,14 @@ def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
 
 
 def test_a_flood_in_mid_throw_neither_commands_nor_releases():
-    """Noise from the vehicle's own address beside its poses: commands stay finite, and nothing is released twice."""
+    """Noise from the vehicle's own address beside its poses: commands stay finite, and nothing is
+    released twice.
+    """
     plant = LevelPlant()
     rng = np.random.default_rng(1)
-    strings = [noise(rng) for _ in range(100)] + [mutated(rng, [any_message(rng)])[:-1] for _ in range(300)]
+    strings = [noise(rng) for _ in range(100)] + [
+        mutated(rng, [any_message(rng)])[:-1] for _ in range(300)
+    ]
     step = plant.step
 
     def noisy(command, release, after=0.0):
@@ -198,7 +253,17 @@ def test_a_flood_in_mid_throw_neither_commands_nor_releases():
 
 def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
-    command = [sys.executable, "-m", "visthrow.cli", "hil", "run", "--set", device, "--out", str(tmp_path / "run")]
+    command = [
+        sys.executable,
+        "-m",
+        "visthrow.cli",
+        "hil",
+        "run",
+        "--set",
+        device,
+        "--out",
+        str(tmp_path / "run"),
+    ]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
@@ -221,14 +286,12 @@ def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):
 def test_what_the_runner_imports_is_enough_on_board():
     """The whole command starts where neither simulator nor trainer can be imported."""
     code = (
-        "import sys\n"
-        "class Blocker:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.split('.')[0] in ('sim', 'warp', 'rsl_rl', 'tensordict', 'mujoco', 'visthrow.training.env'):\n"
-        "            raise ImportError('blocked: ' + name)\n"
-        "sys.meta_path.insert(0, Blocker())\n"
-        "from visthrow.cli import main\n"
-        f"sys.exit(main(['hil', 'check', '--seconds', '0.1', '--set', 'link.device=\"udp:127.0.0.1:{free_port()}\"']))\n"
+        "import sys\nclass Blocker:\n    def find_spec(self, name, path=None, target=None):\n     "
+        "   if name.split('.')[0] in ('sim', 'warp', 'rsl_rl', 'tensordict', 'mujoco',"
+        " 'visthrow.training.env'):\n            raise ImportError('blocked: ' +"
+        " name)\nsys.meta_path.insert(0, Blocker())\nfrom visthrow.cli import"
+        " main\nsys.exit(main(['hil', 'check', '--seconds', '0.1', '--set',"
+        f" 'link.device=\"udp:127.0.0.1:{free_port()}\"']))\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 1, result.stderr

@@ -22,8 +22,10 @@ START = 1.2
 
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5")
 ODOMETRY = (
-    'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
-    '{ body = "payload", message = "ODOMETRY", system = 1, component = 25 }]',
+    (
+        'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
+        '{ body = "payload", message = "ODOMETRY", system = 1, component = 25 }]'
+    ),
 )
 
 HOLD, ABORT, TICK = 0.10, 0.25, 0.02
@@ -46,13 +48,18 @@ class OneWord:
 
 
 def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
-    """A run in which a fault happens in mid throw: runner, fake, and the first decision of each state."""
+    """A run in which a fault happens in mid throw: runner, fake, and the first decision of each
+    state.
+    """
     more = ODOMETRY if name == "reset" else ()
     plant, told = LevelPlant(), []
     runner, source, clock, fake = peers(
-        plant, overrides=(*QUICK, *more), loaded=loaded, mocap_fault=(name, START),
+        plant,
+        overrides=(*QUICK, *more),
+        loaded=loaded,
+        mocap_fault=(name, START),
         pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
-    )  # fmt: skip
+    )
     cut(runner, source, clock, OneWord(), None, START + seconds, told.append)
     return runner, fake, [(d.state, d.reason, d.time) for d in told]
 
@@ -95,8 +102,9 @@ def test_every_fault_is_accounted_for():
 
 @pytest.mark.parametrize("name", ["swap", "order", "jump", "shuffle", "clock-forth"])
 def test_a_fault_as_the_policy_asks_for_the_release(name):
-    """It asks from the first tick of the throw on; the fault is there from the start of the check: nothing is released
-    unless the poses passed all checks, and then once."""
+    """It asks from the first tick of the throw on; the fault is there from the start of the check:
+    nothing is released unless the poses passed all checks, and then once.
+    """
     at_once = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
     plant = LevelPlant()
     runner, source, clock, fake = peers(
@@ -111,7 +119,10 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
 
 
 def test_faults_themselves():
-    good = [Pose(0.01 * i, 0.01 * i, VEHICLE, (0.0, 0.0, 1.0 + i), (1.0, 0.0, 0.0, 0.0)) for i in range(50)]
+    good = [
+        Pose(0.01 * i, 0.01 * i, VEHICLE, (0.0, 0.0, 1.0 + i), (1.0, 0.0, 0.0, 0.0))
+        for i in range(50)
+    ]
 
     def made(name):
         fault = MocapFault(name, 0.1)

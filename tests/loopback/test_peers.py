@@ -1,4 +1,6 @@
-"""Who is on the wire, over UDP between sockets: strays, two senders, a bridge that restarts, another autopilot, cut recordings."""
+"""Who is on the wire, over UDP between sockets: strays, two senders, a bridge that restarts,
+another autopilot, cut recordings.
+"""
 
 import contextlib
 import shutil
@@ -29,14 +31,26 @@ class Wire:
     def __init__(self, folder, base="fake", *overrides):
         self.now, self.said = 0.0, []
         self.number, self.other = free_port(), free_port()
-        given = (f'link.device="udp:127.0.0.1:{self.number}"', *(o.format(other=self.other) for o in overrides))
+        given = (
+            f'link.device="udp:127.0.0.1:{self.number}"',
+            *(o.format(other=self.other) for o in overrides),
+        )
         self.params = config.load(HilParams, config.find("hil", base), given)
-        self.source, self.link, _ = open_source(self.params, folder, MonotonicClock(), None, self.said.append)
+        self.source, self.link, _ = open_source(
+            self.params, folder, MonotonicClock(), None, self.said.append
+        )
         self.backend = make_backend(self.params, self.link)
 
     def peer(self, system=1, component=1, number=None):
         """Somebody with a socket of its own, and what it hears."""
-        link, heard = Link(open_port(check_device(f"udpout:127.0.0.1:{number or self.number}")), system, component), []
+        link, heard = (
+            Link(
+                open_port(check_device(f"udpout:127.0.0.1:{number or self.number}")),
+                system,
+                component,
+            ),
+            [],
+        )
         link.listen(lambda message, arrival: heard.append(message.get_type()))
         return link, heard
 
@@ -51,6 +65,7 @@ class Wire:
 @pytest.fixture
 def wire(tmp_path):
     with contextlib.ExitStack() as stack:
+
         def make(*args):
             made = Wire(tmp_path / "run", *args)
             stack.callback(made.source.close)
@@ -86,7 +101,9 @@ def test_a_stray_byte_does_not_make_its_sender_the_vehicle(wire):
 
 
 def test_another_kind_of_autopilot_is_not_taken_for_the_vehicle(wire):
-    """A PX4 that happens to send to the port of a run that expects an ArduPilot: it is asked for nothing."""
+    """A PX4 that happens to send to the port of a run that expects an ArduPilot: it is asked for
+    nothing.
+    """
     run = wire()
     other, heard = run.peer()
     for _ in range(3):
@@ -165,14 +182,35 @@ def test_check_says_who_is_heard_with_which_ids(tmp_path, capsys, monkeypatch):
             return poll(source, now)
 
         monkeypatch.setattr(MavlinkSource, "poll", sending)
-        assert main(["hil", "check", "--seconds", "0.5", "--set", f'link.device="udp:127.0.0.1:{number}"']) == 1
+        assert (
+            main(
+                [
+                    "hil",
+                    "check",
+                    "--seconds",
+                    "0.5",
+                    "--set",
+                    f'link.device="udp:127.0.0.1:{number}"',
+                ]
+            )
+            == 1
+        )
         port = sender.getsockname()[1]
     out = capsys.readouterr().out
     assert "vehicle: no pose" in out
-    assert "vehicle and payload not heard; expected: vehicle as 1/1 (ATT_POS_MOCAP), payload as 1/25 (ATT_POS_MOCAP)" in out
-    assert f"VISION_POSITION_ESTIMATE of system 42, component 7 from 127.0.0.1:{port}: nobody of this run" in out
+    assert (
+        "vehicle and payload not heard; expected: vehicle as 1/1 (ATT_POS_MOCAP), payload as 1/25"
+        " (ATT_POS_MOCAP)" in out
+    )
+    assert (
+        f"VISION_POSITION_ESTIMATE of system 42, component 7 from 127.0.0.1:{port}: nobody of"
+        " this run" in out
+    )
     monkeypatch.setattr(MavlinkSource, "poll", poll)
-    assert main(["hil", "check", "--seconds", "0.1", "--set", f'link.device="udp:127.0.0.1:{number}"']) == 1
+    assert (
+        main(["hil", "check", "--seconds", "0.1", "--set", f'link.device="udp:127.0.0.1:{number}"'])
+        == 1
+    )
     assert f"nobody speaks on udp:127.0.0.1:{number}" in capsys.readouterr().out
 
 
@@ -195,7 +233,21 @@ def test_a_replay_of_a_cut_recording_is_no_success(tmp_path, capsys):
 def test_a_folder_that_holds_a_run_is_not_resumed(tmp_path, capsys):
     record_run(tmp_path / "run", saved_policy(tmp_path), seconds=0.5)
     number = free_port()
-    assert main(["hil", "run", "--seconds", "0.1", "--out", str(tmp_path / "run"), "--set", f'link.device="udp:127.0.0.1:{number}"']) == 2
+    assert (
+        main(
+            [
+                "hil",
+                "run",
+                "--seconds",
+                "0.1",
+                "--out",
+                str(tmp_path / "run"),
+                "--set",
+                f'link.device="udp:127.0.0.1:{number}"',
+            ]
+        )
+        == 2
+    )
     said = capsys.readouterr().err
     assert "holds a run already; name another folder with --out" in said
     assert "resume" not in said

@@ -1,4 +1,6 @@
-"""Runner and fake as two processes in real time: whole throws with each kind, SIGTERM, SIGKILL, a full disk."""
+"""Runner and fake as two processes in real time: whole throws with each kind, SIGTERM, SIGKILL, a
+full disk.
+"""
 
 import fcntl
 import json
@@ -28,13 +30,17 @@ PATIENCE = 120.0
 """For anything to happen on a busy machine [s]."""
 
 ONE_THROW, MOST_LATE = 0.25, 100
-"""Landing error of a single throw [m], and periods of the fake that may be late: late commands, all of them."""
+"""Landing error of a single throw [m], and periods of the fake that may be late: late commands, all
+of them.
+"""
 
 FEW_MISSED = 3
 """Ticks of a run that may be missed where its throw is to land in its place."""
 
 SPEEDS = (1.0, 0.5, 0.25)
-"""Of both processes' clocks: the next one is flown where the machine was too busy for the one before; the last one counts as it is."""
+"""Of both processes' clocks: the next one is flown where the machine was too busy for the one
+before; the last one counts as it is.
+"""
 
 START = 5.0
 """After which a run whose output is not read has begun to listen [s]."""
@@ -52,8 +58,20 @@ def free_port(kind=socket.SOCK_DGRAM) -> int:
 class Pair:
     """A fake and a runner, each in a process of its own."""
 
-    def __init__(self, folder, kind, policy, plant=("--plant", "tests.level:make"), overrides=(), both=(), terminal=None):
-        self.both, self.terminal = both, terminal  # further arguments of runner and fake; what the runner's controls it
+    def __init__(
+        self,
+        folder,
+        kind,
+        policy,
+        plant=("--plant", "tests.level:make"),
+        overrides=(),
+        both=(),
+        terminal=None,
+    ):
+        self.both, self.terminal = (
+            both,
+            terminal,
+        )  # further arguments of runner and fake; what the runner's controls it
         self.folder, poses, msp = folder, free_port(), free_port(socket.SOCK_STREAM)
         self.device, self.msp = f"127.0.0.1:{poses}", msp
         self.fake = self.runner = None
@@ -66,19 +84,51 @@ class Pair:
 
     def _start_fake(self, kind, plant):
         self.fake = subprocess.Popen(
-            [*COMMAND, "fake", "--kind", kind, "--device", f"udpout:{self.device}", "--msp-port", str(self.msp), *plant,
-             "--seconds", "300", "--after", "1.5", "--out", str(self.folder / "fake.json"), *self.both],
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [
+                *COMMAND,
+                "fake",
+                "--kind",
+                kind,
+                "--device",
+                f"udpout:{self.device}",
+                "--msp-port",
+                str(self.msp),
+                *plant,
+                "--seconds",
+                "300",
+                "--after",
+                "1.5",
+                "--out",
+                str(self.folder / "fake.json"),
+                *self.both,
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         assert "flies" in self.fake.stderr.readline()
 
     def _start_runner(self, kind, policy, overrides):
-        sets = [f'link.device="udp:{self.device}"', f'betaflight.device="tcp:127.0.0.1:{self.msp}"', f'policy="{policy}"']
+        sets = [
+            f'link.device="udp:{self.device}"',
+            f'betaflight.device="tcp:127.0.0.1:{self.msp}"',
+            f'policy="{policy}"',
+        ]
         self.runner = subprocess.Popen(
-            [*COMMAND, "run", "--config", CONFIGS[kind], "--auto-arm", "--out", str(self.folder / "run"), *self.both,
-             *(part for text in (*sets, *overrides) for part in ("--set", text))],
-            **self._streams(), text=True,
-        )  # fmt: skip
+            [
+                *COMMAND,
+                "run",
+                "--config",
+                CONFIGS[kind],
+                "--auto-arm",
+                "--out",
+                str(self.folder / "run"),
+                *self.both,
+                *(part for text in (*sets, *overrides) for part in ("--set", text)),
+            ],
+            **self._streams(),
+            text=True,
+        )
         if self.terminal is None:
             assert self.runner.stderr.readline().startswith("ready after")
         else:
@@ -87,13 +137,22 @@ class Pair:
     def _streams(self) -> dict:
         """A terminal of its own, or pipes."""
         if self.terminal is None:
-            return {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+            return {
+                "stdout": subprocess.PIPE,
+                "stderr": subprocess.PIPE,
+                "stdin": subprocess.DEVNULL,
+            }
 
         def control():
             os.setsid()
             fcntl.ioctl(self.terminal, termios.TIOCSCTTY, 0)
 
-        return {"stdout": self.terminal, "stderr": self.terminal, "stdin": self.terminal, "preexec_fn": control}
+        return {
+            "stdout": self.terminal,
+            "stderr": self.terminal,
+            "stdin": self.terminal,
+            "preexec_fn": control,
+        }
 
     def wait_for(self, state: str) -> None:
         """Until the runner says that it is in a state."""
@@ -107,7 +166,9 @@ class Pair:
         raise AssertionError(f"no {state} within {PATIENCE} s")
 
     def wait_for_actions(self, count: int) -> None:
-        """Until so many actions of the policy are recorded: on a busy machine most ticks are missed."""
+        """Until so many actions of the policy are recorded: on a busy machine most ticks are
+        missed.
+        """
         end, path = time.monotonic() + PATIENCE, self.folder / "run" / "ticks.jsonl"
         while sum('"action": [' in line for line in path.read_text().splitlines()) < count:
             assert time.monotonic() < end, f"no {count} actions within {PATIENCE} s"
@@ -131,7 +192,9 @@ class Pair:
 
 
 def kept_up(folder, fly):
-    """What ``fly(folder, speed)`` gives, with whether the machine was late, at the first of `SPEEDS` at which it was not."""
+    """What ``fly(folder, speed)`` gives, with whether the machine was late, at the first of
+    `SPEEDS` at which it was not.
+    """
     for speed in SPEEDS:
         place = folder / f"at-{speed:g}"
         place.mkdir()
@@ -149,8 +212,11 @@ def never(tmp_path):
     return path
 
 
-OWN = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points",
-       "betaflight": "override: the pilot's sticks count again"}  # fmt: skip
+OWN = {
+    "ardupilot": "levelled: no set-points",
+    "px4": "left OFFBOARD: no set-points",
+    "betaflight": "override: the pilot's sticks count again",
+}
 """What the vehicle does by itself when nobody speaks any more."""
 
 
@@ -169,7 +235,9 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
 
     report, folder = kept_up(tmp_path, fly)
     assert OWN[kind] in [text for _, text in report["events"]]
-    happened = next(at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"])
+    happened = next(
+        at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"]
+    )
     assert 0.29 < happened - report["last_command"] < 0.6
     assert (report["breaches"], report["releases"]) == ([], 0)
     found = replay(folder / "run")
@@ -178,11 +246,19 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
 
 
 def test_sigterm_in_mid_throw(tmp_path, never):
-    """What systemd, `timeout` and a shutdown send; `tests.bench.runner --faults` flies the others, in hover and with each kind. Signed."""
+    """What systemd, `timeout` and a shutdown send; `tests.bench.runner --faults` flies the others,
+    in hover and with each kind. Signed.
+    """
     key = tmp_path / "key"
     key.write_text("a phrase that both know\n")
     key.chmod(0o600)
-    with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0"), both=("--sign", str(key))) as pair:
+    with Pair(
+        tmp_path,
+        "ardupilot",
+        never,
+        overrides=(*QUICK, "states.abort=1.0"),
+        both=("--sign", str(key)),
+    ) as pair:
         pair.wait_for("throw")
         pair.wait_for_actions(10)
         os.kill(pair.runner.pid, signal.SIGTERM)
@@ -198,9 +274,13 @@ def test_sigterm_in_mid_throw(tmp_path, never):
 
 @pytest.mark.slow
 def test_the_terminal_is_closed_in_mid_throw(tmp_path, never):
-    """As by a dropped ssh: the run's terminal is gone, and says so by SIGHUP; it lands, and its folder is complete."""
+    """As by a dropped ssh: the run's terminal is gone, and says so by SIGHUP; it lands, and its
+    folder is complete.
+    """
     master, slave = pty.openpty()
-    with Pair(tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0"), terminal=slave) as pair:
+    with Pair(
+        tmp_path, "ardupilot", never, overrides=(*QUICK, "states.abort=1.0"), terminal=slave
+    ) as pair:
         os.close(slave)
         pair.wait_for_actions(10)
         os.close(master)
@@ -233,14 +313,29 @@ def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
 @pytest.mark.parametrize("policy", ["state", "vision"])
 @pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_a_throw_with_each_kind(tmp_path, kind, policy):
-    """In real time where the machine keeps up, with the simulator's vehicle and the shipped policies."""
+    """In real time where the machine keeps up, with the simulator's vehicle and the shipped
+    policies.
+    """
+
     def fly(folder, speed):
         both = ("--speed", str(speed))
-        with Pair(folder, kind, policy, plant=("--policy", policy), overrides=("states.abort=0.5",), both=both) as pair:
+        with Pair(
+            folder,
+            kind,
+            policy,
+            plant=("--policy", policy),
+            overrides=("states.abort=0.5",),
+            both=both,
+        ) as pair:
             out, _ = pair.runner.communicate(timeout=PATIENCE)
             report = pair.report(end=False)
         summary = json.loads((folder / "run" / "summary.json").read_text())
-        return out, report, summary, report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED
+        return (
+            out,
+            report,
+            summary,
+            report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED,
+        )
 
     out, report, summary, folder = kept_up(tmp_path, fly)
     assert report["landing_w"] is not None, out

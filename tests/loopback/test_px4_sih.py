@@ -25,7 +25,9 @@ def test_a_small_swing_has_the_period_of_a_pendulum():
     ball = make_ball("vision", 0)
     ball.follow(np.array([0.0, 0.0, 2.0]), STILL, LEVEL, STILL)
     ball.step(np.zeros(4), False)
-    ball.follow(np.array([0.02, 0.0, 2.0]), STILL, LEVEL, STILL)  # the mount jumps: the ball hangs beside it now
+    ball.follow(
+        np.array([0.02, 0.0, 2.0]), STILL, LEVEL, STILL
+    )  # the mount jumps: the ball hangs beside it now
     crossings, before = [], None
     for _ in range(1200):
         ball.step(np.zeros(4), False)
@@ -33,8 +35,12 @@ def test_a_small_swing_has_the_period_of_a_pendulum():
         if before is not None and before < 0.0 <= off:
             crossings.append(ball.time - ball.period * off / (off - before))
         before = off
-    assert np.diff(crossings).mean() == pytest.approx(2.0 * math.pi * math.sqrt(ball.length / 9.81), rel=0.01)
-    assert np.linalg.norm(ball.state["payload_pos_w"] - [0.02, 0.0, 2.0 + ball.mount_b[2]]) <= ball.length * (1.0 + 1e-9)
+    assert np.diff(crossings).mean() == pytest.approx(
+        2.0 * math.pi * math.sqrt(ball.length / 9.81), rel=0.01
+    )
+    assert np.linalg.norm(
+        ball.state["payload_pos_w"] - [0.02, 0.0, 2.0 + ball.mount_b[2]]
+    ) <= ball.length * (1.0 + 1e-9)
 
 
 def test_a_release_at_a_steady_speed_falls_by_the_parabola():
@@ -45,12 +51,16 @@ def test_a_release_at_a_steady_speed_falls_by_the_parabola():
         ball.follow(place + n * ball.period * speed, speed, LEVEL, STILL)
         ball.step(np.zeros(4), n * ball.period > 7.0)
     found, height = ball.landing, 2.0 + ball.mount_b[2] - ball.length - ball.ground
-    assert found["landing_time"] - found["separation_time"] == pytest.approx(math.sqrt(2.0 * height / 9.81), abs=0.02)
+    assert found["landing_time"] - found["separation_time"] == pytest.approx(
+        math.sqrt(2.0 * height / 9.81), abs=0.02
+    )
     assert not ball.attached
 
 
 class OtherSide:
-    """PX4's side of the bridge's own link: position, attitude and outputs; it hears which streams are asked for."""
+    """PX4's side of the bridge's own link: position, attitude and outputs; it hears which streams
+    are asked for.
+    """
 
     def __init__(self, port):
         self.link = Link(UdpPort(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
@@ -58,7 +68,10 @@ class OtherSide:
         self.link.listen(self._hear)
 
     def _hear(self, message, arrival):
-        if message.get_type() == "COMMAND_LONG" and message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
+        if (
+            message.get_type() == "COMMAND_LONG"
+            and message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL
+        ):
             self.asked.add(int(message.param1))
 
     def say(self, time, pos, yaw, output):
@@ -82,8 +95,13 @@ def test_the_bridge_hears_places_and_the_mechanism():
         bridge.step()
     now = bridge.plant.state
     np.testing.assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=1e-6)
-    np.testing.assert_allclose(now["quat_wb"], [0.0, 0.0, -math.sin(0.15), math.cos(0.15)], atol=1e-6)
-    assert px4.asked >= {mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION}
+    np.testing.assert_allclose(
+        now["quat_wb"], [0.0, 0.0, -math.sin(0.15), math.cos(0.15)], atol=1e-6
+    )
+    assert px4.asked >= {
+        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    }
     report = bridge.report()
     assert report["releases"] == 1
     assert 1.5 < report["separation_time"] < 1.6

@@ -1,4 +1,6 @@
-"""Complete throws with the shipped policies: mocap in, thrust, rates and release out, payload lands."""
+"""Complete throws with the shipped policies: mocap in, thrust, rates and release out, payload
+lands.
+"""
 
 import dataclasses
 import json
@@ -29,7 +31,9 @@ from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make
 
 LANDING = 0.05
-"""Mean landing error over the wire of three throws at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of loss; 0.10 m is asked for."""
+"""Mean landing error over the wire of three throws at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of
+loss; 0.10 m is asked for.
+"""
 
 ONE_THROW = 0.10
 """A single throw [m]: three deviations of what is measured in simulated time."""
@@ -38,27 +42,38 @@ READ_BACK = 0.01
 """Landing by the payload's noisy poses against the truth [m]."""
 
 FEW_LATE = 20
-"""Periods of the fake that came late in a throw whose times are right: 0.1 s in all. With more, or with a tick that was missed, the
-machine is too busy for real time, and how well a throw lands is not the runner's doing."""
+"""Periods of the fake that came late in a throw whose times are right: 0.1 s in all.
+
+With more, or with a tick that was missed, the machine is too busy for real time, and how well a
+throw lands is not the runner's doing.
+"""
 
 
 @pytest.mark.parametrize("policy", ["state", "vision"])
 def test_throws_in_lock_step(policy):
     loaded, errors = Policy.load(find_policy(policy)), []
     for seed in range(3):
-        summary, fake, _ = throw(make(policy, seed), seed=seed, policy=policy, loaded=loaded, seconds=5.5)
+        summary, fake, _ = throw(
+            make(policy, seed), seed=seed, policy=policy, loaded=loaded, seconds=5.5
+        )
         true = fake.plant.landing["landing_w"]
         assert true is not None, summary["reason"]
         errors.append(np.hypot(true[0] - 2.0, true[1]))
         (landing,) = summary["landings"]
         assert np.linalg.norm(np.subtract(landing["landing_w"], true)) < READ_BACK
-        assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (0, 1, 0)
+        assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (
+            0,
+            1,
+            0,
+        )
         assert summary["held_back"] == 0, "a right throw is not delayed"
     assert np.mean(errors) < LANDING
 
 
 def test_a_policy_that_asks_too_early_is_held_back_and_throws_all_the_same(monkeypatch):
-    """Its first questions come in hover: none is passed on, and none is told to the policy as done; the throw then lands."""
+    """Its first questions come in hover: none is passed on, and none is told to the policy as done;
+    the throw then lands.
+    """
     loaded, asked, act = Policy.load(find_policy("vision")), [], Pilot.act
 
     def hasty(pilot, *args):
@@ -73,7 +88,10 @@ def test_a_policy_that_asks_too_early_is_held_back_and_throws_all_the_same(monke
     summary, fake, _ = throw(make("vision", 0), policy="vision", loaded=loaded, seconds=4.5)
     assert (summary["held_back"], summary["latches"], fake.witness.releases) == (8, 1, 1)
     assert summary["latch_times"][0] > asked[-1] + 0.1
-    assert np.hypot(fake.plant.landing["landing_w"][0] - 2.0, fake.plant.landing["landing_w"][1]) < ONE_THROW
+    assert (
+        np.hypot(fake.plant.landing["landing_w"][0] - 2.0, fake.plant.landing["landing_w"][1])
+        < ONE_THROW
+    )
 
 
 @pytest.mark.parametrize("after", [0.0, 0.0017, 0.0049])
@@ -95,12 +113,18 @@ def free_port() -> int:
 
 
 def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
-    """In real time; recorded, replayed to the bit, and the .tlog holds the poses that the run was flown on."""
+    """In real time; recorded, replayed to the bit, and the .tlog holds the poses that the run was
+    flown on.
+    """
     device = f"127.0.0.1:{free_port()}"
-    params = config.load(HilParams, config.find("hil", "fake"), [f'link.device="udp:{device}"', "states.abort=0.5"])
+    params = config.load(
+        HilParams, config.find("hil", "fake"), [f'link.device="udp:{device}"', "states.abort=0.5"]
+    )
     clock = MonotonicClock()
     recorder = Recorder(tmp_path / "run", params)
-    link = Link(open_port(check_device(params.link.device)), tlog=TlogWriter(tmp_path / "run" / "link.tlog"))
+    link = Link(
+        open_port(check_device(params.link.device)), tlog=TlogWriter(tmp_path / "run" / "link.tlog")
+    )
     source = MavlinkSource(link, params.source.senders, clock.now)
     backend = make_backend(params, link)
     runner = Runner(params, Policy.load(find_policy(params.policy)), backend, mechanism_lag(params))
@@ -108,7 +132,8 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     # The fake goes away in mid flight, which ends the run: half a second later it is done.
     command = [sys.executable, "-m", "visthrow.cli", "hil", "fake", "--device", f"udpout:{device}"]
     fake = subprocess.Popen(
-        [*command, "--seconds", "20", "--after", "0.2", "--out", str(tmp_path / "fake.json")], stdout=subprocess.DEVNULL
+        [*command, "--seconds", "20", "--after", "0.2", "--out", str(tmp_path / "fake.json")],
+        stdout=subprocess.DEVNULL,
     )
     try:
         summary = Loop(runner, source, clock, AutoOperator(), recorder).fly()

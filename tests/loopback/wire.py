@@ -1,4 +1,6 @@
-"""Runner and fake autopilot in one process, in lock step: no waiting, the same bits on every machine."""
+"""Runner and fake autopilot in one process, in lock step: no waiting, the same bits on every
+machine.
+"""
 
 import math
 from collections import deque
@@ -29,7 +31,9 @@ class MemoryPort:
     whole, peer = True, None
 
     def __init__(self) -> None:
-        self.inbox: deque[bytes | tuple[bytes, tuple[str, int]]] = deque()  # with the sender, where it is not the other end
+        self.inbox: deque[bytes | tuple[bytes, tuple[str, int]]] = (
+            deque()
+        )  # with the sender, where it is not the other end
         self.other: MemoryPort | None = None
         self.sender: tuple[str, int] | None = None
 
@@ -60,7 +64,10 @@ def pipe() -> tuple[MemoryPort, MemoryPort]:
 
 
 class PlantClock:
-    """Simulated time; waiting flies on. What is sent is heard at that instant, which may lie within a period of the plant."""
+    """Simulated time; waiting flies on.
+
+    What is sent is heard at that instant, which may lie within a period of the plant.
+    """
 
     def __init__(self, fake: Fake) -> None:
         self._fake, self._now = fake, fake.plant.time
@@ -90,22 +97,42 @@ CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betafligh
 
 
 def peers(
-    plant, seed=0, answer="accepted", overrides=(), mocap=None, policy="state", loaded=None, kind="ardupilot", tell=None,
-    write=False, key=None, mocap_fault=("none", math.inf), **options,
+    plant,
+    seed=0,
+    answer="accepted",
+    overrides=(),
+    mocap=None,
+    policy="state",
+    loaded=None,
+    kind="ardupilot",
+    tell=None,
+    write=False,
+    key=None,
+    mocap_fault=("none", math.inf),
+    **options,
 ):
     """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
     from hil.params import HilParams
 
-    wild = ("aim.bound=9.0",) if loaded is not None and len(loaded.weights) == 1 else ()  # it releases in hover, 2 m off
-    params = config.load(HilParams, config.find("hil", CONFIGS[kind]), [f"policy={policy}", *wild, *overrides])
+    wild = (
+        ("aim.bound=9.0",) if loaded is not None and len(loaded.weights) == 1 else ()
+    )  # it releases in hover, 2 m off
+    params = config.load(
+        HilParams, config.find("hil", CONFIGS[kind]), [f"policy={policy}", *wild, *overrides]
+    )
     here, there = pipe()
     mine, its = pipe()
     mine.whole = its.whole = False
     more = Options(answer=answer, **options)
-    fake = make_fake(kind, plant, Link(there, *VEHICLE_ID, key=key), mocap or MocapParams(), seed, more, its)
+    fake = make_fake(
+        kind, plant, Link(there, *VEHICLE_ID, key=key), mocap or MocapParams(), seed, more, its
+    )
     fake.spoil = MocapFault(*mocap_fault, seed).spoil
     roster = Roster(parties(params, True, True))
-    clock, link = PlantClock(fake), Link(here, params.link.system, params.link.component, roster=roster, key=key)
+    clock, link = (
+        PlantClock(fake),
+        Link(here, params.link.system, params.link.component, roster=roster, key=key),
+    )
     if params.delay.synchronise:
         LinkSync(link)
     source = MavlinkSource(link, params.source.senders, clock.now)
@@ -118,10 +145,12 @@ def peers(
 
 
 def cut(runner, source, clock, operator, recorder, seconds, tell):
-    """The turns of a run for a time [s], and no more: it is neither aborted nor landed then. Its summary.
+    """The turns of a run for a time [s], and no more: it is neither aborted nor landed then.
 
-    ``tell`` is handed the first decision of each state; what is waited for stands in those of `Loop` itself.
-    """
+    Its summary.
+
+    ``tell`` is handed the first decision of each state; what is waited for stands in those of
+    `Loop` itself."""
     said = []
 
     def change(decision):
@@ -136,7 +165,9 @@ def cut(runner, source, clock, operator, recorder, seconds, tell):
 
 
 def throw(plant, seconds=20.0, recorder=None, phase=0, operator=None, **kwargs):
-    """A run in lock step, its ticks ``phase`` of the plant's periods after the poses: summary, fake, decisions."""
+    """A run in lock step, its ticks ``phase`` of the plant's periods after the poses: summary,
+    fake, decisions.
+    """
     runner, source, clock, fake = peers(plant, **kwargs)
     for _ in range(phase):
         fake.step()

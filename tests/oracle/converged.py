@@ -1,4 +1,6 @@
-"""Converged runs of bare quadrotor and rope in MuJoCo C: what the tests of every other plant are held against."""
+"""Converged runs of bare quadrotor and rope in MuJoCo C: what the tests of every other plant are
+held against.
+"""
 
 from dataclasses import dataclass
 
@@ -21,13 +23,17 @@ class OracleRun:
     rate_b: np.ndarray  # [rad/s], shape (T, 3)
     ball_pos_w: np.ndarray  # [m], shape (T, 3)
     ball_vel_w: np.ndarray  # [m/s], shape (T, 3)
-    cable_points_w: np.ndarray  # mount, every joint and the end of the last segment [m], shape (T, L+1, 3)
+    cable_points_w: (
+        np.ndarray
+    )  # mount, every joint and the end of the last segment [m], shape (T, L+1, 3)
     cable_dir_w: np.ndarray  # shape (T, L, 3)
     cable_vel_w: np.ndarray  # time derivative of the directions [1/s], shape (T, L, 3)
     energy: np.ndarray  # kinetic and potential [J], shape (T, 2)
 
 
-def _record(model: "mujoco.MjModel", data: "mujoco.MjData", scene: Scene, rows: dict[str, list[np.ndarray]]) -> None:
+def _record(
+    model: "mujoco.MjModel", data: "mujoco.MjData", scene: Scene, rows: dict[str, list[np.ndarray]]
+) -> None:
     # After mj_step the derived fields describe the state before it.
     mujoco.mj_forward(model, data)
     count, length = scene.segments, scene.segment_length
@@ -90,7 +96,10 @@ def converged(
         ValueError: a time or a switch off the step edges, or another kind of joint.
     """
     if joints != "universal":
-        raise ValueError(f"oracle: joints {joints!r}, expected 'universal'; ball joints are run by sim.reference.plant")
+        raise ValueError(
+            f"oracle: joints {joints!r}, expected 'universal'; ball joints are run by"
+            " sim.reference.plant"
+        )
     model = build_attached(*vehicle_and_rope(scene), joints, armature)
     model.opt.timestep = step
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")

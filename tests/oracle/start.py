@@ -8,7 +8,8 @@ from tests.scenes import Scene
 from tests.simulators import scene_plant
 
 CONVERGED_STEP = 20e-6
-"""Step of a converged run [s]: half of it moves the ball of both scenes by less than a micrometre."""
+"""Step of a converged run [s]: half of it moves the ball of both scenes by less than a micrometre.
+"""
 
 
 def vehicle_and_rope(scene: Scene) -> tuple[BodyParams, RopeParams]:
@@ -27,7 +28,8 @@ def matrix_from_quat(quat: np.ndarray) -> np.ndarray:
 def hinges_from_directions(
     rot_wb: np.ndarray, rate_w: np.ndarray, cable_dir_w: np.ndarray, cable_vel_w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return angles [rad] and rates [rad/s] of the universal joints, shape (2 L,) each, order y0, x0, y1, x1, ..
+    """Return angles [rad] and rates [rad/s] of the universal joints, shape (2 L,) each, order y0,
+    x0, y1, x1, ..
 
     With ``n = Ry(a) Rx(b) (0, 0, -1) = (-cos b sin a, sin b, -cos b cos a)`` in the parent's frame.
 
@@ -43,13 +45,17 @@ def hinges_from_directions(
         n = frame.T @ direction
         b, a = np.arcsin(np.clip(n[1], -1.0, 1.0)), np.arctan2(-n[0], -n[2])
         first = frame[:, 1]
-        turned = frame @ np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        turned = frame @ np.array(
+            [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
+        )
         second = turned[:, 0]
         columns = np.stack((np.cross(first, direction), np.cross(second, direction)), -1)
         rate = np.linalg.lstsq(columns, velocity - np.cross(omega, direction), rcond=None)[0]
         angles += [a, b]
         rates += list(rate)
-        frame = turned @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+        frame = turned @ np.array(
+            [[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]]
+        )
         omega = omega + rate[0] * first + rate[1] * second
     return np.array(angles), np.array(rates)
 

@@ -1,8 +1,8 @@
 """The rope's recursion and its integrator against converged MuJoCo runs of the same bodies.
 
-MuJoCo's joints are universal: they pass the twist of a turning vehicle on and damp it, a string and our recursion do
-not. With the damping of the scenes that is worth 0.03 mm; the tests of the order leave the damping out.
-"""
+MuJoCo's joints are universal: they pass the twist of a turning vehicle on and damp it, a string and
+our recursion do not. With the damping of the scenes that is worth 0.03 mm; the tests of the order
+leave the damping out."""
 
 import dataclasses
 from functools import lru_cache
@@ -21,11 +21,15 @@ POSITION = 1e-3
 VELOCITY = 1e-2
 """Over a flight of half a second it is worth 5 mm [m/s]."""
 FINE_POSITION = 1e-4
-"""At an eighth of the step: order 2 would give a 64th; float32 and the twist's damping leave 0.03 mm each [m]."""
+"""At an eighth of the step: order 2 would give a 64th; float32 and the twist's damping leave 0.03
+mm each [m].
+"""
 ORDER = 1.8
 """Order 2 at steps where the next power is still seen."""
 RESOLVED = {1: 2e-3, 3: 5e-4}
-"""Segments and a step [s] that resolves their fastest mode: one swings at 6 rad/s, three at 200 rad/s when taut."""
+"""Segments and a step [s] that resolves their fastest mode: one swings at 6 rad/s, three at 200
+rad/s when taut.
+"""
 
 
 @lru_cache
@@ -44,7 +48,9 @@ def errors(flight: Flight, run: OracleRun) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", ["hard_throw", "pull_back"])
-@pytest.mark.parametrize(("step", "near", "slow"), [(2e-3, POSITION, VELOCITY), (2.5e-4, FINE_POSITION, np.inf)])
+@pytest.mark.parametrize(
+    ("step", "near", "slow"), [(2e-3, POSITION, VELOCITY), (2.5e-4, FINE_POSITION, np.inf)]
+)
 def test_a_throw_is_as_accurate_as_its_step(step, near, slow, name, precision):
     scene = load_scene(SCENES / f"{name}.toml")
     vehicle, ball, velocity = errors(fly(scene, step, precision), oracle(scene))
@@ -54,10 +60,11 @@ def test_a_throw_is_as_accurate_as_its_step(step, near, slow, name, precision):
 
 
 def test_the_violent_whip_converges():
-    """Slack three times as deep, snapped to 170 rad/s: a limit case whose errors grow a thousandfold, MuJoCo's too.
+    """Slack three times as deep, snapped to 170 rad/s: a limit case whose errors grow a
+    thousandfold, MuJoCo's too.
 
-    No step of milliseconds follows it; what must hold is that nothing fails and that finer steps lead to the oracle.
-    """
+    No step of milliseconds follows it; what must hold is that nothing fails and that finer steps
+    lead to the oracle."""
     scene = load_scene(SCENES / "whip.toml")
     coarse = fly(scene, 2e-3, "float32")
     assert not coarse.status & NONFINITE
@@ -71,7 +78,11 @@ def coarse_rope(segments: int) -> Scene:
     """The hard throw with a rope of few segments, without damping."""
     scene = load_scene(SCENES / "hard_throw.toml")
     return dataclasses.replace(
-        scene, segments=segments, segment_length=0.33 / segments, segment_mass=0.004 / segments, joint_damping=0.0
+        scene,
+        segments=segments,
+        segment_length=0.33 / segments,
+        segment_mass=0.004 / segments,
+        joint_damping=0.0,
     )
 
 
@@ -91,7 +102,9 @@ def test_order_of_the_step(segments):
 
 
 def test_twist_is_all_that_is_left():
-    """Without damping the fine step meets MuJoCo closer than the bodies' twist would allow with it."""
+    """Without damping the fine step meets MuJoCo closer than the bodies' twist would
+    allow with it.
+    """
     scene = dataclasses.replace(load_scene(SCENES / "hard_throw.toml"), joint_damping=0.0)
     vehicle, ball, _ = errors(fly(scene, 2.5e-4, "float64"), oracle(scene))
     assert max(vehicle, ball) < 3e-5

@@ -1,4 +1,6 @@
-"""Effects that a kernel holds only if built for them, against the reference plant and scipy; off, they are not there."""
+"""Effects that a kernel holds only if built for them, against the reference plant and scipy; off,
+they are not there.
+"""
 
 import dataclasses
 
@@ -25,11 +27,15 @@ DISTINCT = 10.0  # times that agreement an effect must move the payload for the 
 
 def fine(plant):
     """The plant in float64 with a step of 1 ms."""
-    return dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, precision="float64", substep=1e-3))
+    return dataclasses.replace(
+        plant, sim=dataclasses.replace(plant.sim, precision="float64", substep=1e-3)
+    )
 
 
 def swing(plant, effect=None):
-    """Positions of vehicle and payload [m] after a swinging payload was pulled along, by this simulator or the reference."""
+    """Positions of vehicle and payload [m] after a swinging payload was pulled along, by this
+    simulator or the reference.
+    """
     com = np.array(plant.vehicle.body.com)
     start = {"pos_w": np.array([[0.0, 0.0, 1.5]]) + com}
     tilt = np.array([np.sin(0.6), 0.0, -np.cos(0.6)])
@@ -43,7 +49,9 @@ def swing(plant, effect=None):
         sim.reset(start["pos_w"] - com, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, rope)
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
     for k in range(STEPS):
-        command = np.array([[weight * (1.0 + 0.2 * np.sin(0.4 * k)), 1.5 * np.sin(0.3 * k), 1.5, 0.0]])
+        command = np.array(
+            [[weight * (1.0 + 0.2 * np.sin(0.4 * k)), 1.5 * np.sin(0.3 * k), 1.5, 0.0]]
+        )
         if effect is None:
             sim.set_command(command)
             sim.step()
@@ -56,13 +64,20 @@ def swing(plant, effect=None):
 
 
 def changed(plant, **parts):
-    """The plant with fields of its parts replaced: ``changed(plant, rope={"payload_drag": 1e-3})``."""
+    """The plant with fields of its parts replaced:
+
+    ``changed(plant, rope={"payload_drag": 1e-3})``.
+    """
     vehicle, rest = plant.vehicle, dict(parts)
     for name in ("thrust", "body", "motor"):
         if name in rest:
-            vehicle = dataclasses.replace(vehicle, **{name: dataclasses.replace(getattr(vehicle, name), **rest.pop(name))})
+            vehicle = dataclasses.replace(
+                vehicle, **{name: dataclasses.replace(getattr(vehicle, name), **rest.pop(name))}
+            )
     return dataclasses.replace(
-        plant, vehicle=vehicle, **{k: dataclasses.replace(getattr(plant, k), **v) for k, v in rest.items()}
+        plant,
+        vehicle=vehicle,
+        **{k: dataclasses.replace(getattr(plant, k), **v) for k, v in rest.items()},
     )
 
 
@@ -71,15 +86,26 @@ CASES = {
     "wind": {"air": {"wind_w": (1.0, -0.5, 0.2)}},
     "drag in wind": {"rope": {"payload_drag": 0.03}, "air": {"wind_w": (-2.0, 0.0, 0.0)}},
     "gain": {"thrust": {"gain": (1.03, 1.02, 1.04, 1.03)}, "rope": {"segments": 1}},
-    "drag torque": {"thrust": {"torque_gain": 1.8, "gain": (1.03, 0.97, 1.03, 0.97)}, "rope": {"segments": 1}},
+    "drag torque": {
+        "thrust": {"torque_gain": 1.8, "gain": (1.03, 0.97, 1.03, 0.97)},
+        "rope": {"segments": 1},
+    },
     "com": {"body": {"com": (2e-3, -1e-3, 3e-3)}, "rope": {"segments": 1}},
-    "ground": {"air": {"ground_effect": 1000.0}, "rope": {"segments": 1}},  # at 1.5 m a hundredth of a per cent each
-    "motors": {"motor": {"kind": "asymmetric", "time_constant_down": 0.25}, "rope": {"segments": 1}},
+    "ground": {
+        "air": {"ground_effect": 1000.0},
+        "rope": {"segments": 1},
+    },  # at 1.5 m a hundredth of a per cent each
+    "motors": {
+        "motor": {"kind": "asymmetric", "time_constant_down": 0.25},
+        "rope": {"segments": 1},
+    },
     "friction": {"rope": {"swing_damping": 0.05, "segments": 1}},
     "jet": {"rope": {"downwash": 0.05, "segments": 1}},
     "mount": {"rope": {"mount_damping": 2e-3, "segments": 1}},
 }
-"""Parameters of which both plants have the equation; what the vehicle does knows nothing of the number of segments."""
+"""Parameters of which both plants have the equation; what the vehicle does knows nothing of the
+number of segments.
+"""
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -94,14 +120,21 @@ def test_extension_is_the_reference_plants(name):
 
 
 def let_go(plant, ask: int = 3):
-    """When a swinging payload separated [s] and how fast it then was [m/s], by this simulator and the reference.
+    """When a swinging payload separated [s] and how fast it then was [m/s], by this simulator and
+    the reference.
 
     It is asked for after ``ask`` periods: the pull is known once a step was done.
     """
-    tilt, still = np.tile([np.sin(0.9), 0.0, -np.cos(0.9)], (1, plant.rope.segments, 1)), np.zeros((1, 3))
+    tilt, still = (
+        np.tile([np.sin(0.9), 0.0, -np.cos(0.9)], (1, plant.rope.segments, 1)),
+        np.zeros((1, 3)),
+    )
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
     command, home = np.array([[weight, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.5]])
-    here, there = HybridSim(plant, 1, extensions=EVERYTHING), ReferencePlant(plant, step=REFERENCE_STEP)
+    here, there = (
+        HybridSim(plant, 1, extensions=EVERYTHING),
+        ReferencePlant(plant, step=REFERENCE_STEP),
+    )
     here.place(pos_w=home, cable_dir_w=tilt)
     there.reset(home, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, tilt)
     k = 0
@@ -110,13 +143,18 @@ def let_go(plant, ask: int = 3):
         here.step()
         there.step(command, k >= ask)
         k += 1
-    opened = 0.02 * (k - 1) + float(here.get("separation_time")[0]), float(there.landing.separation_time[0])
+    opened = (
+        0.02 * (k - 1) + float(here.get("separation_time")[0]),
+        float(there.landing.separation_time[0]),
+    )
     fallen = np.array([0.0, 0.0, GRAVITY]) * (0.02 * k - opened[1])
     return opened, (here.get("payload_vel_w")[0], there.state.payload_vel_w[0] + fallen)
 
 
 def test_release_by_pull_and_kick_are_the_reference_plants():
-    """A payload lets go by the rope's pull, which is less than its weight out there, with the kick on top of what it had."""
+    """A payload lets go by the rope's pull, which is less than its weight out there, with the kick
+    on top of what it had.
+    """
     plant = changed(fine(paper_plant()), rope={"segments": 1}, release={"lag": 0.05})
     (plain, _), _ = let_go(plant)
     early = changed(plant, release={"lag_tension": 0.05})
@@ -124,11 +162,11 @@ def test_release_by_pull_and_kick_are_the_reference_plants():
     assert opened[0] == pytest.approx(opened[1], abs=2e-4)
     assert plain - opened[0] > 5e-3
     kick = np.array([0.1, 0.0, -0.05])
-    (_, kicked) = let_go(changed(early, release={"kick_w": tuple(kick)}))
+    _, kicked = let_go(changed(early, release={"kick_w": tuple(kick)}))
     for before, after in zip(calm, kicked):
         np.testing.assert_allclose(after - before, kick, atol=1e-6)
     np.testing.assert_allclose(kicked[0], kicked[1], atol=5e-3)
-    (_, shot) = let_go(changed(early, release={"kick_along": 0.2}))
+    _, shot = let_go(changed(early, release={"kick_along": 0.2}))
     for before, after in zip(calm, shot):
         assert np.linalg.norm(after - before) == pytest.approx(0.2, rel=1e-6)
     np.testing.assert_allclose(shot[0], shot[1], atol=5e-3)
@@ -139,14 +177,21 @@ def test_a_payload_that_swings_through_pulls_by_more_than_its_weight(segments):
     plant = changed(fine(paper_plant()), rope={"segments": segments}, release={"lag": 0.05})
     (plain, _), _ = let_go(plant, ask=15)
     late, _ = let_go(changed(plant, release={"lag_tension": 0.05}), ask=15)
-    assert late[0] == pytest.approx(late[1], abs=2e-4)  # of several rods, half the first one's load is left out
+    assert late[0] == pytest.approx(
+        late[1], abs=2e-4
+    )  # of several rods, half the first one's load is left out
     assert late[0] - plain > 5e-3
 
 
 def test_mount_damping_is_the_joint_damping_of_a_rigid_rope():
     plant = fine(paper_plant())
     stiff = changed(plant, rope={"segments": 1, "joint_damping": 1e-4, "mount_damping": 4e-4})
-    assert np.abs(swing(stiff) - swing(changed(stiff, rope={"joint_damping": 5e-4, "mount_damping": 0.0}))).max() < 1e-12
+    assert (
+        np.abs(
+            swing(stiff) - swing(changed(stiff, rope={"joint_damping": 5e-4, "mount_damping": 0.0}))
+        ).max()
+        < 1e-12
+    )
 
 
 def test_flight_under_drag_and_wind():
@@ -164,13 +209,26 @@ def test_flight_under_drag_and_wind():
         air = y[3:] - wind
         across = np.cross([0.0, 0.0, 1.0], air)
         push = side * across + lift * np.cross(air, across / np.linalg.norm(across)) - drag * air
-        return np.concatenate((y[3:], np.array([0, 0, -GRAVITY]) + np.linalg.norm(air) / plant.rope.payload_mass * push))
+        return np.concatenate(
+            (
+                y[3:],
+                np.array([0, 0, -GRAVITY]) + np.linalg.norm(air) / plant.rope.payload_mass * push,
+            )
+        )
 
     def ground(_, y):
         return y[2] - plant.release.landing_height
 
     ground.terminal, ground.direction = True, -1
-    path = solve_ivp(rates, (0, 5), np.concatenate((pos, vel)), events=ground, rtol=1e-11, atol=1e-12, dense_output=True)
+    path = solve_ivp(
+        rates,
+        (0, 5),
+        np.concatenate((pos, vel)),
+        events=ground,
+        rtol=1e-11,
+        atol=1e-12,
+        dense_output=True,
+    )
     assert sim.get("time_to_impact")[0] == pytest.approx(path.t[-1], abs=1e-7)
     np.testing.assert_allclose(sim.get("landing_w")[0], path.y[:3, -1], atol=1e-6)
     away = np.array([0.1, 0.3])
@@ -181,8 +239,12 @@ def test_flight_under_drag_and_wind():
     assert sim.get("clearance")[0] == pytest.approx(nearest, abs=1e-6)
 
 
-def spring_pendulum(give: float, mass: float, length: float, angle: float, seconds: float) -> np.ndarray:
-    """End of a pendulum on a stiff, damped spring without mass [m], from rest in balance along the spring; (x, z)."""
+def spring_pendulum(
+    give: float, mass: float, length: float, angle: float, seconds: float
+) -> np.ndarray:
+    """End of a pendulum on a stiff, damped spring without mass [m], from rest in balance along the
+    spring; (x, z).
+    """
     down, tension = np.array([0.0, -GRAVITY]), mass * GRAVITY * np.cos(angle)
     start = (length + give * tension) * np.array([np.sin(angle), -np.cos(angle)])
     damping = 1.4 * np.sqrt(mass / give)
@@ -193,29 +255,50 @@ def spring_pendulum(give: float, mass: float, length: float, angle: float, secon
         pull = (reach - length) / give + damping * y[2:] @ along
         return np.concatenate((y[2:], down - pull / mass * along))
 
-    return solve_ivp(rates, (0, seconds), np.append(start, (0.0, 0.0)), rtol=1e-9, atol=1e-11, method="LSODA").y[:2, -1]
+    return solve_ivp(
+        rates, (0, seconds), np.append(start, (0.0, 0.0)), rtol=1e-9, atol=1e-11, method="LSODA"
+    ).y[:2, -1]
 
 
 @pytest.mark.parametrize("steps", [12, 18])
 def test_a_rope_that_gives_is_a_spring(steps):
-    """A thousand times heavier vehicle holds the mount still; what the rope's give changes is what a spring changes."""
+    """A thousand times heavier vehicle holds the mount still; what the rope's give changes is what
+    a spring changes.
+    """
     plant, heavy = fine(paper_plant()), 1e3
     v, angle = plant.vehicle, 0.9
-    grown = {name: tuple(heavy * x for x in getattr(v.controller, name)) for name in ("p_gain", "i_gain", "d_gain")}
+    grown = {
+        name: tuple(heavy * x for x in getattr(v.controller, name))
+        for name in ("p_gain", "i_gain", "d_gain")
+    }
     grown |= {"max_thrust": heavy * v.controller.max_thrust, "feedforward_gain": (0.0, 0.0, 0.0)}
     v = dataclasses.replace(
-        v, body=dataclasses.replace(v.body, mass=heavy * v.body.mass, inertia=tuple(heavy * x for x in v.body.inertia)),
-        thrust=dataclasses.replace(v.thrust, k_f=heavy * v.thrust.k_f), controller=dataclasses.replace(v.controller, **grown),
-        battery=dataclasses.replace(v.battery, resistance=v.battery.resistance / heavy, capacity=heavy * v.battery.capacity),
-    )  # fmt: skip
-    plant = changed(dataclasses.replace(plant, vehicle=v), rope={"payload_offset": 0.0, "payload_inertia": 1e-9, "rope_mass": 1e-5})
+        v,
+        body=dataclasses.replace(
+            v.body, mass=heavy * v.body.mass, inertia=tuple(heavy * x for x in v.body.inertia)
+        ),
+        thrust=dataclasses.replace(v.thrust, k_f=heavy * v.thrust.k_f),
+        controller=dataclasses.replace(v.controller, **grown),
+        battery=dataclasses.replace(
+            v.battery, resistance=v.battery.resistance / heavy, capacity=heavy * v.battery.capacity
+        ),
+    )
+    plant = changed(
+        dataclasses.replace(plant, vehicle=v),
+        rope={"payload_offset": 0.0, "payload_inertia": 1e-9, "rope_mass": 1e-5},
+    )
     tilt = np.array([np.sin(angle), 0.0, -np.cos(angle)])
 
     def hung(give: float) -> np.ndarray:
         sim = HybridSim(changed(plant, rope={"compliance": give}), 1, extensions=EVERYTHING)
-        sim.place(pos_w=np.array([[0.0, 0.0, 5.0]]), cable_dir_w=np.tile(tilt, (1, plant.rope.segments, 1)))
+        sim.place(
+            pos_w=np.array([[0.0, 0.0, 5.0]]),
+            cable_dir_w=np.tile(tilt, (1, plant.rope.segments, 1)),
+        )
         for _ in range(steps):
-            sim.set_command(np.array([[GRAVITY * (v.body.mass + plant.rope.payload_mass), 0.0, 0.0, 0.0]]))
+            sim.set_command(
+                np.array([[GRAVITY * (v.body.mass + plant.rope.payload_mass), 0.0, 0.0, 0.0]])
+            )
             sim.step()
         return (sim.get("payload_pos_w") - sim.get("pos_w"))[0, [0, 2]]
 
@@ -223,7 +306,9 @@ def test_a_rope_that_gives_is_a_spring(steps):
     expected = [spring_pendulum(g, mass, length, angle, 0.02 * steps) for g in (give, 1e-6)]
     change = hung(give) - hung(0.0)
     assert np.linalg.norm(change) > 5e-4
-    np.testing.assert_allclose(change, expected[0] - expected[1], atol=0.12 * np.linalg.norm(change))  # the mount drifts
+    np.testing.assert_allclose(
+        change, expected[0] - expected[1], atol=0.12 * np.linalg.norm(change)
+    )  # the mount drifts
 
 
 def test_ground_effect_lifts_as_the_formula_says():
@@ -272,15 +357,33 @@ def test_built_in_at_zero_is_the_plain_simulator():
 def test_an_effect_is_compiled_in_only_where_it_is_on():
     plant = paper_plant()
     assert extensions_of([plant.vehicle], [plant.rope], [plant.air]) == frozenset()
-    def built(plant):
-        return hybrid._kernels(plant, False, False, extensions_of([plant.vehicle], [plant.rope], [plant.air]))
 
-    zero = changed(plant, rope={"payload_drag": 0.0, "mount_damping": 0.0}, air={"wind_w": (0.0, 0.0, 0.0)})
+    def built(plant):
+        return hybrid._kernels(
+            plant, False, False, extensions_of([plant.vehicle], [plant.rope], [plant.air])
+        )
+
+    zero = changed(
+        plant, rope={"payload_drag": 0.0, "mount_damping": 0.0}, air={"wind_w": (0.0, 0.0, 0.0)}
+    )
     assert HybridSim(zero, 1)._step is built(plant)[1]
-    for part in ({"rope": {"payload_drag": 1e-3}}, {"air": {"wind_w": (0.1, 0.0, 0.0)}}, {"thrust": {"gain": (1.1,) * 4}},
-                 {"air": {"ground_effect": 1.0}}, {"rope": {"mount_damping": 1e-5}}, {"rope": {"compliance": 1e-3}}):  # fmt: skip
+    for part in (
+        {"rope": {"payload_drag": 1e-3}},
+        {"air": {"wind_w": (0.1, 0.0, 0.0)}},
+        {"thrust": {"gain": (1.1,) * 4}},
+        {"air": {"ground_effect": 1.0}},
+        {"rope": {"mount_damping": 1e-5}},
+        {"rope": {"compliance": 1e-3}},
+    ):
         assert built(changed(plant, **part)) is not built(plant), part
-    assert set(EXTENSIONS) >= {"gain", "wind", "ground_effect", "payload_drag", "mount_damping", "push"}
+    assert set(EXTENSIONS) >= {
+        "gain",
+        "wind",
+        "ground_effect",
+        "payload_drag",
+        "mount_damping",
+        "push",
+    }
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,9 @@ LENSES = pytest.mark.parametrize(
     [
         FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5),
         FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0),
-        FisheyeParams(512, 512, 190.97, 190.99, 254.9, 256.9, 0.0035, 0.0007, -0.0021, 0.0002, 195.0),
+        FisheyeParams(
+            512, 512, 190.97, 190.99, 254.9, 256.9, 0.0035, 0.0007, -0.0021, 0.0002, 195.0
+        ),
     ],
     ids=["equidistant", "bent", "narrow"],
 )
@@ -25,7 +27,10 @@ LENSES = pytest.mark.parametrize(
 def points_before_the_lens(number: int = 5000) -> np.ndarray:
     """Points up to 89.5 deg off the axis, some close to it, shape (N, 3)."""
     rng = np.random.default_rng(0)
-    theta, phi = rng.uniform(0.0, math.radians(89.5), number), rng.uniform(-math.pi, math.pi, number)
+    theta, phi = (
+        rng.uniform(0.0, math.radians(89.5), number),
+        rng.uniform(-math.pi, math.pi, number),
+    )
     theta[:50] *= 1e-6
     rays = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
     return rays * rng.uniform(0.1, 10.0, (number, 1))
@@ -48,8 +53,12 @@ def test_equal_to_kornia_before_the_lens(params):
     from kornia.geometry.camera import distort_points_kannala_brandt
 
     points = torch.from_numpy(points_before_the_lens())
-    values = torch.tensor([params.fx, params.fy, params.cx, params.cy, *params.coefficients], dtype=torch.float64)
-    theirs = distort_points_kannala_brandt((points[:, :2] / points[:, 2:])[None], values[None, None])[0]
+    values = torch.tensor(
+        [params.fx, params.fy, params.cx, params.cy, *params.coefficients], dtype=torch.float64
+    )
+    theirs = distort_points_kannala_brandt(
+        (points[:, :2] / points[:, 2:])[None], values[None, None]
+    )[0]
     ours, _ = Fisheye(params).project(points)
     assert (ours - theirs).abs().max() < PIXEL_TOLERANCE
 
@@ -57,7 +66,9 @@ def test_equal_to_kornia_before_the_lens(params):
 @LENSES
 def test_unprojection_equal_to_opencv(params):
     points = points_before_the_lens(500)
-    points = points[np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2]) < math.radians(80.0)]
+    points = points[
+        np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2]) < math.radians(80.0)
+    ]
     lens = Fisheye(params)
     pixels, _ = lens.project(torch.from_numpy(points))
     camera_matrix = np.array([[params.fx, 0, params.cx], [0, params.fy, params.cy], [0, 0, 1]])
@@ -72,13 +83,15 @@ def test_unprojection_equal_to_opencv(params):
 
 
 def test_opencv_mirrors_points_behind_the_lens_and_ours_does_not():
-    # The reason for the model of our own: 100 deg off the axis OpenCV divides by a negative z and lands on the other
-    # side.
+    # The reason for the model of our own: 100 deg off the axis OpenCV divides by a negative z and
+    # lands on the other side.
     params = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
     t = math.radians(100.0)
     point = np.array([[[math.sin(t), 0.0, math.cos(t)]]])
     camera_matrix = np.array([[params.fx, 0, params.cx], [0, params.fy, params.cy], [0, 0, 1]])
-    theirs, _ = cv2.fisheye.projectPoints(point, np.zeros(3), np.zeros(3), camera_matrix, np.zeros(4))
+    theirs, _ = cv2.fisheye.projectPoints(
+        point, np.zeros(3), np.zeros(3), camera_matrix, np.zeros(4)
+    )
     ours, valid = Fisheye(params).project(torch.from_numpy(point[0]))
     assert theirs[0, 0, 0] < params.cx < float(ours[0, 0])
     assert valid.all()

@@ -30,13 +30,17 @@ def plant() -> PlantParams:
     """The paper's plant with a delay and a lag that fall inside substeps."""
     base = paper_plant()
     return dataclasses.replace(
-        base, vehicle=dataclasses.replace(base.vehicle, queue=QueueParams(0.0213)),
+        base,
+        vehicle=dataclasses.replace(base.vehicle, queue=QueueParams(0.0213)),
         release=dataclasses.replace(base.release, lag=LAG),
     )
 
 
 def start() -> tuple[np.ndarray, np.ndarray]:
-    return np.tile([0.0, 0.0, 2.0], (COUNT, 1)), np.random.default_rng(0).normal(size=(COUNT, 3)) * 0.5
+    return (
+        np.tile([0.0, 0.0, 2.0], (COUNT, 1)),
+        np.random.default_rng(0).normal(size=(COUNT, 3)) * 0.5,
+    )
 
 
 @lru_cache
@@ -52,19 +56,27 @@ def reference() -> ReferencePlant:
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_whole_plant(precision):
     pos, vel = start()
-    sim = HybridSim(dataclasses.replace(plant(), sim=numerics(SUBSTEPS[precision], precision)), COUNT)
+    sim = HybridSim(
+        dataclasses.replace(plant(), sim=numerics(SUBSTEPS[precision], precision)), COUNT
+    )
     sim.place(pos, vel_w=vel)
     separation = np.full(COUNT, np.nan)
     for k, command in enumerate(random_commands(0, STEPS, COUNT)):
         sim.set_command(command, RELEASE & (k == ASKED_AT))
         sim.step()
-        separation[sim.get("separated") != 0] = 0.02 * k + sim.get("separation_time")[sim.get("separated") != 0]
+        separation[sim.get("separated") != 0] = (
+            0.02 * k + sim.get("separation_time")[sim.get("separated") != 0]
+        )
     state = reference().state
     bound = WITHIN[precision]
     assert np.linalg.norm(sim.get("pos_w") - state.pos_w, axis=1).max() < bound
     held = ~RELEASE
-    assert np.linalg.norm(sim.get("payload_pos_w") - state.payload_pos_w, axis=1)[held].max() < bound
+    assert (
+        np.linalg.norm(sim.get("payload_pos_w") - state.payload_pos_w, axis=1)[held].max() < bound
+    )
     assert np.abs(sim.get("voltage") - state.battery_voltage).max() < VOLTAGE
     np.testing.assert_array_equal(sim.get("attached") != 0, state.attached)
     np.testing.assert_allclose(separation, reference().landing.separation_time, atol=1e-6)
-    assert np.linalg.norm(state.pos_w - pos, axis=1).min() > 0.1, "the vehicles must have gone somewhere"
+    assert np.linalg.norm(state.pos_w - pos, axis=1).min() > 0.1, (
+        "the vehicles must have gone somewhere"
+    )

@@ -1,4 +1,6 @@
-"""The quadrotor's blocks against their float64 twin of the reference, which shares no code with them."""
+"""The quadrotor's blocks against their float64 twin of the reference, which shares no code with
+them.
+"""
 
 import dataclasses
 from functools import lru_cache
@@ -13,22 +15,33 @@ from tests.plants import paper_plant
 from tests.simulators import random_commands
 
 WITHIN = 1e-3
-"""After a second of full-range commands [m]; the vehicles tumble, so errors of the first instants grow."""
+"""After a second of full-range commands [m]; the vehicles tumble, so errors of the first instants
+grow.
+"""
 SAME_EQUATIONS = 1e-6
-"""Two float64 codes of one method at one step differ by round-off and by what tumbling makes of it [m]."""
+"""Two float64 codes of one method at one step differ by round-off and by what tumbling makes of it
+[m].
+"""
 COUNT = 8
 SEEDS = (0, 1, 2)
 STEPS = 50
 """Of 20 ms: a new command every time."""
 SUBSTEP = 2e-3
 """Of the training simulator [s]; the largest error is 0.6 mm there, 0.04 mm at 0.5 ms."""
-STATES = {"pos_w": slice(0, 3), "quat_wb": slice(3, 7), "vel_w": slice(7, 10), "rate_b": slice(10, 13)}
+STATES = {
+    "pos_w": slice(0, 3),
+    "quat_wb": slice(3, 7),
+    "vel_w": slice(7, 10),
+    "rate_b": slice(10, 13),
+}
 
 
 def vehicle_with(delay: float = 0.0213, **kinds: str) -> VehicleParams:
     """The paper's vehicle; its command switches inside a substep."""
     vehicle = dataclasses.replace(paper_plant().vehicle, queue=QueueParams(delay))
-    parts = {name: dataclasses.replace(getattr(vehicle, name), kind=kind) for name, kind in kinds.items()}
+    parts = {
+        name: dataclasses.replace(getattr(vehicle, name), kind=kind) for name, kind in kinds.items()
+    }
     if kinds.get("controller") == "motor_mixing":
         parts["controller"] = dataclasses.replace(parts["controller"], gyro_share=(0.4, 0.5, 1.3))
     return dataclasses.replace(vehicle, **parts)
@@ -62,7 +75,9 @@ def flown(vehicle: VehicleParams, step: float, steps: int, precision: str) -> Qu
 def test_a_second_of_full_range_commands(precision):
     vehicle = vehicle_with()
     body, _ = reference(vehicle, 5e-4, STEPS)  # 0.03 mm from half of it
-    apart = np.linalg.norm(flown(vehicle, SUBSTEP, STEPS, precision).get("pos_w") - body[:, :3], axis=1)
+    apart = np.linalg.norm(
+        flown(vehicle, SUBSTEP, STEPS, precision).get("pos_w") - body[:, :3], axis=1
+    )
     assert apart.max() < WITHIN
     assert np.linalg.norm(body[:, :3], axis=1).min() > 0.1, "the vehicles must have gone somewhere"
 
@@ -70,8 +85,15 @@ def test_a_second_of_full_range_commands(precision):
 @pytest.mark.parametrize(
     "changes",
     [
-        {}, {"delay": 0.0}, {"delay": 0.0467}, {"delay": 0.04}, {"controller": "geometric"}, {"controller": "motor_mixing"},
-        {"motor": "instant"}, {"battery": "ideal"}, {"aero": "none"},
+        {},
+        {"delay": 0.0},
+        {"delay": 0.0467},
+        {"delay": 0.04},
+        {"controller": "geometric"},
+        {"controller": "motor_mixing"},
+        {"motor": "instant"},
+        {"battery": "ideal"},
+        {"aero": "none"},
     ],
     ids=str,
 )
@@ -81,9 +103,16 @@ def test_every_state_of_every_block(changes):
     body, blocks = reference(vehicle, 1e-3, 10)
     sim = flown(vehicle, 1e-3, 10, "float64")
     for name, columns in STATES.items():
-        np.testing.assert_allclose(sim.get(name), body[:, columns], atol=SAME_EQUATIONS * 100, err_msg=name)
+        np.testing.assert_allclose(
+            sim.get(name), body[:, columns], atol=SAME_EQUATIONS * 100, err_msg=name
+        )
     assert np.abs(sim.get("pos_w") - body[:, :3]).max() < SAME_EQUATIONS
-    inner = {"setpoint": blocks[:, 0:3], "gyro": blocks[:, 3:6], "integral": blocks[:, 6:9], "voltage": blocks[:, 14]}
+    inner = {
+        "setpoint": blocks[:, 0:3],
+        "gyro": blocks[:, 3:6],
+        "integral": blocks[:, 6:9],
+        "voltage": blocks[:, 14],
+    }
     if vehicle.controller.kind == "geometric":
         del inner["setpoint"], inner["gyro"]
     if vehicle.motor.kind == "first_order":
@@ -94,7 +123,9 @@ def test_every_state_of_every_block(changes):
 
 
 def test_orders_of_the_integrators():
-    """Gentle commands keep the mixer off its limits, where order 1 and 4 can be seen; no other code is needed."""
+    """Gentle commands keep the mixer off its limits, where order 1 and 4 can be seen; no other code
+    is needed.
+    """
     vehicle = vehicle_with(0.0213)
 
     def end(integrator, step):

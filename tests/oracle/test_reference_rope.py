@@ -1,4 +1,6 @@
-"""The reference's two ropes against each other: universal joints in C, and directions without twist in NumPy."""
+"""The reference's two ropes against each other: universal joints in C, and directions without twist
+in NumPy.
+"""
 
 import dataclasses
 
@@ -13,11 +15,15 @@ from tests.plants import SCENES
 from tests.scenes import load_scene
 
 CONVERGED = 1e-6
-"""Doubling the oracle's step moves the whip, the harsher scene, by 1.7e-7 m, halving it by 1.4e-11 m [m]."""
+"""Doubling the oracle's step moves the whip, the harsher scene, by 1.7e-7 m, halving it by 1.4e-11
+m [m].
+"""
 SAME_ROPE = 1e-8
 """Without damping they are one rope; 0.25 ms at order 4 leaves 1e-10 m or less within 0.1 s [m]."""
 TWIST_DAMPING = 5e-5
-"""What the damping of twist in universal joints moves within 0.5 s; measured 0.034 mm in the hard throw [m]."""
+"""What the damping of twist in universal joints moves within 0.5 s; measured 0.034 mm in the hard
+throw [m].
+"""
 
 
 def hard_throw(**changes):
@@ -82,7 +88,9 @@ def test_two_ropes_differ_by_twist_in_the_damping_only():
 
 
 def test_fold_beyond_a_right_angle():
-    """Directions along +-y of the parent are where universal joints are singular; the plant's rope passes them."""
+    """Directions along +-y of the parent are where universal joints are singular; the plant's rope
+    passes them.
+    """
     scene = hard_throw(direction=(0.0, 1.0, 0.02), duration=0.02)
     fine, coarse = BareScene(scene, 1e-4), BareScene(scene, 5e-4)
     for bare in (fine, coarse):
@@ -105,6 +113,9 @@ def test_scene_file_with_an_unknown_key(tmp_path):
 
 def test_bench_scenes_run():
     scene = hard_throw()
-    for bench in (timed_scene(scene, "RK4", 8e-4), timed_scene(scene, "implicitfast", 2e-3, "implicitfast", 2e-7)):
+    for bench in (
+        timed_scene(scene, "RK4", 8e-4),
+        timed_scene(scene, "implicitfast", 2e-3, "implicitfast", 2e-7),
+    ):
         bench.advance(2000)
         assert bench.step in (8e-4, 2e-3)

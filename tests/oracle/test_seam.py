@@ -1,4 +1,6 @@
-"""The hybrid's seam: two solvers behind one interface on the hard throw; a box and two cables fly; closed forms of each."""
+"""The hybrid's seam: two solvers behind one interface on the hard throw; a box and two cables fly;
+closed forms of each.
+"""
 
 import time
 
@@ -19,14 +21,21 @@ from visthrow.onboard.hover import HoverController, HoverParams
 SCENE = load_scene(SCENES / "hard_throw.toml")
 BODY, ROPE = vehicle_and_rope(SCENE)
 AGREE = 1e-3
-"""A thirtieth of the landing error that a policy is to reach [m]; measured 0.14 mm of the ball, 0.19 mm of the vehicle."""
+"""A thirtieth of the landing error that a policy is to reach [m]; measured 0.14 mm of the ball,
+0.19 mm of the vehicle.
+"""
 SIDES = (0.08, 0.06, 0.05)
 """Of the box [m]."""
 
 
 def fused(interval: float = 0.002, device: str = "cpu") -> FusedChain:
     bodies = FusedChain(scene_plant(SCENE, 2e-3, "float32"), interval=interval, device=device)
-    start = {"pos_w": SCENE.pos_w, "quat_wb": SCENE.quat_wb, "vel_w": SCENE.vel_w, "rate_b": SCENE.rate_b}
+    start = {
+        "pos_w": SCENE.pos_w,
+        "quat_wb": SCENE.quat_wb,
+        "vel_w": SCENE.vel_w,
+        "rate_b": SCENE.rate_b,
+    }
     rope = {"cable_dir_w": SCENE.cable_dir_w()[None], "cable_vel_w": SCENE.cable_vel_w()[None]}
     bodies.sim.place(**{name: np.array([value]) for name, value in start.items()}, **rope)
     return bodies
@@ -50,7 +59,11 @@ def hard_throw(bodies) -> tuple[np.ndarray, np.ndarray]:
 
 def test_two_solvers_agree_on_the_hard_throw():
     """The fused chain at 2 ms, MuJoCo at its own converged step: half of it changes little."""
-    ours, theirs, finer = hard_throw(fused()), hard_throw(in_mujoco(5e-4)), hard_throw(in_mujoco(2.5e-4))
+    ours, theirs, finer = (
+        hard_throw(fused()),
+        hard_throw(in_mujoco(5e-4)),
+        hard_throw(in_mujoco(2.5e-4)),
+    )
     for a, b, c in zip(ours, theirs, finer, strict=True):
         assert np.linalg.norm(b - c) < 0.1 * AGREE, "MuJoCo has converged"
         assert np.linalg.norm(a - b) < AGREE
@@ -70,7 +83,10 @@ class WarpBodies(MujocoBodies):
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_forward(self.model, data)
         with wp.ScopedDevice(self.device):
-            self.there, self.state = self.warp.put_model(self.model), self.warp.put_data(self.model, data, nworld=1)
+            self.there, self.state = (
+                self.warp.put_model(self.model),
+                self.warp.put_data(self.model, data, nworld=1),
+            )
             self.graphs.clear()  # they hold the arrays of before
 
     def advance(self, force_b, torque_b, duration) -> None:
@@ -86,16 +102,23 @@ class WarpBodies(MujocoBodies):
                         self._go_on(steps)
                     self.graphs[steps] = captured.graph
                 wp.capture_launch(self.graphs[steps])
-        super().place(self.state.qpos.numpy(), self.state.qvel.numpy())  # whoever looks sees C's copy
+        super().place(
+            self.state.qpos.numpy(), self.state.qvel.numpy()
+        )  # whoever looks sees C's copy
 
     def _go_on(self, steps: int) -> None:
         for _ in range(steps):
             self.warp.step(self.there, self.state)
 
 
-@pytest.mark.parametrize("device", [pytest.param("cpu", marks=pytest.mark.slow), pytest.param("cuda:0", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize(
+    "device",
+    [pytest.param("cpu", marks=pytest.mark.slow), pytest.param("cuda:0", marks=pytest.mark.gpu)],
+)
 def test_mujoco_warp_ends_the_hard_throw_there_too(capsys, device):
-    """At its own converged step; and what it takes beside the fused chain, one vehicle on the same device, in one run."""
+    """At its own converged step; and what it takes beside the fused chain, one vehicle on the same
+    device, in one run.
+    """
     fused_chain = fused(device=device)
     ours, seconds, ends = hard_throw(fused_chain), {}, {}
     for step in (5e-4, 2.5e-4):
@@ -113,14 +136,19 @@ def test_mujoco_warp_ends_the_hard_throw_there_too(capsys, device):
     plain = time.perf_counter() - start
     off = [1e3 * np.linalg.norm(a - b) for a, b in zip(ours, ends[5e-4], strict=True)]
     with capsys.disabled():
-        print(f"\nMuJoCo Warp, {device}: ball {off[0]:.3f} mm, vehicle {off[1]:.3f} mm; {seconds[5e-4] / plain:.1f} times the fused chain")
+        print(
+            f"\nMuJoCo Warp, {device}: ball {off[0]:.3f} mm, vehicle {off[1]:.3f} mm;"
+            f" {seconds[5e-4] / plain:.1f} times the fused chain"
+        )
     for a, b, c in zip(ours, ends[5e-4], ends[2.5e-4], strict=True):
         assert np.linalg.norm(b - c) < 0.1 * AGREE, "it has converged"
         assert np.linalg.norm(a - b) < AGREE
 
 
 def hovered(bodies, seconds: float = 3.0) -> np.ndarray:
-    """Fly the hover controller on bodies, in the vehicle's blocks; places of the payload [m], shape (T, 3)."""
+    """Fly the hover controller on bodies, in the vehicle's blocks; places of the payload [m], shape
+    (T, 3).
+    """
     vehicle = paper_plant().vehicle
     plant = SeamSim(vehicle, bodies)
     home = np.array([0.1, 0.0, 0.0]) + bodies.root().pos_w
@@ -139,17 +167,27 @@ def test_other_payloads_fly_behind_the_same_seam(payload):
     build = {
         "ball": lambda: MujocoBodies(rope_and_ball(BODY, ROPE)),
         "box": lambda: MujocoBodies(rope_and_box(BODY, ROPE, SIDES)),
-        "two cables": lambda: MujocoBodies(two_cables(BODY, ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP),
+        "two cables": lambda: MujocoBodies(
+            two_cables(BODY, ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP
+        ),
     }
-    below = {"ball": 0.33 + SCENE.ball_offset, "box": 0.33 + 0.5 * SIDES[2], "two cables": 0.33 + 0.5 * SIDES[2]}
+    below = {
+        "ball": 0.33 + SCENE.ball_offset,
+        "box": 0.33 + 0.5 * SIDES[2],
+        "two cables": 0.33 + 0.5 * SIDES[2],
+    }
     bodies = build[payload]()
     places = hovered(bodies)
     hangs = bodies.root().pos_w[0, 2] + ROPE.mount[2] - places[-50:, 2].mean()
-    assert hangs == pytest.approx(below[payload], abs=0.01), "it hangs where the geometry says, swinging a little"
+    assert hangs == pytest.approx(below[payload], abs=0.01), (
+        "it hangs where the geometry says, swinging a little"
+    )
 
 
 def test_two_cables_turn_as_a_bifilar_pendulum():
-    """omega^2 = m g d^2 / (4 I L) for a small turn about the vertical, the mount held still by its own inertia."""
+    """omega^2 = m g d^2 / (4 I L) for a small turn about the vertical, the mount held still by its
+    own inertia.
+    """
     heavy = BodyParams(1e4, (1e3, 1e3, 1e3))
     apart, length, turn = 0.06, 0.33, 0.05
     bodies = MujocoBodies(two_cables(heavy, ROPE, SIDES, apart, length), step=CABLE_STEP)
@@ -170,7 +208,9 @@ def test_two_cables_turn_as_a_bifilar_pendulum():
 
 
 def test_a_cable_pulls_or_is_slack():
-    """In free fall together with the vehicle nothing is stretched; under thrust the cables are as long as they are."""
+    """In free fall together with the vehicle nothing is stretched; under thrust the cables are as
+    long as they are.
+    """
     bodies = MujocoBodies(two_cables(BODY, ROPE, SIDES, 0.06, 0.33), step=CABLE_STEP)
     lift = np.array([[0.0, 0.0, 1.5 * bodies.total_mass * GRAVITY]])
     bodies.advance(lift, np.zeros((1, 3)), 0.2)
@@ -190,10 +230,14 @@ def test_the_seam_names_what_it_cannot_do():
 
 @pytest.mark.slow
 def test_what_the_seam_costs(capsys):
-    """Prints environment steps a second of both solvers in one run; the fused chain is the faster one."""
+    """Prints environment steps a second of both solvers in one run; the fused chain is the faster
+    one.
+    """
     found = {}
-    for name, make in (("fused", lambda: FusedChain(scene_plant(SCENE, 2e-3, "float32"), 256)),
-                       ("mujoco", lambda: MujocoBodies(rope_and_ball(BODY, ROPE), 256))):  # fmt: skip
+    for name, make in (
+        ("fused", lambda: FusedChain(scene_plant(SCENE, 2e-3, "float32"), 256)),
+        ("mujoco", lambda: MujocoBodies(rope_and_ball(BODY, ROPE), 256)),
+    ):
         bodies, lift = make(), np.array([[0.0, 0.0, 2.7]])
         bodies.advance(lift, np.zeros((1, 3)), 0.002)
         best = 0.0
@@ -206,5 +250,7 @@ def test_what_the_seam_costs(capsys):
             best = max(best, steps / (time.perf_counter() - start) / 10.0)
         found[name] = best
     with capsys.disabled():
-        print(f"\nseam, one core, 256 vehicles: {found}, ratio {found['fused'] / found['mujoco']:.1f}")
+        print(
+            f"\nseam, one core, 256 vehicles: {found}, ratio {found['fused'] / found['mujoco']:.1f}"
+        )
     assert found["fused"] > found["mujoco"]

@@ -1,16 +1,18 @@
 """Code blocks of the pages, and what runs them.
 
-A fence is run by its language: ``sh`` a line at a time, ``python`` as one program, and any language with a ``title="NAME"`` becomes the
-file of that name beside the commands. ``text`` is what a command printed. Comments in front of a fence, unseen by a reader, say more:
+A fence is run by its language: ``sh`` a line at a time, ``python`` as one program, and any language
+with a ``title="NAME"`` becomes the file of that name beside the commands. ``text`` is what a
+command printed. Comments in front of a fence, unseen by a reader, say more:
 
-    <!-- run with: --throws 2 -->            these arguments are added to each visthrow command of the block, to make it cheaper
-    <!-- run train with: --iterations 1 -->  the same for one command alone
-    <!-- terminals -->                       each line is a process of its own, all at once
-    <!-- not run: a GPU -->                  not run, for one of :data:`REASONS`; its visthrow commands are parsed all the same
+    <!-- run with: --throws 2 -->            these arguments are added to each visthrow command of
+    the block, to make it cheaper <!-- run train with: --iterations 1 -->  the same for one command
+    alone <!-- terminals -->                       each line is a process of its own, all at once
+    <!-- not run: a GPU -->                  not run, for one of :data:`REASONS`; its visthrow
+    commands are parsed all the same
 
-The blocks of a page run in order in a folder of the page's own that looks like the root of a clone. What another page has run already,
-with the same arguments and files, is not run again: what it wrote is copied. A training is evaluated with 20 throws for 200.
-"""
+The blocks of a page run in order in a folder of the page's own that looks like the root of a clone.
+What another page has run already, with the same arguments and files, is not run again: what it
+wrote is copied. A training is evaluated with 20 throws for 200."""
 
 import contextlib
 import dataclasses
@@ -30,12 +32,24 @@ from visthrow.training import trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 REASONS = {
-    "a GPU", "a vehicle", "a motion-capture hall", "a camera", "an autopilot's firmware", "flights of yours", "hours", "many minutes",
-    "it installs software", "it opens a window", "a cluster",
-}  # fmt: skip
+    "a GPU",
+    "a vehicle",
+    "a motion-capture hall",
+    "a camera",
+    "an autopilot's firmware",
+    "flights of yours",
+    "hours",
+    "many minutes",
+    "it installs software",
+    "it opens a window",
+    "a cluster",
+}
 SEEN = ("tests", "configs", "docs")
 """Folders of the repository that a page's commands may read."""
-FENCE = re.compile(r'((?:<!--[^\n]*-->\n+)*)^```(\w*)(?: title="([^"\n]+)")?[^\n]*\n(.*?)^```[ \t]*$', re.MULTILINE | re.DOTALL)
+FENCE = re.compile(
+    r'((?:<!--[^\n]*-->\n+)*)^```(\w*)(?: title="([^"\n]+)")?[^\n]*\n(.*?)^```[ \t]*$',
+    re.MULTILINE | re.DOTALL,
+)
 PATIENCE = 300.0
 """For the processes of one block [s]."""
 
@@ -45,8 +59,10 @@ class Block:
     """One fence.
 
     Attributes:
-        page: file that it stands in, from the root. line: of the fence, from 1. language: of the fence. title: name of a file, or "".
-        text: between the fences. reason: why it is not run, or "". terminals: its lines run side by side.
+        page: file that it stands in, from the root. line: of the fence, from 1. language: of the
+            fence. title: name of a file, or "".
+        text: between the fences. reason: why it is not run, or "". terminals: its lines run side by
+            side.
         extra: command, or "" for all -> arguments that are added.
     """
 
@@ -65,7 +81,9 @@ class Block:
         return f"{self.page}:{self.line}"
 
     def commands(self) -> list[list[str]]:
-        """Return the words of each visthrow command, arguments of the comments added; another line is left to the shell as one word."""
+        """Return the words of each visthrow command, arguments of the comments added; another line
+        is left to the shell as one word.
+        """
         lines = [line.strip() for line in self.text.replace("\\\n", " ").splitlines()]
         return [self._words(line) for line in lines if line and not line.startswith("#")]
 
@@ -74,27 +92,42 @@ class Block:
             more = self.extra.get("python", ()) if line.startswith("python ") else ()
             return [f"{line.split(' #')[0]} {shlex.join(more)}" if more else line]
         words = shlex.split(line, comments=True)
-        return [*words, *self.extra.get("", ()), *self.extra.get(words[1], ()), *self.extra.get(" ".join(words[1:3]), ())]
+        return [
+            *words,
+            *self.extra.get("", ()),
+            *self.extra.get(words[1], ()),
+            *self.extra.get(" ".join(words[1:3]), ()),
+        ]
 
 
 def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
     """Read the blocks of a page.
 
     Raises:
-        ValueError: a fence without a language, one that is indented, a reason that is none of :data:`REASONS`, an unknown comment.
+        ValueError: a fence without a language, one that is indented, a reason that is none of
+            :data:`REASONS`, an unknown comment.
     """
     text, name = page.read_text(encoding="utf-8"), page.relative_to(root).as_posix()
     if found := re.search(r"^[ \t>]+```", text, re.MULTILINE):
-        raise ValueError(f"{name}: a fence that is indented is not found: {text[found.start():][:60]!r}")
+        raise ValueError(
+            f"{name}: a fence that is indented is not found: {text[found.start() :][:60]!r}"
+        )
     blocks = []
     for match in FENCE.finditer(text):
         place = text.count("\n", 0, match.start(2)) + 1
         reason, terminals, extra = _said(match[1], f"{name}:{place}")
         if not match[2]:
-            raise ValueError(f"{name}:{place}: a fence without a language: sh, python, toml, ..., or text for what was printed")
-        blocks.append(Block(name, place, match[2], match[3] or "", match[4], reason, terminals, extra))
+            raise ValueError(
+                f"{name}:{place}: a fence without a language: sh, python, toml, ..., or text for"
+                " what was printed"
+            )
+        blocks.append(
+            Block(name, place, match[2], match[3] or "", match[4], reason, terminals, extra)
+        )
     if 2 * len(blocks) != len(re.findall(r"^```", text, re.MULTILINE)):
-        raise ValueError(f"{name}: a fence is not closed, or stands in a way that is not understood")
+        raise ValueError(
+            f"{name}: a fence is not closed, or stands in a way that is not understood"
+        )
     return blocks
 
 
@@ -104,7 +137,10 @@ def _said(comments: str, place: str) -> tuple[str, bool, dict[str, tuple[str, ..
         if match := re.fullmatch(r"not run: (.*)", comment):
             reason = match[1]
             if reason not in REASONS:
-                raise ValueError(f"{place}: {reason!r} is no reason not to run a block; there are {sorted(REASONS)}")
+                raise ValueError(
+                    f"{place}: {reason!r} is no reason not to run a block; there are"
+                    f" {sorted(REASONS)}"
+                )
         elif match := re.fullmatch(r"run ?(.*?) with: (.*)", comment):
             extra[match[1]] = tuple(shlex.split(match[2]))
         elif comment == "terminals":
@@ -120,7 +156,9 @@ class Runner:
     def __init__(self, work: Path) -> None:
         """Take an empty folder."""
         self.work = work
-        self.done: dict[str, Path] = {}  # digest of a command and its files -> copy of what it wrote
+        self.done: dict[
+            str, Path
+        ] = {}  # digest of a command and its files -> copy of what it wrote
         self.seconds: dict[str, float] = {}  # place and command -> processor time [s]
 
     def run(self, blocks: list[Block]) -> None:
@@ -140,7 +178,9 @@ class Runner:
         with contextlib.chdir(folder), mock.patch.object(trainer, "EVALUATED", 20):
             for block in blocks:
                 if block.title:
-                    assert block.title in spoken + files, f"{block.place}: nothing on the page uses {block.title}"
+                    assert block.title in spoken + files, (
+                        f"{block.place}: nothing on the page uses {block.title}"
+                    )
                     Path(block.title).parent.mkdir(parents=True, exist_ok=True)
                     Path(block.title).write_text(block.text, encoding="utf-8")
                 elif block.reason:
@@ -150,11 +190,18 @@ class Runner:
                 elif block.language == "sh":
                     self._run_commands(block)
                 else:
-                    assert block.language == "text", f"{block.place}: nothing is done with {block.language!r}; give it a title"
+                    assert block.language == "text", (
+                        f"{block.place}: nothing is done with {block.language!r}; give it a title"
+                    )
 
     def _run_commands(self, block: Block) -> None:
-        for jobs in [block.commands()] if block.terminals else [[words] for words in block.commands()]:
-            jobs = [[part for word in words for part in _globbed(word)] if len(words) > 1 else words for words in jobs]
+        for jobs in (
+            [block.commands()] if block.terminals else [[words] for words in block.commands()]
+        ):
+            jobs = [
+                [part for word in words for part in _globbed(word)] if len(words) > 1 else words
+                for words in jobs
+            ]
             digest = _digest(jobs)
             if digest in self.done:
                 shutil.copytree(self.done[digest], ".", dirs_exist_ok=True)
@@ -207,7 +254,8 @@ def _program(argv: list[str]) -> int:
 
 def _side_by_side(jobs: list[list[str]], place: str) -> None:
     processes = [
-        subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words[1:]], env=_environment()) for words in jobs
+        subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words[1:]], env=_environment())
+        for words in jobs
     ]
     try:
         statuses = [process.wait(PATIENCE) for process in processes]
@@ -219,33 +267,54 @@ def _side_by_side(jobs: list[list[str]], place: str) -> None:
 
 
 def _processor() -> float:
-    """Processor time of this process and of those that ended [s]: what a block costs however busy the machine is."""
+    """Processor time of this process and of those that ended [s]: what a block costs however busy
+    the machine is.
+    """
     return sum(os.times()[:4])
 
 
 def _environment() -> dict[str, str]:
     paths = {"PATH": Path(sys.executable).parent, "PYTHONPATH": ROOT}
-    return os.environ | {key: f"{path}{os.pathsep}{os.environ.get(key, '')}" for key, path in paths.items()}
+    return os.environ | {
+        key: f"{path}{os.pathsep}{os.environ.get(key, '')}" for key, path in paths.items()
+    }
 
 
 def _globbed(word: str) -> list[str]:
-    found = [] if Path(word).is_absolute() or not set("*[?") & set(word) else sorted(map(str, Path().glob(word)))
+    found = (
+        []
+        if Path(word).is_absolute() or not set("*[?") & set(word)
+        else sorted(map(str, Path().glob(word)))
+    )
     return found or [word]
 
 
 def _files() -> set[tuple[str, int]]:
-    return {(str(path), path.stat().st_mtime_ns) for path in Path().rglob("*") if path.is_file()
-            and path.parts[0] not in SEEN}  # fmt: skip
+    return {
+        (str(path), path.stat().st_mtime_ns)
+        for path in Path().rglob("*")
+        if path.is_file() and path.parts[0] not in SEEN
+    }
 
 
 def _digest(jobs: list[list[str]]) -> str:
-    """Return a digest of commands, and of the page's files that they name or that those may name in turn."""
+    """Return a digest of commands, and of the page's files that they name or that those may name in
+    turn.
+    """
     spoken, named = repr(jobs), []
-    files = [path for path in sorted(Path().rglob("*.*")) if path.is_file() and path.parts[0] not in SEEN]
+    files = [
+        path for path in sorted(Path().rglob("*.*")) if path.is_file() and path.parts[0] not in SEEN
+    ]
     while more := [path for path in files if path not in named and str(path) in spoken]:
         named += more
-        spoken += "".join(path.read_text(encoding="utf-8", errors="ignore") for path in more if path.suffix in {".toml", ".yaml", ".py"})
-    return hashlib.sha256(spoken.encode() + b"".join(path.read_bytes() for path in named)).hexdigest()
+        spoken += "".join(
+            path.read_text(encoding="utf-8", errors="ignore")
+            for path in more
+            if path.suffix in {".toml", ".yaml", ".py"}
+        )
+    return hashlib.sha256(
+        spoken.encode() + b"".join(path.read_bytes() for path in named)
+    ).hexdigest()
 
 
 def pages() -> list[Path]:

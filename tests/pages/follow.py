@@ -1,9 +1,11 @@
-"""Follow pages to the letter, as a stranger does: every block as it is shown, nothing added, nothing reused, processes of their own.
+"""Follow pages to the letter, as a stranger does: every block as it is shown, nothing added,
+nothing reused, processes of their own.
 
-    python -m tests.pages.follow docs/howto/rope.md docs/howto/report.md    # from the root of a clone, its environment active
+    python -m tests.pages.follow docs/howto/rope.md docs/howto/report.md    # from the root of a
+    clone, its environment active
 
-It prints minutes a block and a page, beside the processor's. What is marked with a reason of :data:`LEFT` is not followed.
-"""
+It prints minutes a block and a page, beside the processor's. What is marked with a reason of
+:data:`LEFT` is not followed."""
 
 import argparse
 import os
@@ -14,8 +16,19 @@ from pathlib import Path
 
 from tests.pages.blocks import Block, blocks_of
 
-LEFT = {"a GPU", "a vehicle", "a motion-capture hall", "a camera", "an autopilot's firmware", "flights of yours", "hours", "a cluster",
-        "it installs software", "it opens a window", "many minutes"}  # fmt: skip
+LEFT = {
+    "a GPU",
+    "a vehicle",
+    "a motion-capture hall",
+    "a camera",
+    "an autopilot's firmware",
+    "flights of yours",
+    "hours",
+    "a cluster",
+    "it installs software",
+    "it opens a window",
+    "many minutes",
+}
 """Reasons for which a stranger with two cores and ten minutes skips a block, too."""
 
 
@@ -35,9 +48,18 @@ def follow(block: Block) -> bool:
 
 def main() -> int:
     """Follow the pages that are named; returns 1 where one stumbles."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("pages", nargs="+", type=Path)
-    parser.add_argument("--with", dest="reasons", action="append", default=[], choices=sorted(LEFT), help="follow these all the same")
+    parser.add_argument(
+        "--with",
+        dest="reasons",
+        action="append",
+        default=[],
+        choices=sorted(LEFT),
+        help="follow these all the same",
+    )
     args, rows = parser.parse_args(), []
     for page in args.pages:
         begin, spent, stumbled = time.perf_counter(), sum(os.times()[2:4]), []
@@ -49,7 +71,10 @@ def main() -> int:
                 stumbled.append(block.place)
             print(f"-- {block.place}: {time.perf_counter() - start:.1f} s", flush=True)
         wall, own = time.perf_counter() - begin, sum(os.times()[2:4]) - spent
-        rows.append(f"{page}: {wall / 60:.1f} min, {own / 60:.1f} of a processor; " + (f"STUMBLED at {stumbled}" if stumbled else "well"))
+        rows.append(
+            f"{page}: {wall / 60:.1f} min, {own / 60:.1f} of a processor; "
+            + (f"STUMBLED at {stumbled}" if stumbled else "well")
+        )
     print(*rows, sep="\n")
     return int("STUMBLED" in "".join(rows))
 

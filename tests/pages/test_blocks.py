@@ -17,7 +17,7 @@ def run(tmp_path, text):
     return runner
 
 
-GOOD = '''
+GOOD = """
 ```toml title="mine.toml"
 base = "paper.toml"
 ```
@@ -36,7 +36,7 @@ visthrow train state
 from pathlib import Path
 assert Path("made.txt").read_text() == "x\\n"
 ```
-'''
+"""
 
 
 def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
@@ -54,7 +54,9 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_module_that_a_test_has_imported_runs_anew(tmp_path, monkeypatch):
     (tmp_path / "whole").mkdir()
-    (tmp_path / "whole" / "part.py").write_text("from pathlib import Path\nPath('ran.txt').write_text(__name__)\n")
+    (tmp_path / "whole" / "part.py").write_text(
+        "from pathlib import Path\nPath('ran.txt').write_text(__name__)\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     before = importlib.import_module("whole.part")
@@ -73,7 +75,10 @@ def test_a_module_that_a_test_has_imported_runs_anew(tmp_path, monkeypatch):
         ("<!-- not run: a GPU -->\n```sh\nvisthrow train --no-such-option\n```\n", "2"),
         ("```toml\nbase = 'x'\n```\n", "give it a title"),
         ('```toml title="lonely.toml"\nbase = "x"\n```\n', "nothing on the page uses lonely.toml"),
-        ("<!-- terminals -->\n```sh\nvisthrow config nothing\nvisthrow config vehicle\n```\n", r"statuses \[2, 0\]"),
+        (
+            "<!-- terminals -->\n```sh\nvisthrow config nothing\nvisthrow config vehicle\n```\n",
+            r"statuses \[2, 0\]",
+        ),
     ],
 )
 def test_what_does_not_run_fails(tmp_path, text, said):
@@ -105,8 +110,10 @@ def test_arguments_are_added(tmp_path):
         "```sh\nvisthrow train laptop\nvisthrow fly\nls\n```\n"
     )
     assert blocks_of(page, root=tmp_path)[0].commands() == [
-        ["visthrow", "train", "laptop", "--seed", "1", "--iterations", "1"], ["visthrow", "fly", "--seed", "1"], ["ls"],
-    ]  # fmt: skip
+        ["visthrow", "train", "laptop", "--seed", "1", "--iterations", "1"],
+        ["visthrow", "fly", "--seed", "1"],
+        ["ls"],
+    ]
 
 
 def test_all_pages_are_read():

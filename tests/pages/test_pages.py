@@ -18,7 +18,13 @@ COMMENTS = r"<!--.*?-->"
 def runner(tmp_path_factory):
     runner = Runner(tmp_path_factory.mktemp("pages"))
     yield runner
-    print(*(f"{seconds:6.1f} s  {what}" for what, seconds in sorted(runner.seconds.items(), key=lambda item: -item[1])), sep="\n")
+    print(
+        *(
+            f"{seconds:6.1f} s  {what}"
+            for what, seconds in sorted(runner.seconds.items(), key=lambda item: -item[1])
+        ),
+        sep="\n",
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
@@ -28,14 +34,18 @@ def test_blocks_run(runner, page):
 
 
 def sentences(text: str) -> list[str]:
-    """Return the sentences of a page's prose: no code, tables, headings, pictures; a point of a list ends a sentence."""
+    """Return the sentences of a page's prose: no code, tables, headings, pictures; a point of a
+    list ends a sentence.
+    """
     text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(COMMENTS, "", text, flags=re.DOTALL)
     text = re.sub(r"^(\||#|:::|!\[|\?\?\?|!!!).*$", "\n", text, flags=re.MULTILINE)
     text = re.sub(r"`[^`]*`", "Code", text)
     text = re.sub(r"\]\([^)]*\)", "]", text)
     points = re.split(r"\n\s*\n|^\s*(?:[-*]|\d+\.) ", text, flags=re.MULTILINE)
-    parts = [part for point in points for part in re.split(r"(?<=[.!?:])\s+(?=[A-Z0-9`*\[])", point)]
+    parts = [
+        part for point in points for part in re.split(r"(?<=[.!?:])\s+(?=[A-Z0-9`*\[])", point)
+    ]
     return [part for part in parts if len(re.findall(r"\w+", part)) > 1]
 
 
@@ -51,7 +61,10 @@ def test_sentences_are_short(page):
 
 
 def test_what_counts_as_a_sentence():
-    text = "# No sentence\n\nOne of four words. `code a b c` is one.\n\n| a | b |\n\n- a point of five words\n```sh\nls\n```\n"
+    text = (
+        "# No sentence\n\nOne of four words. `code a b c` is one.\n\n| a | b |\n\n- a point of five"
+        " words\n```sh\nls\n```\n"
+    )
     assert [len(part.split()) for part in sentences(text)] == [4, 3, 5], sentences(text)
     assert mean_words("word " * 30 + ".") > MEAN_WORDS
 
@@ -64,12 +77,27 @@ def test_links_and_named_files_are_there():
     missing = []
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         text = page.read_text(encoding="utf-8")
-        named = [(ROOT, name) for name in re.findall(r"`((?:configs|tests|docs|visthrow|sim|camera|hil)/[\w./-]*[\w/])`", text)]
-        linked = [(page.parent, link.split("#")[0]) for link in re.findall(r"\]\(([^)\s]+)\)", text)]
-        missing += [f"{page.name}: {name}" for root, name in named + linked if name and "://" not in name and not (root / name).exists()]
+        named = [
+            (ROOT, name)
+            for name in re.findall(
+                r"`((?:configs|tests|docs|visthrow|sim|camera|hil)/[\w./-]*[\w/])`", text
+            )
+        ]
+        linked = [
+            (page.parent, link.split("#")[0]) for link in re.findall(r"\]\(([^)\s]+)\)", text)
+        ]
+        missing += [
+            f"{page.name}: {name}"
+            for root, name in named + linked
+            if name and "://" not in name and not (root / name).exists()
+        ]
     assert not missing
 
 
 def test_nothing_is_fetched():
     """A reader without a network misses nothing: no picture, script or style of another host."""
-    assert not [p for p in PAGES if re.search(r"!\[[^\]]*\]\(https?:|src=\"https?:", p.read_text(encoding="utf-8"))]
+    assert not [
+        p
+        for p in PAGES
+        if re.search(r"!\[[^\]]*\]\(https?:|src=\"https?:", p.read_text(encoding="utf-8"))
+    ]

@@ -15,15 +15,21 @@ from tests.plants import paper_plant, plain_vehicle
 from tests.simulators import numerics, rods
 
 PERIOD = 1e-4
-"""Of a pendulum's period; order 2 at 2 ms leaves (w h)^2 = 2e-4 of the phase, less by the method's constant."""
+"""Of a pendulum's period; order 2 at 2 ms leaves (w h)^2 = 2e-4 of the phase, less by the method's
+constant.
+"""
 SHAPE = 1e-4
-"""Distance from the shape of equilibrium [m]: the start is exact to round-off, so this is what the step adds."""
+"""Distance from the shape of equilibrium [m]: the start is exact to round-off, so this is what the
+step adds.
+"""
 HELD = 2e3
 """Mass of a vehicle that the rope hardly moves [kg]: by 3e-5 of its own motion."""
 
 
 def held(plant: PlantParams, substep: float = 0.002, **rope) -> HybridSim:
-    """Rope under a vehicle too heavy to move, carried by a force of its own weight and the load's."""
+    """Rope under a vehicle too heavy to move, carried by a force of its own weight and
+    the load's.
+    """
     body = BodyParams(HELD, (HELD, HELD, HELD))
     vehicle = dataclasses.replace(plant.vehicle, body=body, queue=QueueParams(0.0))
     changed = dataclasses.replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
@@ -44,14 +50,21 @@ def advance(sim, steps: int) -> None:
 
 @pytest.mark.parametrize("amplitude", [0.05, 1.2])
 def test_pendulum_period(amplitude):
-    """One rigid segment swings as a physical pendulum: ``T = 4 sqrt(I / (m g c)) K(sin^2(amplitude / 2))``."""
+    """One rigid segment swings as a physical pendulum:
+
+    ``T = 4 sqrt(I / (m g c)) K(sin^2(amplitude / 2))``.
+    """
     sim = held(paper_plant(), segments=1, joint_damping=0.0)
     rope = sim.params.rope
     reach = rope.length + rope.payload_offset
-    inertia = rope.rope_mass * rope.length**2 / 3.0 + rope.payload_inertia + rope.payload_mass * reach**2
+    inertia = (
+        rope.rope_mass * rope.length**2 / 3.0 + rope.payload_inertia + rope.payload_mass * reach**2
+    )
     moment = rope.rope_mass * rope.length / 2.0 + rope.payload_mass * reach
     expected = 4.0 * np.sqrt(inertia / (moment * GRAVITY)) * ellipk(np.sin(amplitude / 2.0) ** 2)
-    sim.place(np.zeros((1, 3)), cable_dir_w=np.array([[[np.sin(amplitude), 0.0, -np.cos(amplitude)]]]))
+    sim.place(
+        np.zeros((1, 3)), cable_dir_w=np.array([[[np.sin(amplitude), 0.0, -np.cos(amplitude)]]])
+    )
     times, angles = [], []
     for k in range(200):
         advance(sim, 1)
@@ -70,7 +83,9 @@ def test_pendulum_period(amplitude):
 
 
 def test_hanging_rope_stays_at_rest_and_bears_what_is_below():
-    """At rest a rope that hangs from one end is straight; each joint carries the weight below it."""
+    """At rest a rope that hangs from one end is straight; each joint carries the weight
+    below it.
+    """
     sim = held(paper_plant())
     advance(sim, 50)
     rope = sim.params.rope
@@ -83,11 +98,12 @@ def test_hanging_rope_stays_at_rest_and_bears_what_is_below():
 
 
 def turning_shape(rope, rate: float) -> np.ndarray:
-    """Angles off the vertical [rad], shape (L,), of a rope that turns steadily about the vertical through its mount.
+    """Angles off the vertical [rad], shape (L,), of a rope that turns steadily about the vertical
+    through its mount.
 
-    In the turning frame each rod balances its weight and its centrifugal forces about its upper joint; forces below a
-    joint add up. Rods turn about the vertical, so their transverse inertia J adds ``J rate^2 sin cos``.
-    """
+    In the turning frame each rod balances its weight and its centrifugal forces about its upper
+    joint; forces below a joint add up. Rods turn about the vertical, so their transverse inertia J
+    adds ``J rate^2 sin cos``."""
     count, length, mass = rope.segments, rope.length / rope.segments, rope.rope_mass / rope.segments
 
     def unbalanced(angles):
@@ -117,11 +133,11 @@ def turning_shape(rope, rate: float) -> np.ndarray:
 
 
 def test_turning_rope_keeps_its_curve():
-    """The shape of a rope in steady rotation, with weight and centrifugal force as the load of a catenary.
+    """The shape of a rope in steady rotation, with weight and centrifugal force as the load of a
+    catenary.
 
-    A rope that hangs from one end has no catenary at rest; this is its curve of equilibrium in a turning frame, found
-    here by balancing moments.
-    """
+    A rope that hangs from one end has no catenary at rest; this is its curve of equilibrium in a
+    turning frame, found here by balancing moments."""
     rate, steps = 6.5, 50
     sim = held(paper_plant(), substep=0.0005, joint_damping=0.0, rope_mass=0.05)
     angles = turning_shape(sim.params.rope, rate)
@@ -132,8 +148,21 @@ def test_turning_rope_keeps_its_curve():
         return np.stack((sin * np.cos(azimuth), sin * np.sin(azimuth), -cos), -1)
 
     start = directions(0.0)
-    sim.place(np.zeros((1, 3)), cable_dir_w=start[None], cable_vel_w=np.cross([0.0, 0.0, rate], start)[None])
-    sim.set_command([[(HELD + sim.params.rope.rope_mass + sim.params.rope.payload_mass) * GRAVITY, 0.0, 0.0, 0.0]])
+    sim.place(
+        np.zeros((1, 3)),
+        cable_dir_w=start[None],
+        cable_vel_w=np.cross([0.0, 0.0, rate], start)[None],
+    )
+    sim.set_command(
+        [
+            [
+                (HELD + sim.params.rope.rope_mass + sim.params.rope.payload_mass) * GRAVITY,
+                0.0,
+                0.0,
+                0.0,
+            ]
+        ]
+    )
     advance(sim, steps)
     expected = directions(rate * 0.02 * steps)
     reach = sim.params.rope.length / sim.params.rope.segments
@@ -142,7 +171,10 @@ def test_turning_rope_keeps_its_curve():
 
 
 def test_motor_step():
-    """A step of the set-point: ``1 - exp(-t / T)``; the set-point itself is the root of the thrust over k_f."""
+    """A step of the set-point:
+
+    ``1 - exp(-t / T)``; the set-point itself is the root of the thrust over k_f.
+    """
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
     vehicle = dataclasses.replace(vehicle, queue=QueueParams(0.0))
     sim = QuadSim(vehicle, 1, "rk4", 0.001, precision="float64")
@@ -167,21 +199,34 @@ def test_battery_sags_to_where_source_and_load_meet():
     advance(sim, 100)
     voltage, speed = sim.get("voltage")[0], sim.get("motor_speed")[0]
     cell, thrust = vehicle.battery, vehicle.thrust
-    lift = thrust.k_f * speed**2 * (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
+    lift = (
+        thrust.k_f
+        * speed**2
+        * (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
+    )
     power = cell.idle_power + np.sum(thrust.torque_ratio * lift * speed) / cell.efficiency
     source = cell.ocv[0]
-    assert voltage == pytest.approx((source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0, abs=1e-6)
+    assert voltage == pytest.approx(
+        (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0, abs=1e-6
+    )
     assert voltage < start - 0.3, "ten newtons must sag more than hover"
 
 
 def test_battery_counts_its_charge():
-    """The used fraction grows by the current: power over voltage over capacity, in hover steady but for the sag."""
-    sim = QuadSim(dataclasses.replace(paper_plant().vehicle, queue=QueueParams(0.0)), 1, precision="float64")
+    """The used fraction grows by the current: power over voltage over capacity, in hover steady but
+    for the sag.
+    """
+    sim = QuadSim(
+        dataclasses.replace(paper_plant().vehicle, queue=QueueParams(0.0)), 1, precision="float64"
+    )
     vehicle = sim.vehicle
     weight = vehicle.body.mass * GRAVITY
     sim.set_command([[weight, 0.0, 0.0, 0.0]])
     voltage, speed = sim.get("voltage")[0], sim.get("motor_speed")[0, 0]
-    power = vehicle.battery.idle_power + weight * vehicle.thrust.torque_ratio * speed / vehicle.battery.efficiency
+    power = (
+        vehicle.battery.idle_power
+        + weight * vehicle.thrust.torque_ratio * speed / vehicle.battery.efficiency
+    )
     advance(sim, 50)
     expected = power / voltage / 3600.0 / vehicle.battery.capacity
     assert sim.get("charge_used")[0] == pytest.approx(expected, rel=0.05)
@@ -190,12 +235,12 @@ def test_battery_counts_its_charge():
 def test_gyroscopic_torques_do_no_work():
     """Unpowered rotors on a tumbling body: its kinetic energy stays while the rotors bend its path.
 
-    Rotors at equal speeds would cancel; here two stand still. No thrust coefficient that matters, no air: only Euler's
-    equation and the rotors' momentum are left.
-    """
+    Rotors at equal speeds would cancel; here two stand still. No thrust coefficient that matters,
+    no air: only Euler's equation and the rotors' momentum are left."""
     base = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="first_order")
     still = dataclasses.replace(base.motor, time_constant=1e30)
-    # No thrust worth the name, and motors that never reach a set-point; hover needs none because gravity is off.
+    # No thrust worth the name, and motors that never reach a set-point; hover needs none because
+    # gravity is off.
     weak = dataclasses.replace(base.thrust, k_f=1e-30)
     idle = dataclasses.replace(base.controller, min_thrust=0.0, geometric_gain=0.0)
     vehicle = dataclasses.replace(base, motor=still, thrust=weak, controller=idle)
@@ -217,9 +262,13 @@ def test_gyroscopic_torques_do_no_work():
 
 
 def test_hover_is_an_equilibrium():
-    """What a reset leaves is steady where the battery is ideal; with a real one the voltage's compensation is not."""
+    """What a reset leaves is steady where the battery is ideal; with a real one the voltage's
+    compensation is not.
+    """
     plant = paper_plant()
-    ideal = dataclasses.replace(plant.vehicle, battery=dataclasses.replace(plant.vehicle.battery, kind="ideal"))
+    ideal = dataclasses.replace(
+        plant.vehicle, battery=dataclasses.replace(plant.vehicle.battery, kind="ideal")
+    )
     sim = HybridSim(dataclasses.replace(plant, vehicle=ideal, sim=numerics(precision="float64")), 1)
     sim.place(np.array([[0.0, 0.0, 2.0]]))
     weight = GRAVITY * (ideal.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)

@@ -1,4 +1,6 @@
-"""What a free chain of vehicle, rope and ball must keep: energy, linear momentum, its centre of mass in free fall."""
+"""What a free chain of vehicle, rope and ball must keep: energy, linear momentum, its centre of
+mass in free fall.
+"""
 
 import dataclasses
 
@@ -20,7 +22,9 @@ ROUND_OFF = {"float32": 1e-5, "float64": 1e-12}
 ENERGY_ROUND_OFF = {"float32": 5e-6, "float64": 1e-12}
 """Of the energy; float32 states hold seven digits."""
 DISSIPATION = 0.01
-"""Of the dissipated energy; the integrator's own loss at 0.25 ms is a few millionths of the whole energy."""
+"""Of the dissipated energy; the integrator's own loss at 0.25 ms is a few millionths of the whole
+energy.
+"""
 STEPS = 60
 """Of 20 ms."""
 FRICTION = 5e-4
@@ -32,10 +36,17 @@ HELD = 2e-3
 
 
 def free(**changes):
-    """The hard throw's bodies, undamped, unpushed, the vehicle tumbling and the rope swinging fast."""
+    """The hard throw's bodies, undamped, unpushed, the vehicle tumbling and the rope
+    swinging fast.
+    """
     scene = load_scene(SCENES / "hard_throw.toml")
     nothing = (Wrench(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
-    start = {"schedule": nothing, "joint_damping": 0.0, "rate_b": (5.0, -8.0, 3.0), "cable_rate_w": (2.0, 15.0, 1.0)}
+    start = {
+        "schedule": nothing,
+        "joint_damping": 0.0,
+        "rate_b": (5.0, -8.0, 3.0),
+        "cable_rate_w": (2.0, 15.0, 1.0),
+    }
     return dataclasses.replace(scene, **{**start, **changes})
 
 
@@ -68,8 +79,12 @@ def test_energy_drift_falls_with_the_step():
 
 
 def test_a_rope_that_moves_as_one_body_keeps_everything():
-    """Straight, at rest against the vehicle: nothing may happen, in float64 not even in the last digits."""
-    energies, momenta = history(free(rate_b=(0.0,) * 3, cable_rate_w=(0.0,) * 3), 2e-3, "float64", gravity=0.0)
+    """Straight, at rest against the vehicle: nothing may happen, in float64 not even in the last
+    digits.
+    """
+    energies, momenta = history(
+        free(rate_b=(0.0,) * 3, cable_rate_w=(0.0,) * 3), 2e-3, "float64", gravity=0.0
+    )
     assert np.abs(energies / energies[0] - 1.0).max() < 1e-13
     assert np.abs(momenta - momenta[0]).max() < 1e-15
 
@@ -82,7 +97,9 @@ def relative_rates(sim):
 
 
 def test_joint_damping_takes_what_its_law_says():
-    """Power of the couples -d (w_i - w_(i-1)) is -d |w_i - w_(i-1)|^2; integrated by the trapezoidal rule."""
+    """Power of the couples -d (w_i - w_(i-1)) is -d |w_i - w_(i-1)|^2; integrated by the
+    trapezoidal rule.
+    """
     damping, period = 1e-5, 5e-4
     sim = scene_sim(free(joint_damping=damping), 2.5e-4, "float64", period, gravity=0.0)
     sim.set_command(np.zeros((1, 4)))
@@ -96,20 +113,41 @@ def test_joint_damping_takes_what_its_law_says():
 
 
 def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
-    """A law's pair of forces and torque do to vehicle, rod and ball what the couple in the chain's own equations does."""
-    scene = free(segments=1, segment_length=0.5, rate_b=(1.0, -4.0, 3.0), cable_rate_w=(2.0, 6.0, 1.0))
+    """A law's pair of forces and torque do to vehicle, rod and ball what the couple in the chain's
+    own equations does.
+    """
+    scene = free(
+        segments=1, segment_length=0.5, rate_b=(1.0, -4.0, 3.0), cable_rate_w=(2.0, 6.0, 1.0)
+    )
     plant = scene_plant(scene, 2.5e-4, "float64", 0.01)
     rubbing = dataclasses.replace(plant.rope, mount_damping=FRICTION)
     law = LawParams("rope joint", (), "joint_rate", FRICTION)
     ends = []
-    for same in (plant, dataclasses.replace(plant, rope=rubbing), dataclasses.replace(plant, laws=(law,))):
-        sim = HybridSim(same, 1, gravity=0.0, extensions=EVERYTHING if same.rope.mount_damping else frozenset())
-        place = ([scene.pos_w], [scene.quat_wb], [scene.vel_w], [scene.rate_b], [scene.cable_dir_w()], [scene.cable_vel_w()])
+    for same in (
+        plant,
+        dataclasses.replace(plant, rope=rubbing),
+        dataclasses.replace(plant, laws=(law,)),
+    ):
+        sim = HybridSim(
+            same, 1, gravity=0.0, extensions=EVERYTHING if same.rope.mount_damping else frozenset()
+        )
+        place = (
+            [scene.pos_w],
+            [scene.quat_wb],
+            [scene.vel_w],
+            [scene.rate_b],
+            [scene.cable_dir_w()],
+            [scene.cable_vel_w()],
+        )
         sim.place(*map(np.array, place))
         sim.set_command(np.array([[2.0, 0.0, 0.0, 0.0]]))
         for _ in range(20):
             sim.step()
-        ends.append(np.concatenate([np.ravel(sim.get(name)) for name in ("rate_b", "vel_w", "payload_vel_w")]))
+        ends.append(
+            np.concatenate(
+                [np.ravel(sim.get(name)) for name in ("rate_b", "vel_w", "payload_vel_w")]
+            )
+        )
     without, rubbed, lawful = ends
     moved = np.abs(rubbed - without)
     assert np.all(moved.reshape(3, 3).max(axis=1) > MOVED)
@@ -121,6 +159,9 @@ def test_free_fall(precision):
     """Whatever rope and vehicle do, the total momentum grows by m g t."""
     scene = free()
     _, momenta = history(scene, 2e-3, precision)
-    expected = momenta[0] - scene.total_mass * GRAVITY * 0.02 * np.arange(STEPS + 1)[:, None] * np.array([0, 0, 1.0])
-    # It is carried through the step as one sum of up to 3 kg m/s, so its round-off is that of the sum.
+    expected = momenta[0] - scene.total_mass * GRAVITY * 0.02 * np.arange(STEPS + 1)[
+        :, None
+    ] * np.array([0, 0, 1.0])
+    # It is carried through the step as one sum of up to 3 kg m/s, so its round-off is that of the
+    # sum.
     np.testing.assert_allclose(momenta, expected, rtol=0.0, atol=3.0 * ROUND_OFF[precision])

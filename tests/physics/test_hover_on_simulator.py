@@ -1,4 +1,6 @@
-"""The hover controller on the full simulator: every block of the vehicle, 15 segments of rope, also with more delay."""
+"""The hover controller on the full simulator: every block of the vehicle, 15 segments of rope, also
+with more delay.
+"""
 
 import dataclasses
 
@@ -12,7 +14,9 @@ from visthrow.task import Experiment, plant_of
 
 GOAL = np.array([0.0, 0.0, 2.0])
 SWING = 0.35
-"""Start of the second vehicle: rope this far off the vertical [rad]; the first starts 0.5 m off the goal."""
+"""Start of the second vehicle: rope this far off the vertical [rad]; the first starts 0.5 m off the
+goal.
+"""
 SECONDS = 6
 STEPS = 50
 """Of 20 ms, a second."""
@@ -29,16 +33,24 @@ def test_settles_and_damps_with_margin(extra_delay, loaded):
     ropes[1] = (np.sin(SWING), 0.0, -np.cos(SWING))
     simulator.place(pos_w=GOAL + np.array([[0.3, 0.32, -0.24], [0.0, 0.0, 0.0]]), cable_dir_w=ropes)
     controller = HoverController(HoverParams(), plant.sim.control_period, 2)
-    mass = plant.vehicle.body.mass + (plant.rope.rope_mass + plant.rope.payload_mass if loaded else 0.0)
+    mass = plant.vehicle.body.mass + (
+        plant.rope.rope_mass + plant.rope.payload_mass if loaded else 0.0
+    )
     distance, swing, rate = [], [], []
     for _ in range(SECONDS * STEPS):
         pos_w, vel_w = simulator.get("pos_w"), simulator.get("vel_w")
-        simulator.set_command(controller.step(pos_w, simulator.get("quat_wb"), vel_w, GOAL, mass), [not loaded] * 2)
+        simulator.set_command(
+            controller.step(pos_w, simulator.get("quat_wb"), vel_w, GOAL, mass), [not loaded] * 2
+        )
         simulator.step()
         distance.append(np.linalg.norm(simulator.get("pos_w") - GOAL, axis=1))
-        swing.append(np.linalg.norm((simulator.get("payload_pos_w") - simulator.get("pos_w"))[:, :2], axis=1))
+        swing.append(
+            np.linalg.norm((simulator.get("payload_pos_w") - simulator.get("pos_w"))[:, :2], axis=1)
+        )
         rate.append(np.linalg.norm(simulator.get("rate_b"), axis=1))
-    distance, swing, rate = (np.array(rows).reshape(SECONDS, STEPS, 2) for rows in (distance, swing, rate))
+    distance, swing, rate = (
+        np.array(rows).reshape(SECONDS, STEPS, 2) for rows in (distance, swing, rate)
+    )
     assert distance[3:].max() < 0.10
     assert distance[-1].max() < 0.02
     if loaded:

@@ -1,7 +1,7 @@
 """Random full-range flights: nothing fails, and rods turn as fast as they do at a fine step.
 
-A rope that never fails may do so by false damping; so its segments' rates are held against a run at 0.1 ms.
-"""
+A rope that never fails may do so by false damping; so its segments' rates are held against a run at
+0.1 ms."""
 
 import dataclasses
 
@@ -54,9 +54,14 @@ def fly_with_terminations(count: int, steps: int, seed: int) -> tuple[int, int]:
         age += 1.0
         failed += np.count_nonzero(sim.get("status") & NONFINITE)
         done = terminations.negative(
-            exp.task.bounds, views.state["pos_w"], ob.rotation_from_quat(views.state["quat_wb"]),
-            views.out["payload_pos_w"], views.state["status"], views.state["release_timer"] >= 0.0,
-            torch.from_numpy(age * PERIOD), exp.release.landing_height,
+            exp.task.bounds,
+            views.state["pos_w"],
+            ob.rotation_from_quat(views.state["quat_wb"]),
+            views.out["payload_pos_w"],
+            views.state["status"],
+            views.state["release_timer"] >= 0.0,
+            torch.from_numpy(age * PERIOD),
+            exp.release.landing_height,
         ).numpy()
         ended += np.count_nonzero(done)
         age[done] = 0.0
@@ -65,7 +70,9 @@ def fly_with_terminations(count: int, steps: int, seed: int) -> tuple[int, int]:
 
 
 def fly_freely(count: int, steps: int, seed: int, episode: int) -> tuple[int, int, float]:
-    """Episodes, those with a failed state, and the share of steps with a fall-back, without terminations."""
+    """Episodes, those with a failed state, and the share of steps with a fall-back, without
+    terminations.
+    """
     exp, sim = experiment(), started(count, seed)
     bad, failed, fallbacks = np.zeros(count, dtype=bool), 0, 0
     for k, command in enumerate(random_commands(seed, steps, count)):
@@ -108,13 +115,15 @@ def test_a_million_steps_without_terminations(episode, capsys):
     episodes, failed, fallbacks = fly_freely(4000, 250, seed=12, episode=episode)
     with capsys.disabled():
         print(
-            f"\n1,000,000 env-steps without terminations: {episodes} episodes of {episode * PERIOD:.0f} s, "
-            f"{failed} failed, fall-back in {fallbacks:.2%} of the steps"
+            f"\n1,000,000 env-steps without terminations: {episodes} episodes of"
+            f" {episode * PERIOD:.0f} s, {failed} failed, fall-back in {fallbacks:.2%} of the steps"
         )
     assert failed <= FAILED * episodes
 
 
-def segment_rates(substep: float, precision: str, count: int, seed: int, steps: int = 10) -> np.ndarray:
+def segment_rates(
+    substep: float, precision: str, count: int, seed: int, steps: int = 10
+) -> np.ndarray:
     """Rates of all rods over the first 0.2 s [1/s], shape (T, E, L, 3)."""
     plant = dataclasses.replace(plant_of(experiment()), sim=numerics(substep, precision))
     sim, rows = started(count, seed, plant), []
@@ -141,4 +150,6 @@ def test_segments_turn_as_fast_as_at_a_fine_step():
 
 @pytest.mark.slow
 def test_segments_turn_as_fast_as_at_a_fine_step_in_many_flights():
-    assert_same_rates(segment_rates(0.002, "float32", 2048, 4), segment_rates(1e-4, "float64", 2048, 4))
+    assert_same_rates(
+        segment_rates(0.002, "float32", 2048, 4), segment_rates(1e-4, "float64", 2048, 4)
+    )

@@ -33,7 +33,9 @@ def fly(quadrotor, command, periods):
 
 
 def test_queue_switches_at_the_delay_exactly(vehicle):
-    """A step of thrust after 22 ms: the rotors answer 22 ms after the command, within a period, as 1 - exp(-t / T)."""
+    """A step of thrust after 22 ms: the rotors answer 22 ms after the command, within a period, as
+    1 - exp(-t / T).
+    """
     plain = plain_vehicle(vehicle)
     quadrotor = ReferenceQuadrotor(plain)
     start = quadrotor.blocks[0, 9]
@@ -44,7 +46,9 @@ def test_queue_switches_at_the_delay_exactly(vehicle):
     answered = 0.06 - plain.queue.delay
     final = np.sqrt(2.0 * weight / 4.0 / plain.thrust.k_f)
     expected = final + (start - final) * np.exp(-answered / plain.motor.time_constant)
-    np.testing.assert_allclose(quadrotor.blocks[0, 9:13], expected, rtol=1e-9)  # RK4, 15 us to the power of 4
+    np.testing.assert_allclose(
+        quadrotor.blocks[0, 9:13], expected, rtol=1e-9
+    )  # RK4, 15 us to the power of 4
 
 
 def test_queue_takes_the_latest_that_is_due():
@@ -55,7 +59,9 @@ def test_queue_takes_the_latest_that_is_due():
 
 
 def test_battery_settles_where_source_and_load_meet(vehicle):
-    """u = (u_oc + sqrt(u_oc^2 - 4 R P)) / 2 under constant power, approached within time constants."""
+    """u = (u_oc + sqrt(u_oc^2 - 4 R P)) / 2 under constant power, approached within
+    time constants.
+    """
     cell = vehicle.battery
     speed, torque = np.full((1, 4), 3000.0), np.full((1, 4), 0.015)
     power = cell.idle_power + 4 * 0.015 * 3000.0 / cell.efficiency
@@ -71,14 +77,18 @@ def test_battery_settles_where_source_and_load_meet(vehicle):
     settled = (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0
     drawn = 1.0 * power / settled / (3600.0 * cell.capacity)
     slope = np.polynomial.polynomial.polyval(0.2, np.polynomial.polynomial.polyder(cell.ocv))
-    assert 0.0 < voltage - settled < 1.2 * abs(slope) * drawn * cell.time_constant  # lags the falling source by T
+    assert (
+        0.0 < voltage - settled < 1.2 * abs(slope) * drawn * cell.time_constant
+    )  # lags the falling source by T
     assert abs(used - 0.2 - drawn) < 0.01 * drawn
 
 
 def test_mixer_delivers_what_fits(vehicle):
     rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
     torque = np.array([[0.02, -0.03, 0.004]])
-    thrusts, tilt_share, yaw_share = blocks.mixer(np.array([4.0]), torque, rotors, ratio, 0.03, np.array([3.5]))
+    thrusts, tilt_share, yaw_share = blocks.mixer(
+        np.array([4.0]), torque, rotors, ratio, 0.03, np.array([3.5])
+    )
     x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
     delivered = [np.sum(thrusts * y), -np.sum(thrusts * x), ratio * np.sum(thrusts * spin)]
     np.testing.assert_allclose(delivered, torque[0], atol=EXACT)
@@ -124,7 +134,14 @@ def test_rotors_and_body_keep_their_angular_momentum(vehicle):
     arms = rotor_arms(frictionless, VehicleErrors.none(1))
     still, nothing = np.zeros((1, 3)), np.zeros((1, 4))
     _, torque = blocks.composer(
-        vehicle.rotors, arms, nothing, nothing, nothing, speed_dot, still, (still, still, nothing, nothing)
+        vehicle.rotors,
+        arms,
+        nothing,
+        nothing,
+        nothing,
+        speed_dot,
+        still,
+        (still, still, nothing, nothing),
     )
     momentum_dot = -vehicle.rotors.inertia * np.sum(spin * speed_dot)
     assert abs(torque[0, 2] + momentum_dot) < 1e-18
@@ -144,7 +161,9 @@ def test_air_only_takes_energy_from_a_still_rotor_vehicle(vehicle):
 
 @pytest.mark.parametrize("battery", ["ideal", "sag"])
 def test_hover_is_an_equilibrium(vehicle, battery):
-    """Thrust equals weight at the start; a battery that holds 16.7 V makes the rotors a little fast afterwards."""
+    """Thrust equals weight at the start; a battery that holds 16.7 V makes the rotors a little fast
+    afterwards.
+    """
     plain = plain_vehicle(vehicle, aero="rotor_drag", battery=battery)
     weight = plain.body.mass * GRAVITY
     state = initial_blocks(plain, np.zeros((1, 3)), np.array([weight]), np.zeros(1))
@@ -159,7 +178,9 @@ def test_hover_is_an_equilibrium(vehicle, battery):
         np.testing.assert_allclose(torque, 0.0, atol=EXACT)
 
 
-@pytest.mark.parametrize(("controller", "motor"), [("betaflight", "first_order"), ("geometric", "instant")])
+@pytest.mark.parametrize(
+    ("controller", "motor"), [("betaflight", "first_order"), ("geometric", "instant")]
+)
 def test_rates_reach_their_command(vehicle, controller, motor):
     plain = plain_vehicle(vehicle, controller=controller, motor=motor)
     quadrotor = ReferenceQuadrotor(plain)
@@ -171,12 +192,16 @@ def test_thrown_vehicle_falls_freely(vehicle):
     """No thrust at all: instantaneous rotors at f_min = 0 and no air."""
     idle = dataclasses.replace(vehicle.controller, kind="geometric", min_thrust=0.0)
     plain = dataclasses.replace(
-        plain_vehicle(vehicle, motor="instant"), controller=idle, queue=dataclasses.replace(vehicle.queue, delay=0.0)
+        plain_vehicle(vehicle, motor="instant"),
+        controller=idle,
+        queue=dataclasses.replace(vehicle.queue, delay=0.0),
     )
     quadrotor = ReferenceQuadrotor(plain)
     quadrotor.reset(np.zeros((1, 3)), LEVEL, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3)))
     fly(quadrotor, (0.0, 0.0, 0.0, 0.0), 10)
-    np.testing.assert_allclose(quadrotor.body[0, :3], (0.2, 0.4, 0.6 - 0.5 * GRAVITY * 0.04), atol=EXACT)
+    np.testing.assert_allclose(
+        quadrotor.body[0, :3], (0.2, 0.4, 0.6 - 0.5 * GRAVITY * 0.04), atol=EXACT
+    )
 
 
 def test_turning_body_keeps_momentum_and_energy(vehicle):
@@ -185,7 +210,9 @@ def test_turning_body_keeps_momentum_and_energy(vehicle):
     rate = np.array([[6.0, 3.0, -4.0]])
     body = np.hstack((np.zeros((1, 3)), LEVEL, np.zeros((1, 3)), rate))
     for _ in range(1000):
-        body = rk4(lambda x: rigid_body_rates(vehicle, x, np.zeros((1, 3)), np.zeros((1, 3))), body, 5e-4)
+        body = rk4(
+            lambda x: rigid_body_rates(vehicle, x, np.zeros((1, 3)), np.zeros((1, 3))), body, 5e-4
+        )
     assert abs(np.sum(inertia * body[0, 10:] ** 2) / np.sum(inertia * rate**2) - 1.0) < 1e-10
     x, y, z, w = body[0, 3:7]
     momentum = inertia * body[0, 10:]

@@ -17,14 +17,23 @@ STEP = 2e-3  # s, at most; of order 4, and some nanometres off a quarter of it
 
 
 def short(plant, segments=2):
-    """The same rope in few segments: the extras do not depend on their number and the tests take less time."""
+    """The same rope in few segments: the extras do not depend on their number and the tests take
+    less time.
+    """
     return dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=segments))
 
 
 def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0, segments=2):
-    reference = ReferencePlant(short(plant or plain_plant(), segments), extras, seed, count, step=STEP)
+    reference = ReferencePlant(
+        short(plant or plain_plant(), segments), extras, seed, count, step=STEP
+    )
     velocity = np.tile([speed, 0.0, 0.0], (count, 1))
-    reference.reset(np.tile([0.0, 0.0, height], (count, 1)), np.tile(LEVEL, (count, 1)), velocity, np.zeros((count, 3)))
+    reference.reset(
+        np.tile([0.0, 0.0, height], (count, 1)),
+        np.tile(LEVEL, (count, 1)),
+        velocity,
+        np.zeros((count, 3)),
+    )
     return reference
 
 
@@ -40,7 +49,9 @@ def test_all_off_by_default():
 
 
 def test_payload_drag_slows_by_its_equation():
-    """On the rope and in flight: 2 m/s of translation lose k v^2 / m_total, then k v^2 / (ball and rope)."""
+    """On the rope and in flight: 2 m/s of translation lose k v^2 / m_total, then k v^2 / (ball and
+    rope).
+    """
     k, speed = 2e-3, 2.0
     reference = start(ReferenceExtras(payload_drag=k), speed=speed)
     clean = start(ReferenceExtras(), speed=speed)
@@ -62,7 +73,9 @@ def test_wind_pushes_vehicle_and_payload():
 
 
 def test_wind_has_its_deviation_and_memory():
-    reference = start(ReferenceExtras(wind_sigma_w=(0.5, 0.0, 0.0), wind_time_constant=0.1), count=400)
+    reference = start(
+        ReferenceExtras(wind_sigma_w=(0.5, 0.0, 0.0), wind_time_constant=0.1), count=400
+    )
     first = reference._wind[:, 0].copy()
     hover(reference, 2)
     later = reference._wind[:, 0]
@@ -82,7 +95,9 @@ def test_joint_damping_calms_the_swing():
     rates = []
     for damping in (0.0, 4e-3):
         reference = start(ReferenceExtras(extra_joint_damping=damping))
-        reference.reset(np.array([[0, 0, 1.5]]), LEVEL[None], np.zeros((1, 3)), np.zeros((1, 3)), direction)
+        reference.reset(
+            np.array([[0, 0, 1.5]]), LEVEL[None], np.zeros((1, 3)), np.zeros((1, 3)), direction
+        )
         hover(reference, 2)
         rates.append(np.abs(np.diff(reference._rope_of(reference._state)[1], axis=1)).max())
     assert rates[1] < 0.9 * rates[0]
@@ -133,7 +148,10 @@ def test_measured_is_the_state_of_before_with_noise():
     late = reference.measured()
     assert late.time == pytest.approx(0.05, abs=1e-12)
     assert late.pos_w[0, 0] == pytest.approx(0.05, abs=1e-6)
-    noisy = start(ReferenceExtras(mocap_position_sigma=1e-3, mocap_angle_sigma=1e-2, gyro_sigma=0.1), count=500)
+    noisy = start(
+        ReferenceExtras(mocap_position_sigma=1e-3, mocap_angle_sigma=1e-2, gyro_sigma=0.1),
+        count=500,
+    )
     measured = noisy.measured()
     assert (measured.pos_w - noisy.state.pos_w).std() == pytest.approx(1e-3, rel=0.1)
     assert (2.0 * measured.quat_wb[:, :3]).std() == pytest.approx(1e-2, rel=0.1)
@@ -157,15 +175,22 @@ def test_payload_and_rope_vary():
 
 def test_same_seed_same_flight():
     realistic = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
-    ends = [hover(start(realistic, paper_plant(), 3, seed=seed), 2).payload_pos_w for seed in (1, 1, 2)]
+    ends = [
+        hover(start(realistic, paper_plant(), 3, seed=seed), 2).payload_pos_w for seed in (1, 1, 2)
+    ]
     np.testing.assert_array_equal(ends[0], ends[1])
     assert np.all(ends[0] != ends[2])
 
 
 def test_realistic_plant_throws_and_lands():
-    """All extras together, 15 segments, a swing and a release: the payload lands near the plain plant's point."""
+    """All extras together, 15 segments, a swing and a release: the payload lands near the plain
+    plant's point.
+    """
     points = []
-    for extras in (ReferenceExtras(), config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))):
+    for extras in (
+        ReferenceExtras(),
+        config.load(ReferenceExtras, config.find("vehicle", "reference_realistic")),
+    ):
         reference = start(extras, paper_plant(), 2, 2.0, 0.6, segments=15)
         hover(reference, 18, True)
         assert reference.landing.landed.all()

@@ -24,17 +24,28 @@ def unloaded(**changes):
     """The hard throw's bodies without thrust and damping, swinging and turning."""
     scene = load_scene(SCENES / "hard_throw.toml")
     free = (Wrench(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
-    start = {"schedule": free, "joint_damping": 0.0, "rate_b": (1.0, -2.0, 3.0), "cable_rate_w": (2.0, 6.0, 1.0)}
+    start = {
+        "schedule": free,
+        "joint_damping": 0.0,
+        "rate_b": (1.0, -2.0, 3.0),
+        "cable_rate_w": (2.0, 6.0, 1.0),
+    }
     return dataclasses.replace(scene, **{**start, **changes})
 
 
 def momentum(bare):
-    """Linear momentum [kg m/s] of quadrotor, segments and ball, and their total first moment [kg m]."""
+    """Linear momentum [kg m/s] of quadrotor, segments and ball, and their total first moment [kg
+    m].
+    """
     scene = bare.scene
     n, n_dot = bare.rope
     ball, ball_vel = bare.ball
     # Upwards from the ball: the lower end of the last segment, then middle after middle.
-    length, total, moment = scene.segment_length, scene.mass * bare.body[7:10], scene.mass * bare.body[:3]
+    length, total, moment = (
+        scene.segment_length,
+        scene.mass * bare.body[7:10],
+        scene.mass * bare.body[:3],
+    )
     end, end_vel = ball - scene.ball_offset * n[-1], ball_vel - scene.ball_offset * n_dot[-1]
     total, moment = total + scene.ball_mass * ball_vel, moment + scene.ball_mass * ball
     for direction, velocity in zip(n[::-1], n_dot[::-1]):
@@ -52,8 +63,12 @@ def test_everything_together_falls_freely():
     bare.advance(time)
     total, moment = momentum(bare)
     gravity = np.array([0.0, 0.0, -GRAVITY])
-    np.testing.assert_allclose(total, start + mass * gravity * time, atol=1e-7)  # order 4 of the joints' motion
-    np.testing.assert_allclose(moment, first + start * time + 0.5 * mass * gravity * time**2, atol=1e-8)
+    np.testing.assert_allclose(
+        total, start + mass * gravity * time, atol=1e-7
+    )  # order 4 of the joints' motion
+    np.testing.assert_allclose(
+        moment, first + start * time + 0.5 * mass * gravity * time**2, atol=1e-8
+    )
 
 
 def test_energy_stays_without_damping_and_falls_with_it():
@@ -78,17 +93,30 @@ def test_pendulum_period():
         cable_rate_w=(0.0, 0.0, 0.0),
         direction=(np.sin(amplitude), 0.0, -np.cos(amplitude)),
     )
-    scene = dataclasses.replace(scene, schedule=(Wrench(0.0, (0.0, 0.0, scene.total_mass * GRAVITY), (0.0, 0.0, 0.0)),))
+    scene = dataclasses.replace(
+        scene, schedule=(Wrench(0.0, (0.0, 0.0, scene.total_mass * GRAVITY), (0.0, 0.0, 0.0)),)
+    )
     reach = scene.segment_length + scene.ball_offset
-    inertia = scene.segment_mass * scene.segment_length**2 / 3 + scene.ball_mass * reach**2 + scene.ball_inertia
+    inertia = (
+        scene.segment_mass * scene.segment_length**2 / 3
+        + scene.ball_mass * reach**2
+        + scene.ball_inertia
+    )
     arm = scene.segment_mass * scene.segment_length / 2 + scene.ball_mass * reach
     period = 2 * np.pi * np.sqrt(inertia / (arm * GRAVITY)) * (1 + amplitude**2 / 16)
     bare = BareScene(scene, 2e-3)
     bare.advance(period / 4)
-    # At the quarter it passes the vertical at its greatest rate: a position off zero is a time off the period. The
-    # vehicle gives by the ball's share of the mass, 6e-5.
+    # At the quarter it passes the vertical at its greatest rate: a position off zero is a time off
+    # the period. The vehicle gives by the ball's share of the mass, 6e-5.
     assert abs(bare.rope[0][0, 0]) < 1e-4 * amplitude
-    assert abs(np.abs(bare.rope[1][0, 0]) / np.sqrt(2 * arm * GRAVITY * (1 - np.cos(amplitude)) / inertia) - 1) < 1e-4
+    assert (
+        abs(
+            np.abs(bare.rope[1][0, 0])
+            / np.sqrt(2 * arm * GRAVITY * (1 - np.cos(amplitude)) / inertia)
+            - 1
+        )
+        < 1e-4
+    )
 
 
 def test_hover_stays():
@@ -98,7 +126,9 @@ def test_hover_stays():
     for _ in range(5):
         reference.step(np.array([[weight, 0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(reference.state.pos_w, HIGH, atol=ROUND_OFF)
-    np.testing.assert_allclose(reference.state.payload_pos_w, [[0.0, 0.0, 1.5 - 0.02 - 0.33 - 0.033]], atol=ROUND_OFF)
+    np.testing.assert_allclose(
+        reference.state.payload_pos_w, [[0.0, 0.0, 1.5 - 0.02 - 0.33 - 0.033]], atol=ROUND_OFF
+    )
 
 
 def swinging(plant, step=5e-4, count=1, **start):
@@ -106,12 +136,16 @@ def swinging(plant, step=5e-4, count=1, **start):
     reference = ReferencePlant(plant, count=count, step=step)
     direction = np.tile([np.sin(0.5), 0.1, -np.cos(0.5)], (count, plant.rope.segments, 1))
     still = np.zeros((count, 3))
-    reference.reset(np.tile(HIGH, (count, 1)), np.tile(LEVEL, (count, 1)), still, still, direction, **start)
+    reference.reset(
+        np.tile(HIGH, (count, 1)), np.tile(LEVEL, (count, 1)), still, still, direction, **start
+    )
     return reference
 
 
 def test_steps_of_the_plant_have_converged():
-    """Queue, controller, battery, aerodynamics, rope: halving 0.5 ms moves nothing by a micrometre in 0.14 s."""
+    """Queue, controller, battery, aerodynamics, rope: halving 0.5 ms moves nothing by a micrometre
+    in 0.14 s.
+    """
     ends = []
     for step in (5e-4, 2.5e-4):
         reference = swinging(paper_plant(), step)
@@ -136,8 +170,8 @@ def test_separation_is_exact_and_continuous():
     after = reference.state
     assert not after.attached[0]
     assert abs(reference.landing.separation_time[0] - plant.release.lag) < 1e-12
-    # Half-way through the step the rope opens: over 20 ms no point jumps, all move on with their velocity, but for
-    # gravity and the swing's centripetal acceleration.
+    # Half-way through the step the rope opens: over 20 ms no point jumps, all move on with their
+    # velocity, but for gravity and the swing's centripetal acceleration.
     moved = after.payload_pos_w - before.payload_pos_w - 0.02 * before.payload_vel_w
     assert np.linalg.norm(moved) < 0.5 * 3 * GRAVITY * 0.02**2
     lengths = np.linalg.norm(np.diff(after.cable_points_w, axis=1), axis=-1)
@@ -169,20 +203,26 @@ def test_landing_equals_the_closed_form_without_rope_mass(step):
     reference = ReferencePlant(plant, step=step)
     direction = np.tile([np.sin(0.5), 0.1, -np.cos(0.5)], (1, 2, 1))
     swing = np.cross([0.0, -5.0, 0.0], direction)
-    reference.reset(np.array([[0.0, 0.0, 0.48]]), LEVEL, np.array([[2.0, 0.0, 0.2]]), STILL, direction, swing)
+    reference.reset(
+        np.array([[0.0, 0.0, 0.48]]), LEVEL, np.array([[2.0, 0.0, 0.2]]), STILL, direction, swing
+    )
     command = np.array([[2.6, 0.0, 0.0, 0.0]])
     reference.step(command, True)
     reference.step(command)
     opened = reference.state
     assert not opened.attached[0]
     p, v = opened.payload_pos_w[0], opened.payload_vel_w[0]
-    time = (v[2] + np.sqrt(v[2] ** 2 + 2 * GRAVITY * (p[2] - plant.release.landing_height))) / GRAVITY
+    time = (
+        v[2] + np.sqrt(v[2] ** 2 + 2 * GRAVITY * (p[2] - plant.release.landing_height))
+    ) / GRAVITY
     for _ in range(int(time / 0.02) + 1):
         reference.step(command)
     landing = reference.landing
     assert landing.landed[0]
     assert abs(landing.time[0] - opened.time - time) < 1e-4
-    np.testing.assert_allclose(landing.point_w[0], (*(p + v * time)[:2], plant.release.landing_height), atol=3e-4)
+    np.testing.assert_allclose(
+        landing.point_w[0], (*(p + v * time)[:2], plant.release.landing_height), atol=3e-4
+    )
 
 
 def test_environments_do_not_see_each_other():
@@ -190,13 +230,17 @@ def test_environments_do_not_see_each_other():
     for _ in range(3):
         pair.step(np.array([[3.0, 1.0, 0.0, 0.0], [1.0, 0.0, 5.0, 0.0]]), np.array([True, False]))
         single.step(np.array([[3.0, 1.0, 0.0, 0.0]]), True)
-    np.testing.assert_allclose(pair.state.payload_pos_w[0], single.state.payload_pos_w[0], atol=1e-12)
+    np.testing.assert_allclose(
+        pair.state.payload_pos_w[0], single.state.payload_pos_w[0], atol=1e-12
+    )
     assert pair.state.latched.tolist() == [True, False]
 
 
 def test_wrong_shapes_are_named():
     reference = ReferencePlant(plain_plant())
-    with pytest.raises(ValueError, match=r"cable_dir_w has shape \(1, 3, 3\), expected \(1, 15, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"cable_dir_w has shape \(1, 3, 3\), expected \(1, 15, 3\)"
+    ):
         reference.reset(HIGH, LEVEL, STILL, STILL, np.zeros((1, 3, 3)))
     with pytest.raises(ValueError, match="step is 0"):
         ReferencePlant(plain_plant(), step=0.0)

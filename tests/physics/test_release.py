@@ -1,4 +1,6 @@
-"""Release: latch, lag at substep resolution, and what follows from the state at separation, against plain NumPy."""
+"""Release: latch, lag at substep resolution, and what follows from the state at separation, against
+plain NumPy.
+"""
 
 import dataclasses
 
@@ -19,11 +21,15 @@ ROUND_OFF = 2e-5
 PERIOD = 0.02
 
 
-def plant(lag: float, precision: str = "float32", control_period: float = PERIOD, **vehicle) -> PlantParams:
+def plant(
+    lag: float, precision: str = "float32", control_period: float = PERIOD, **vehicle
+) -> PlantParams:
     base = paper_plant()
     changed = dataclasses.replace(base.vehicle, **vehicle)
     release = dataclasses.replace(base.release, lag=lag)
-    return PlantParams(changed, base.rope, release, numerics(precision=precision, control_period=control_period))
+    return PlantParams(
+        changed, base.rope, release, numerics(precision=precision, control_period=control_period)
+    )
 
 
 def thrown(sim: HybridSim, commands: np.ndarray, asked_at: int) -> list[dict]:
@@ -32,14 +38,23 @@ def thrown(sim: HybridSim, commands: np.ndarray, asked_at: int) -> list[dict]:
     for k, command in enumerate(commands):
         sim.set_command(command, np.full(sim.count, k == asked_at))
         sim.step()
-        names = ("separated", "attached", "separation_time", "release_timer", "payload_pos_w", "payload_vel_w")
+        names = (
+            "separated",
+            "attached",
+            "separation_time",
+            "release_timer",
+            "payload_pos_w",
+            "payload_vel_w",
+        )
         rows.append({name: sim.get(name) for name in names})
     return rows
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.004, 0.02, 0.1037, 0.11])
 def test_the_latch_keeps_and_the_lag_is_exact(lag):
-    """Asked for once, at the start of step 3; separation follows by itself, in the right step and at the right time."""
+    """Asked for once, at the start of step 3; separation follows by itself, in the right step and
+    at the right time.
+    """
     asked_at, count = 3, 2
     sim = HybridSim(plant(lag), count)
     rows = thrown(sim, np.tile([3.0, 0.5, 0.0, 0.0], (14, count, 1)), asked_at)
@@ -73,7 +88,9 @@ def test_nothing_separates_unasked():
 
 @pytest.mark.parametrize("lag", [0.11, 0.104])
 def test_separation_is_the_state_of_a_run_that_ends_there(lag):
-    """A second simulator with periods of 2 ms is stopped at the separation: same substeps, same state."""
+    """A second simulator with periods of 2 ms is stopped at the separation: same substeps, same
+    state.
+    """
     command, count = np.array([[4.0, 2.0, -3.0, 1.0]]), 1
     without_delay = QueueParams(0.0)
     sim = HybridSim(plant(lag, "float64", queue=without_delay), count)
@@ -85,13 +102,19 @@ def test_separation_is_the_state_of_a_run_that_ends_there(lag):
     for _ in range(round(lag / 0.002)):
         stopped.set_command(command)
         stopped.step()
-    np.testing.assert_allclose(sim.get("payload_pos_w"), stopped.get("payload_pos_w"), atol=SAME_STATE)
-    np.testing.assert_allclose(sim.get("payload_vel_w"), stopped.get("payload_vel_w"), atol=100 * SAME_STATE)
+    np.testing.assert_allclose(
+        sim.get("payload_pos_w"), stopped.get("payload_pos_w"), atol=SAME_STATE
+    )
+    np.testing.assert_allclose(
+        sim.get("payload_vel_w"), stopped.get("payload_vel_w"), atol=100 * SAME_STATE
+    )
     np.testing.assert_allclose(sim.get("release_pos_w"), stopped.get("pos_w"), atol=SAME_STATE)
 
 
 def test_a_lag_inside_a_substep_lies_between_its_neighbours():
-    """0.1037 s is no multiple of 2 ms: the state is that of 0.1037 s, not of a substep beside it."""
+    """0.1037 s is no multiple of 2 ms: the state is that of 0.1037 s, not of a substep
+    beside it.
+    """
     command = np.array([[4.0, 2.0, -3.0, 1.0]])
 
     def at(lag):
@@ -114,7 +137,9 @@ def test_landing_flight_and_clearance():
     sim = HybridSim(params, count)
     rng = np.random.default_rng(1)
     height = rng.uniform(0.8, 3.0, count)
-    sim.place(np.column_stack((rng.normal(size=(count, 2)), height)), vel_w=rng.normal(size=(count, 3)))
+    sim.place(
+        np.column_stack((rng.normal(size=(count, 2)), height)), vel_w=rng.normal(size=(count, 3))
+    )
     commands = random_commands(2, 20, count) * [0.5, 0.3, 0.3, 0.3]
     for k, command in enumerate(commands):
         sim.set_command(command, np.full(count, k == asked_at))
@@ -149,14 +174,19 @@ def test_outputs_stay_after_the_landing_step():
                 np.testing.assert_array_equal(sim.get(name), value)
             assert sim.get("separated")[0] == 0
         if sim.get("separated")[0]:
-            kept = {name: sim.get(name) for name in ("landing_w", "time_to_impact", "clearance", "payload_pos_w")}
+            kept = {
+                name: sim.get(name)
+                for name in ("landing_w", "time_to_impact", "clearance", "payload_pos_w")
+            }
     assert kept is not None
 
 
 def test_the_vehicle_flies_on_alone():
     """After separation it climbs by its own thrust over its own mass: no rope pulls, drag off."""
     aero = paper_plant().vehicle.aero
-    calm = dataclasses.replace(aero, **{f.name: 0.0 for f in dataclasses.fields(aero) if f.name != "kind"})
+    calm = dataclasses.replace(
+        aero, **{f.name: 0.0 for f in dataclasses.fields(aero) if f.name != "kind"}
+    )
     ideal = dataclasses.replace(paper_plant().vehicle.battery, kind="ideal")
     params = plant(0.0, "float64", aero=calm, battery=ideal)
     sim = HybridSim(params, 1)
@@ -166,7 +196,9 @@ def test_the_vehicle_flies_on_alone():
         sim.set_command([[weight, 0.0, 0.0, 0.0]], [k == 0])
         sim.step()
         speeds.append(sim.get("vel_w")[0, 2])
-    np.testing.assert_allclose(np.diff(speeds) / PERIOD, weight / params.vehicle.body.mass - GRAVITY, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.diff(speeds) / PERIOD, weight / params.vehicle.body.mass - GRAVITY, rtol=1e-9
+    )
 
 
 def test_payload_of_the_outputs_is_the_end_of_the_rope():

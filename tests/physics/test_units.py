@@ -1,4 +1,6 @@
-"""A plant in other units of length, mass and time flies the same flight: the dimension of every field is right."""
+"""A plant in other units of length, mass and time flies the same flight: the dimension of every
+field is right.
+"""
 
 import dataclasses
 
@@ -15,16 +17,26 @@ from visthrow.task.fleet import TASK
 
 UNITS = Units(2.5, 0.3)
 ROUNDING = 1e-7
-"""Of a difference after half a second in float64, whose operations round differently in other units; the landing is iterated to 1e-9 m."""
+"""Of a difference after half a second in float64, whose operations round differently in other
+units; the landing is iterated to 1e-9 m.
+"""
 
 
 def plant() -> PlantParams:
-    """The shipped plant in float64, with a number in every field of the usual blocks that is 0 there."""
+    """The shipped plant in float64, with a number in every field of the usual blocks that is 0
+    there.
+    """
     p = plant_of(config.load(Experiment, config.find("train", "state")))
     rope = dataclasses.replace(
-        p.rope, payload_drag=2e-3, mount_damping=1e-4, swing_damping=2e-3, downwash=0.05, payload_side=1e-4, payload_lift=2e-4,
+        p.rope,
+        payload_drag=2e-3,
+        mount_damping=1e-4,
+        swing_damping=2e-3,
+        downwash=0.05,
+        payload_side=1e-4,
+        payload_lift=2e-4,
         compliance=1e-3,
-    )  # fmt: skip
+    )
     release = dataclasses.replace(
         p.release, lag_tension=2e-3, kick_w=(0.1, 0.05, 0.02), kick_along=0.1, rope_tail=0.3
     )
@@ -32,7 +44,14 @@ def plant() -> PlantParams:
     thrust = dataclasses.replace(p.vehicle.thrust, k_1=2e-5)
     body = dataclasses.replace(p.vehicle.body, com=(1e-3, -2e-3, 1e-3))
     vehicle = dataclasses.replace(p.vehicle, thrust=thrust, body=body)
-    return dataclasses.replace(p, vehicle=vehicle, rope=rope, release=release, air=air, sim=dataclasses.replace(p.sim, precision="float64"))
+    return dataclasses.replace(
+        p,
+        vehicle=vehicle,
+        rope=rope,
+        release=release,
+        air=air,
+        sim=dataclasses.replace(p.sim, precision="float64"),
+    )
 
 
 def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
@@ -46,10 +65,18 @@ def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
         sim.set_command(np.array([[thrust / force, *(rates / rate)]]), np.array([k >= 18]))
         sim.step()
     sizes = {
-        "pos_w": units.length, "vel_w": units.length / units.time, "rate_b": rate, "quat_wb": 1.0, "motor_speed": rate,
-        "voltage": 1.0, "charge_used": 1.0, "landing_w": units.length, "time_to_impact": units.time, "clearance": units.length,
+        "pos_w": units.length,
+        "vel_w": units.length / units.time,
+        "rate_b": rate,
+        "quat_wb": 1.0,
+        "motor_speed": rate,
+        "voltage": 1.0,
+        "charge_used": 1.0,
+        "landing_w": units.length,
+        "time_to_impact": units.time,
+        "clearance": units.length,
         "separation_time": units.time,
-    }  # fmt: skip
+    }
     assert sim.get("attached")[0] == 0
     return {name: sim.get(name) * size for name, size in sizes.items()}
 
@@ -57,7 +84,9 @@ def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("kind", ["betaflight", "motor_mixing", "geometric"])
 def test_a_plant_in_other_units_flies_the_same_flight(kind):
     p = plant()
-    vehicle = dataclasses.replace(p.vehicle, controller=dataclasses.replace(p.vehicle.controller, kind=kind))
+    vehicle = dataclasses.replace(
+        p.vehicle, controller=dataclasses.replace(p.vehicle.controller, kind=kind)
+    )
     p = dataclasses.replace(p, vehicle=vehicle)
     usual, other = flown(p, Units(1.0, 1.0)), flown(in_units(p, UNITS), UNITS)
     for name, value in usual.items():
@@ -74,7 +103,13 @@ def numbers(value: object) -> list[float]:
     """All numbers of nested dataclasses."""
     if dataclasses.is_dataclass(value):
         return [x for f in dataclasses.fields(value) for x in numbers(getattr(value, f.name))]
-    return [x for item in value for x in numbers(item)] if isinstance(value, tuple) else [value] if isinstance(value, float) else []
+    return (
+        [x for item in value for x in numbers(item)]
+        if isinstance(value, tuple)
+        else [value]
+        if isinstance(value, float)
+        else []
+    )
 
 
 def test_every_field_of_plant_and_task_has_a_dimension():

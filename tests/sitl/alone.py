@@ -1,9 +1,10 @@
-"""Run a command in a network of its own, loopback alone: a firmware in software listens on every address it finds.
+"""Run a command in a network of its own, loopback alone: a firmware in software listens on every
+address it finds.
 
     python tests/sitl/alone.py COMMAND ...
 
-Where the system grants no network namespace it says so and runs the command on this machine's network.
-"""
+Where the system grants no network namespace it says so and runs the command on this machine's
+network."""
 
 import ctypes
 import fcntl
@@ -35,5 +36,9 @@ if __name__ == "__main__":
         raise_loopback()
         print("the firmware has a network of its own", flush=True)
     else:
-        print("no network namespace is granted: the firmware listens on all of this machine's addresses", flush=True)
+        print(
+            "no network namespace is granted: the firmware listens on all of this machine's"
+            " addresses",
+            flush=True,
+        )
     os.execvp(sys.argv[1], sys.argv[1:])

@@ -1,10 +1,12 @@
-"""Throws through the firmware in lock step: runner, link, firmware and vehicle take turns in one process, on no clock but theirs.
+"""Throws through the firmware in lock step: runner, link, firmware and vehicle take turns in one
+process, on no clock but theirs.
 
-    python tests/sitl/alone.py python -m tests.sitl.direct --firmware PROGRAM --seeds 0 1 2    # a line of JSON a throw
+    python tests/sitl/alone.py python -m tests.sitl.direct --firmware PROGRAM --seeds 0 1 2    # a
+    line of JSON a throw
 
-The runner is the one that flies, with its state machine, guard, back-end and recorder; poses come by MAVLink, commands go by MSP.
-The same seed gives the same throw on any machine that is not out of memory, as fast as it can.
-"""
+The runner is the one that flies, with its state machine, guard, back-end and recorder; poses come
+by MAVLink, commands go by MSP. The same seed gives the same throw on any machine that is not out of
+memory, as fast as it can."""
 
 import argparse
 import json
@@ -45,7 +47,9 @@ AFTER, MOST = 1.2, 25.0  # flown on after a landing; flown at most [s]
 
 
 class FlightClock:
-    """A clock that goes as far as the vehicle behind the firmware has flown; see `hil.links.clock.Clock`."""
+    """A clock that goes as far as the vehicle behind the firmware has flown; see
+    `hil.links.clock.Clock`.
+    """
 
     def __init__(self, fake: Fake) -> None:
         self._fake, self._now = fake, fake.plant.time
@@ -72,7 +76,10 @@ class FlightClock:
 
 
 def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
-    """The firmware's settings for a run, written and read back where the folder has none yet. Raises `RunError`: see `Firmware`."""
+    """The firmware's settings for a run, written and read back where the folder has none yet.
+
+    Raises `RunError`: see `Firmware`.
+    """
     settings = folder / SETTINGS
     if not (settings / "eeprom.bin").exists():
         Firmware(program, settings).set_up(needed(params.betaflight))
@@ -81,9 +88,17 @@ def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
 
 @contextmanager
 def opened(
-    program: str | Path, folder: Path, params: HilParams, policy: Policy, plant: MotorPlant, mocap: MocapParams, seed: int
-) -> Iterator[tuple[Runner, Source, FlightClock, BetaflightSitl]]:  # fmt: skip
-    """Runner, its source and clock, and the bridge, joined to a firmware that stands ready; all ended afterwards. See `throw`."""
+    program: str | Path,
+    folder: Path,
+    params: HilParams,
+    policy: Policy,
+    plant: MotorPlant,
+    mocap: MocapParams,
+    seed: int,
+) -> Iterator[tuple[Runner, Source, FlightClock, BetaflightSitl]]:
+    """Runner, its source and clock, and the bridge, joined to a firmware that stands ready; all
+    ended afterwards. See `throw`.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     shutil.copy(set_up(program, folder.parent, params), folder)
@@ -92,7 +107,9 @@ def opened(
         firmware.start()
         port = check_device(params.source.device or params.link.device).port
         link = Link(open_port(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
-        fake = BetaflightSitl(plant, link, mocap, seed, Options(), params.betaflight, firmware.stands)
+        fake = BetaflightSitl(
+            plant, link, mocap, seed, Options(), params.betaflight, firmware.stands
+        )
         clock = FlightClock(fake)
         source, link, _ = open_source(params, folder / "run", clock)
         backend = make_backend(params, link, folder=folder / "run")
@@ -107,19 +124,34 @@ def opened(
 
 
 def throw(
-    program: str | Path, folder: Path, params: HilParams, policy: Policy, plant: MotorPlant, mocap: MocapParams, seed: int
-) -> dict[str, Any]:  # fmt: skip
-    """Fly one throw; returns the bridge's report, with the runner's summary under ``run``; raises `RunError` of the firmware.
+    program: str | Path,
+    folder: Path,
+    params: HilParams,
+    policy: Policy,
+    plant: MotorPlant,
+    mocap: MocapParams,
+    seed: int,
+) -> dict[str, Any]:
+    """Fly one throw; returns the bridge's report, with the runner's summary under ``run``; raises
+    `RunError` of the firmware.
 
     Args:
-        program: of the firmware. folder: of the throw, made anew: the run's record (``run``) and the firmware's blackbox; its
-            settings lie beside it.
+        program: of the firmware. folder: of the throw, made anew: the run's record (``run``) and
+            the firmware's blackbox; its settings lie beside it.
         params: of the run. policy: on the CPU. plant: what flies behind the firmware.
         mocap: its faults. seed: of noise and loss.
     """
-    with opened(program, folder, params, policy, plant, mocap, seed) as (runner, source, clock, fake):
-        # Ticks and motion capture know nothing of each other: the seed says how old the newest pose is at a tick.
-        clock.sleep_until(clock.now() + np.random.default_rng([seed, 1]).uniform(0.0, 1.0 / mocap.rate))
+    with opened(program, folder, params, policy, plant, mocap, seed) as (
+        runner,
+        source,
+        clock,
+        fake,
+    ):
+        # Ticks and motion capture know nothing of each other: the seed says how old the newest pose
+        # is at a tick.
+        clock.sleep_until(
+            clock.now() + np.random.default_rng([seed, 1]).uniform(0.0, 1.0 / mocap.rate)
+        )
         recorder = Recorder(folder / "run", params)
         summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
         recorder.close(summary)
@@ -134,30 +166,63 @@ def _flown(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
     while plant.time < MOST and not done:
         loop.turn(False)
         landed = plant.landing["landing_time"]
-        done = loop.runner.machine.state is State.DONE or (landed is not None and plant.time > landed + AFTER)
-    return {**loop.summary(), "links": [one.roster.summary() for one in loop.source.links], "autopilot": {}}
+        done = loop.runner.machine.state is State.DONE or (
+            landed is not None and plant.time > landed + AFTER
+        )
+    return {
+        **loop.summary(),
+        "links": [one.roster.summary() for one in loop.source.links],
+        "autopilot": {},
+    }
 
 
 def main() -> None:
     """Throw; a line of JSON a seed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add = parser.add_argument
-    add("--firmware", required=True, metavar="PROGRAM", help="Betaflight's for a PC, to fly the plant's motors")
+    add(
+        "--firmware",
+        required=True,
+        metavar="PROGRAM",
+        help="Betaflight's for a PC, to fly the plant's motors",
+    )
     add("--config", default="betaflight_sitl", metavar="NAME", help="of configs/hil, or a file")
     add("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-    add("--seeds", type=int, nargs="+", default=[0], metavar="N", help="of starts, noise and loss; a throw each")
+    add(
+        "--seeds",
+        type=int,
+        nargs="+",
+        default=[0],
+        metavar="N",
+        help="of starts, noise and loss; a throw each",
+    )
     add("--policy", help="whose plant is flown (default: the one that throws)")
     add("--plant", default=MOTORS, metavar="MODULE:FUNCTION", help="that makes the vehicle")
-    add("--folder", type=Path, default=Path("out/firmware"), help="of the firmware's settings and blackbox")
+    add(
+        "--folder",
+        type=Path,
+        default=Path("out/firmware"),
+        help="of the firmware's settings and blackbox",
+    )
     args = parser.parse_args()
     params = config.load(HilParams, config.find("hil", args.config), args.overrides)
     policy = Policy.load(find_policy(params.policy))
     for seed in args.seeds:
         flown = load_plant(args.plant, args.policy or params.policy, seed)
-        report = throw(args.firmware, args.folder / f"{seed:03d}", params, policy, flown, MocapParams(), seed)
+        report = throw(
+            args.firmware, args.folder / f"{seed:03d}", params, policy, flown, MocapParams(), seed
+        )
         summary, landed = report.pop("run"), report["landing_w"]
         error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])
-        told = {"seed": seed, "error": error, "state": summary["state"], "reason": summary["reason"], **report}
+        told = {
+            "seed": seed,
+            "error": error,
+            "state": summary["state"],
+            "reason": summary["reason"],
+            **report,
+        }
         print(json.dumps(told), flush=True)
 
 

@@ -1,12 +1,14 @@
-"""What the blackbox's gyro shows beside the controller block, and why: one throw, without one after the other of what makes it differ.
+"""What the blackbox's gyro shows beside the controller block, and why: one throw, without one after
+the other of what makes it differ.
 
     python tests/sitl/alone.py python -m tests.sitl.gyro --seeds 100 101
 
-The blackbox records each loop of the firmware; the vehicle is the training's with the firmware's settings, as `diagnose apply` makes it.
-What windows leave of the gyro beside their initial states is told as its mean square about x, y and z, in deviations of its noise and of
-the recording's steps of 1 deg/s, at the 250 samples a second that `explain` looks at. The first line is as `explain` sees it: the
-vehicle behind the firmware in steps of 2 ms, the gyro behind the firmware's filters, commands at the runner's stamps.
-"""
+The blackbox records each loop of the firmware; the vehicle is the training's with the firmware's
+settings, as `diagnose apply` makes it. What windows leave of the gyro beside their initial states
+is told as its mean square about x, y and z, in deviations of its noise and of the recording's steps
+of 1 deg/s, at the 250 samples a second that `explain` looks at. The first line is as `explain` sees
+it: the vehicle behind the firmware in steps of 2 ms, the gyro behind the firmware's filters,
+commands at the runner's stamps."""
 
 import argparse
 import json
@@ -43,12 +45,16 @@ AT_ONCE = np.radians(2.0)
 
 
 def flown(folder: Path, step: float, seed: int) -> Path:
-    """A throw with the vehicle in steps of some length [s], every loop in the blackbox; its folder."""
+    """A throw with the vehicle in steps of some length [s], every loop in the blackbox;
+    its folder.
+    """
     params = config.load(HilParams, config.find("hil", "betaflight_sitl"), [f'policy="{BASE}"'])
     settings, where = folder / SETTINGS, folder / f"{seed}"
     if not where.exists():
         if not (settings / "eeprom.bin").exists():
-            Firmware(program(), settings).set_up(needed(params.betaflight) | {"blackbox_sample_rate": "1/1"})
+            Firmware(program(), settings).set_up(
+                needed(params.betaflight) | {"blackbox_sample_rate": "1/1"}
+            )
         plant = type("Stepped", (MotorPlant,), {"period": step})(load_policy(BASE).experiment, seed)
         throw(program(), where, params, Policy.load(find_policy(BASE)), plant, MocapParams(), seed)
     return where
@@ -56,7 +62,10 @@ def flown(folder: Path, step: float, seed: int) -> Path:
 
 def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
     """The throw's log with its blackbox."""
-    (box,), (run,) = logs_of_blackbox(path := next(where.glob("LOG*"))), read(where / "run" / "throw-01.npz")
+    (box,), (run,) = (
+        logs_of_blackbox(path := next(where.glob("LOG*"))),
+        read(where / "run" / "throw-01.npz"),
+    )
     if unfiltered:
         raw = read_blackbox(path)[0]
         columns = dict(zip(raw.names, raw.main.T))
@@ -65,12 +74,18 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
     log = join([run, box])
     rate, setpoint, command = log["rate_b"], log["rate_setpoint_b"], log["command"]
     every = round(EVERY / np.median(np.diff(rate.time)))
-    log.channels["rate_b"] = replace(rate, time=rate.time[::every], values=rate.values[::every], valid=rate.valid[::every])
+    log.channels["rate_b"] = replace(
+        rate, time=rate.time[::every], values=rate.values[::every], valid=rate.valid[::every]
+    )
     if as_taken:
         time = command.time.copy()
-        for k in np.flatnonzero(np.abs(np.diff(command.values[:, 1:], axis=0)).max(axis=1) > AT_ONCE) + 1:
+        for k in (
+            np.flatnonzero(np.abs(np.diff(command.values[:, 1:], axis=0)).max(axis=1) > AT_ONCE) + 1
+        ):
             after = slice(*np.searchsorted(setpoint.time, time[k] + [0.0, 2.0 * DELAY]))
-            same = np.all(np.abs(setpoint.values[after] - command.values[k, 1:]) < 0.5 * AT_ONCE, axis=1)
+            same = np.all(
+                np.abs(setpoint.values[after] - command.values[k, 1:]) < 0.5 * AT_ONCE, axis=1
+            )
             time[k] = setpoint.time[after][same.argmax()] - DELAY if same.any() else time[k]
         log.channels["command"] = replace(command, time=np.maximum.accumulate(time))
     return log
@@ -78,15 +93,27 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
 
 def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
     """Mean square of what windows leave of the gyro, in deviations of its noise, shape (3,)."""
-    path, hover = config.find("train", BASE), config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
+    path, hover = (
+        config.find("train", BASE),
+        config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover,
+    )
     file = folder / "settings.toml"
-    file.write_text(patch.with_firmware(box, str(path), config.load(Experiment, path), hover, DELAY))
-    model = ThrowModel([log.measured() for log in logs], plant_of(config.load(Experiment, file)), only=["cmd_delay"])
+    file.write_text(
+        patch.with_firmware(box, str(path), config.load(Experiment, path), hover, DELAY)
+    )
+    model = ThrowModel(
+        [log.measured() for log in logs],
+        plant_of(config.load(Experiment, file)),
+        only=["cmd_delay"],
+    )
     squares = []
     for w in model.windows({}):
         scaled, residual = w.nuisance * w.nuisance_sd / w.sigma[:, None], w.residual / w.sigma
         fitted = np.linalg.solve(np.eye(scaled.shape[1]) + scaled.T @ scaled, scaled.T @ residual)
-        squares.append((residual - scaled @ fitted)[w.channel == model.channels.index("rate_b")].reshape(-1, 3) ** 2)
+        squares.append(
+            (residual - scaled @ fitted)[w.channel == model.channels.index("rate_b")].reshape(-1, 3)
+            ** 2
+        )
     return np.concatenate(squares).mean(axis=0).round(2).tolist()
 
 
@@ -96,11 +123,21 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101])
     parser.add_argument("--out", type=Path, default=Path("out/gyro"))
     args = parser.parse_args()
-    for step, *of in ((0.002, False, False), (0.002, True, False), (0.002, True, True), (SAMPLE, True, True)):
+    for step, *of in (
+        (0.002, False, False),
+        (0.002, True, False),
+        (0.002, True, True),
+        (SAMPLE, True, True),
+    ):
         folder = args.out / f"{1e3 * step:g}ms"
         throws = [flown(folder, step, seed) for seed in args.seeds]
         found = left([joined(where, *of) for where in throws], next(throws[0].glob("LOG*")), folder)
-        print(json.dumps({"step_s": step, "unfiltered": of[0], "commands_as_taken": of[1], "left": found}), flush=True)
+        print(
+            json.dumps(
+                {"step_s": step, "unfiltered": of[0], "commands_as_taken": of[1], "left": found}
+            ),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

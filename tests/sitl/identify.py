@@ -1,12 +1,13 @@
-"""What our controller block gets wrong of Betaflight's: rate doublets through the firmware, the block fitted to them, the rest.
+"""What our controller block gets wrong of Betaflight's: rate doublets through the firmware, the
+block fitted to them, the rest.
 
     python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --seconds 36
 
-Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that were not fitted, by the shipped block
-and by the fitted one. ``python -m tests.bench.direct --plant tests.sitl.identify:make_fitted`` throws with the fitted vehicle.
-``doublets.npz`` is the flight as motion capture and runner see it: `diagnose explain` takes it with the firmware's blackbox. Commands wait
-as in a throw.
-"""
+Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that
+were not fitted, by the shipped block and by the fitted one. ``python -m tests.bench.direct --plant
+tests.sitl.identify:make_fitted`` throws with the fitted vehicle. ``doublets.npz`` is the flight as
+motion capture and runner see it: `diagnose explain` takes it with the firmware's blackbox. Commands
+wait as in a throw."""
 
 import argparse
 import dataclasses
@@ -60,13 +61,19 @@ REST = ("integral_x", "integral_y", "integral_z")
 
 
 def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
-    """Hover through the firmware with a doublet of a rate now and then; states and commands of each period."""
+    """Hover through the firmware with a doublet of a rate now and then; states and commands of each
+    period.
+    """
     params = config.load(HilParams, config.find("hil", "betaflight_sitl"))
     settings = set_up(bench.program(), folder, params).parent
     run = folder / "run"
     run.mkdir(parents=True, exist_ok=True)
     desk = bench.Bench(run, settings)
-    backend, seen, mocap = Held(desk.backend, params.delay.hold), FlightRecorder({"source": "doublets"}), Mocap(MocapParams(), seed)
+    backend, seen, mocap = (
+        Held(desk.backend, params.delay.hold),
+        FlightRecorder({"source": "doublets"}),
+        Mocap(MocapParams(), seed),
+    )
     rng, plant = np.random.default_rng(seed), desk.plant
     hover = HoverController(HoverParams(max_thrust=plant.max_thrust), bench.TICK)
     rows, starts = [], []
@@ -83,13 +90,27 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
             if plant.time >= due:
                 axis = int(rng.integers(3))
                 size = rng.choice(SIZES[axis]) * rng.choice((-1.0, 1.0))
-                doublet, due = (axis, size, plant.time, rng.integers(2, 5) * bench.TICK), due + EVERY
+                doublet, due = (
+                    (
+                        axis,
+                        size,
+                        plant.time,
+                        rng.integers(2, 5) * bench.TICK,
+                    ),
+                    due + EVERY,
+                )
                 lift = rng.choice(LIFTS)
                 starts.append((plant.time, axis, size, lift))
-            command[0] *= lift if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6 else 1.0
+            command[0] *= (
+                lift
+                if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6
+                else 1.0
+            )
             if doublet is not None and plant.time - doublet[2] < 2 * doublet[3] - 1e-6:
                 command[1:] = 0.0
-                command[1 + doublet[0]] = doublet[1] if plant.time - doublet[2] < doublet[3] - 1e-6 else -doublet[1]
+                command[1 + doublet[0]] = (
+                    doublet[1] if plant.time - doublet[2] < doublet[3] - 1e-6 else -doublet[1]
+                )
             backend.send(command, plant.time)
             seen.add(plant.time, command=command)
             backend.service(plant.time)
@@ -106,7 +127,11 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                     backend.service(waits)
                 clock.sleep_until(end_of_period)
                 for pose in mocap.measure(plant.time, plant.state) if mocap.due(plant.time) else ():
-                    ours = {"payload_pos_w": pose.pos} if pose.body == PAYLOAD else {"pos_w": pose.pos, "quat_wb": pose.quat}
+                    ours = (
+                        {"payload_pos_w": pose.pos}
+                        if pose.body == PAYLOAD
+                        else {"pos_w": pose.pos, "quat_wb": pose.quat}
+                    )
                     seen.add(plant.time, **ours)
     finally:
         desk.close()
@@ -115,17 +140,27 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def changed(vehicle: VehicleParams, theta: np.ndarray) -> VehicleParams:
-    """A vehicle with the settings' controller, changed by `NAMES`: delay [s], voltage [V], 1 + logarithms of factors of the others."""
+    """A vehicle with the settings' controller, changed by `NAMES`: delay [s], voltage [V], 1 +
+    logarithms of factors of the others.
+    """
     delay, voltage = theta[:2].tolist()
     gyro, p, i, d, p_yaw, i_yaw = np.exp(theta[2:] - 1.0).tolist()
     c = vehicle.controller
     scale = lambda gain, both, yaw: (gain[0] * both, gain[1] * both, gain[2] * yaw)  # noqa: E731
     full = c.max_thrust * (voltage / c.calibration_voltage) ** 2
     controller = dataclasses.replace(
-        c, gyro_time_constant=gyro * c.gyro_time_constant, p_gain=scale(c.p_gain, p, p_yaw), i_gain=scale(c.i_gain, i, i_yaw),
-        d_gain=scale(c.d_gain, d, 1.0), max_thrust=full, min_thrust=full * IDLE**2, calibration_voltage=voltage,
-    )  # fmt: skip
-    return dataclasses.replace(vehicle, controller=controller, queue=dataclasses.replace(vehicle.queue, delay=delay))
+        c,
+        gyro_time_constant=gyro * c.gyro_time_constant,
+        p_gain=scale(c.p_gain, p, p_yaw),
+        i_gain=scale(c.i_gain, i, i_yaw),
+        d_gain=scale(c.d_gain, d, 1.0),
+        max_thrust=full,
+        min_thrust=full * IDLE**2,
+        calibration_voltage=voltage,
+    )
+    return dataclasses.replace(
+        vehicle, controller=controller, queue=dataclasses.replace(vehicle.queue, delay=delay)
+    )
 
 
 class Windows:
@@ -136,47 +171,78 @@ class Windows:
         first = np.searchsorted(rows[:, 0], flight["starts"][:, 0] - BEFORE)
         count = round(LENGTH / PERIOD)
         first = first[first + count < len(rows)]
-        # Where the firmware was not scheduled for a while its outputs stand still: such a doublet says nothing of its controller.
-        stood = np.array([np.diff(rows[at - round(BEFORE / PERIOD) : at + count, 18][::STALL]).min() == 0 for at in first])
-        self.starts, self.stalled, first = flight["starts"][: len(first)][~stood], int(stood.sum()), first[~stood]
+        # Where the firmware was not scheduled for a while its outputs stand still: such a doublet
+        # says nothing of its controller.
+        stood = np.array(
+            [
+                np.diff(rows[at - round(BEFORE / PERIOD) : at + count, 18][::STALL]).min() == 0
+                for at in first
+            ]
+        )
+        self.starts, self.stalled, first = (
+            flight["starts"][: len(first)][~stood],
+            int(stood.sum()),
+            first[~stood],
+        )
         self.flight, self.first = rows, first
         self.rows = np.stack([rows[at : at + count] for at in first])  # (E, T, fields)
         lead = round(0.1 / PERIOD)
-        self.earlier = np.stack([rows[at - lead : at, 14:18] for at in first])  # commands before a window, for the queue
+        self.earlier = np.stack(
+            [rows[at - lead : at, 14:18] for at in first]
+        )  # commands before a window, for the queue
         plant = plant_of(load_policy(policy).experiment)
-        self.plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, control_period=PERIOD))
+        self.plant = dataclasses.replace(
+            plant, sim=dataclasses.replace(plant.sim, control_period=PERIOD)
+        )
 
     def controller(self, vehicle: VehicleParams, rest: np.ndarray) -> dict[str, np.ndarray]:
-        """Integral, smoothed set-point and gyro of the block at each period of the whole flight, by what it was asked and flew."""
+        """Integral, smoothed set-point and gyro of the block at each period of the whole flight, by
+        what it was asked and flew.
+        """
         c, rows = vehicle.controller, self.flight
         late = np.searchsorted(rows[:, 0], rows[:, 0] - vehicle.queue.delay + 1e-6) - 1
         asked, rate = rows[np.maximum(late, 0), 15:18], rows[:, 1:4]
 
         def smoothed(values: np.ndarray, time_constant: float) -> np.ndarray:
             share = 1.0 - np.exp(-PERIOD / time_constant)
-            return lfilter([share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1])[0]
+            return lfilter(
+                [share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1]
+            )[0]
 
-        setpoint, gyro = smoothed(asked, c.setpoint_time_constant), smoothed(rate, c.gyro_time_constant)
+        setpoint, gyro = (
+            smoothed(asked, c.setpoint_time_constant),
+            smoothed(rate, c.gyro_time_constant),
+        )
         if c.kind != "motor_mixing":
             return {"setpoint": setpoint, "gyro": gyro, "integral": np.zeros_like(rate)}
         error = asked - rate - np.array(c.gyro_share) * (gyro - rate)
         error[:, :2] *= np.maximum(1.0 - np.abs(asked - setpoint)[:, :2] / c.relax_threshold, 0.0)
-        return {"setpoint": setpoint, "gyro": gyro, "integral": c.i_gain * (rest + PERIOD * np.cumsum(error, axis=0))}
+        return {
+            "setpoint": setpoint,
+            "gyro": gyro,
+            "integral": c.i_gain * (rest + PERIOD * np.cumsum(error, axis=0)),
+        }
 
     def rates(self, vehicle: VehicleParams, chosen: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        """Rates by the simulator under the same commands [rad/s], shape (E, T, 3); rest: see `REST`."""
+        """Rates by the simulator under the same commands [rad/s], shape (E, T, 3); rest: see
+        `REST`.
+        """
         rows = self.rows[chosen]
         sim = HybridSim(dataclasses.replace(self.plant, vehicle=vehicle), len(rows))
         start = rows[:, 0]
         cable_dir, cable_vel = np.moveaxis(start[:, 25:].reshape(len(start), 2, -1, 3), 1, 0)
-        sim.place(start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4], cable_dir, cable_vel)
+        sim.place(
+            start[:, 11:14], start[:, 4:8], start[:, 8:11], start[:, 1:4], cable_dir, cable_vel
+        )
         sim.state.voltage.assign(start[:, 19].astype(np.float32))
         sim.state.charge_used.assign(start[:, 20].astype(np.float32))
         sim.state.motor_speed.assign(start[:, 21:25].astype(np.float32))
         for name, value in self.controller(vehicle, rest).items():
             getattr(sim.state, name).assign(value[self.first[chosen] - 1].astype(np.float32))
         depth = sim.state.queue.shape[0]
-        newest_first = self.earlier[chosen][:, ::-1][:, np.minimum(np.arange(depth), self.earlier.shape[1] - 1)]
+        newest_first = self.earlier[chosen][:, ::-1][
+            :, np.minimum(np.arange(depth), self.earlier.shape[1] - 1)
+        ]
         sim.state.queue.assign(np.swapaxes(newest_first, 0, 1).astype(np.float32))
         out = np.empty((*rows.shape[:2], 3))
         for k in range(rows.shape[1]):
@@ -188,10 +254,14 @@ class Windows:
     def miss(self, vehicle: VehicleParams, chosen: np.ndarray, rest: np.ndarray) -> float:
         """Rms of the difference over the rms of the firmware's rates."""
         flown = self.rows[chosen][:, :, 1:4]
-        return float(np.sqrt(((self.rates(vehicle, chosen, rest) - flown) ** 2).mean() / (flown**2).mean()))
+        return float(
+            np.sqrt(((self.rates(vehicle, chosen, rest) - flown) ** 2).mean() / (flown**2).mean())
+        )
 
 
-def fit(windows: Windows, vehicle: VehicleParams, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit(
+    windows: Windows, vehicle: VehicleParams, chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of :func:`changed`, and `REST`, that fit the chosen windows best."""
     start = np.array([0.001, vehicle.controller.calibration_voltage, *np.ones(6), *np.zeros(3)])
     low = np.array([0.0, 14.0, *np.full(6, -3.0), *np.full(3, -5.0)])
@@ -199,14 +269,27 @@ def fit(windows: Windows, vehicle: VehicleParams, chosen: np.ndarray) -> tuple[n
     scale = [5e-3, 0.3, *np.full(6, 0.5), *np.full(3, 0.1)]
 
     def off(theta: np.ndarray) -> np.ndarray:
-        return (windows.rates(changed(vehicle, theta[:8]), chosen, theta[8:]) - windows.rows[chosen][:, :, 1:4]).ravel()
+        return (
+            windows.rates(changed(vehicle, theta[:8]), chosen, theta[8:])
+            - windows.rows[chosen][:, :, 1:4]
+        ).ravel()
 
-    found = least_squares(off, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25)
+    found = least_squares(
+        off, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25
+    )
     return found.x[:8], found.x[8:]
 
 
-def draw(path: Path, windows: Windows, chosen: np.ndarray, vehicles: dict[str, VehicleParams], rest: np.ndarray) -> None:
-    """Draw the largest of some doublets about each axis: the firmware's rate, and those of vehicles under the same commands."""
+def draw(
+    path: Path,
+    windows: Windows,
+    chosen: np.ndarray,
+    vehicles: dict[str, VehicleParams],
+    rest: np.ndarray,
+) -> None:
+    """Draw the largest of some doublets about each axis: the firmware's rate, and those of vehicles
+    under the same commands.
+    """
     from visthrow.common import style
 
     style.use()
@@ -219,8 +302,21 @@ def draw(path: Path, windows: Windows, chosen: np.ndarray, vehicles: dict[str, V
         sizes = np.where(windows.starts[chosen, 1] == axis, np.abs(windows.starts[chosen, 2]), 0.0)
         at = int(np.argmax(sizes))
         for i, (what, values) in enumerate(rates.items()):
-            axes[axis].plot(time, values[at, :, axis], color=style.COLOURS[i + 1], lw=1.6, ls=("--", "-")[i % 2], label=what)
-        axes[axis].plot(time, windows.rows[chosen][at, :, 1 + axis], color=style.INK, lw=1.0, label="Betaflight 4.6")
+            axes[axis].plot(
+                time,
+                values[at, :, axis],
+                color=style.COLOURS[i + 1],
+                lw=1.6,
+                ls=("--", "-")[i % 2],
+                label=what,
+            )
+        axes[axis].plot(
+            time,
+            windows.rows[chosen][at, :, 1 + axis],
+            color=style.INK,
+            lw=1.0,
+            label="Betaflight 4.6",
+        )
         axes[axis].set(xlabel="time [ms]", title=name)
     axes[0].set_ylabel("rate [rad/s]")
     axes[2].legend(fontsize=8)
@@ -249,25 +345,44 @@ def main() -> None:
     windows = Windows(flight, args.policy)
     every = np.arange(len(windows.rows))
     seen, held_out = every[every % 3 != 2], every[every % 3 == 2]
-    shipped, configured = windows.plant.vehicle, config.load(VehicleParams, config.find("vehicle", "betaflight_sitl"))
+    shipped, configured = (
+        windows.plant.vehicle,
+        config.load(VehicleParams, config.find("vehicle", "betaflight_sitl")),
+    )
     settings = read_blackbox(next((args.out / "run").glob("LOG*")))[0].header
     hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     weight = 0.25 * windows.plant.total_mass * GRAVITY
-    alone = controller_of(shipped, settings, weight, calibrated_voltage(shipped, settings, weight, hover))
+    alone = controller_of(
+        shipped, settings, weight, calibrated_voltage(shipped, settings, weight, hover)
+    )
     named = dataclasses.replace(shipped, controller=alone)
     theta, rest = fit(windows, named, seen)
     fitted = changed(named, theta)
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
-        "doublets": len(every), "stalled": windows.stalled, "shipped": windows.miss(shipped, held_out, rest),
+        "doublets": len(every),
+        "stalled": windows.stalled,
+        "shipped": windows.miss(shipped, held_out, rest),
         "settings": windows.miss(dataclasses.replace(named, queue=fitted.queue), held_out, rest),
-        "configured": windows.miss(dataclasses.replace(configured, queue=fitted.queue), held_out, rest),
-        "fitted": windows.miss(fitted, held_out, rest), "seen": windows.miss(fitted, seen, rest),
-        **{name: float(v if k < 2 else np.exp(v - 1.0)) for k, (name, v) in enumerate(zip(NAMES, theta))},
-    }  # fmt: skip
+        "configured": windows.miss(
+            dataclasses.replace(configured, queue=fitted.queue), held_out, rest
+        ),
+        "fitted": windows.miss(fitted, held_out, rest),
+        "seen": windows.miss(fitted, seen, rest),
+        **{
+            name: float(v if k < 2 else np.exp(v - 1.0))
+            for k, (name, v) in enumerate(zip(NAMES, theta))
+        },
+    }
     (args.out / "fit.json").write_text(json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2))
-    draw(args.out / "doublets.png", windows, held_out, {"the training's block": shipped, "fitted": fitted}, rest)
+    draw(
+        args.out / "doublets.png",
+        windows,
+        held_out,
+        {"the training's block": shipped, "fitted": fitted},
+        rest,
+    )
 
 
 if __name__ == "__main__":

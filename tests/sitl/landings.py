@@ -1,12 +1,13 @@
-"""Landings of throws through the firmware, predicted open loop: by the training's vehicle, by the firmware's settings, by what was named.
+"""Landings of throws through the firmware, predicted open loop: by the training's vehicle, by the
+firmware's settings, by what was named.
 
-    visthrow diagnose explain out/firmware/10*/... --plant out/doc.toml --out out/explain      # of other throws
-    python -m tests.sitl.landings out/firmware/11* --diagnosis out/explain/diagnosis.json
+    visthrow diagnose explain out/firmware/10*/... --plant out/doc.toml --out out/explain      # of
+    other throws python -m tests.sitl.landings out/firmware/11* --diagnosis
+    out/explain/diagnosis.json
 
-Each folder is a throw of `tests.sitl.direct`, with its run and its blackbox. The settings are those in the first blackbox's
-header, with the hover's share of throttle and the commands' delay; nothing is fitted to these throws but the state from which a
-prediction begins.
-"""
+Each folder is a throw of `tests.sitl.direct`, with its run and its blackbox. The settings are those
+in the first blackbox's header, with the hover's share of throttle and the commands' delay; nothing
+is fitted to these throws but the state from which a prediction begins."""
 
 import argparse
 import json
@@ -22,12 +23,16 @@ from visthrow.diagnose.inputs import opening
 from visthrow.task import Experiment
 
 BASE, DELAY = "vision", 0.028
-"""The vehicle that the policy was trained in; from a decision to the firmware's mixer, with the wait of `delay.hold` [s]."""
+"""The vehicle that the policy was trained in; from a decision to the firmware's mixer, with the
+wait of `delay.hold` [s].
+"""
 
 
 def errors(logs: list[str], plant: str, theta: dict[str, float] | None = None) -> np.ndarray:
     """Horizontal distance of predicted from measured landings [m], shape (F,)."""
-    told = argparse.Namespace(logs=logs, plant=plant, overrides=[], config=None, only=None, measured=[], device="cpu")
+    told = argparse.Namespace(
+        logs=logs, plant=plant, overrides=[], config=None, only=None, measured=[], device="cpu"
+    )
     model, _ = opening.open_model(told)
     return model.landings(theta or {}).errors
 
@@ -36,18 +41,30 @@ def main() -> None:
     """Predict and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("throws", nargs="+", type=Path, metavar="FOLDER")
-    parser.add_argument("--diagnosis", type=Path, metavar="FILE", help="diagnosis.json of an explain on top of the settings")
+    parser.add_argument(
+        "--diagnosis",
+        type=Path,
+        metavar="FILE",
+        help="diagnosis.json of an explain on top of the settings",
+    )
     args = parser.parse_args()
     boxes = [next(folder.glob("LOG*")) for folder in args.throws]
-    logs = [f"{folder / 'run' / 'throw-01.npz'}+{box}" for folder, box in zip(args.throws, boxes, strict=True)]
+    logs = [
+        f"{folder / 'run' / 'throw-01.npz'}+{box}"
+        for folder, box in zip(args.throws, boxes, strict=True)
+    ]
     hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     with tempfile.TemporaryDirectory() as name:
         plant = Path(name) / "settings.toml"
         path = config.find("train", BASE)
-        plant.write_text(patch.with_firmware(boxes[0], str(path), config.load(Experiment, path), hover, DELAY))
+        plant.write_text(
+            patch.with_firmware(boxes[0], str(path), config.load(Experiment, path), hover, DELAY)
+        )
         found = {"before": errors(logs, BASE), "settings": errors(logs, str(plant))}
         if args.diagnosis:
-            found["named"] = errors(logs, str(plant), json.loads(args.diagnosis.read_text())["theta"])
+            found["named"] = errors(
+                logs, str(plant), json.loads(args.diagnosis.read_text())["theta"]
+            )
     mean = {key: float(value.mean()) for key, value in found.items()}
     less = {key: 1.0 - mean[key] / mean["before"] for key in mean if key != "before"}
     print(json.dumps({"throws": len(logs), "mean_m": mean, "less_by": less}, indent=1))

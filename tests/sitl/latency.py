@@ -1,11 +1,13 @@
-"""From the newest pose on the wire to the command on the wire, through the firmware's own link, beside the runner's own share.
+"""From the newest pose on the wire to the command on the wire, through the firmware's own link,
+beside the runner's own share.
 
     python tests/sitl/alone.py python -m tests.sitl.latency --seconds 25
 
-Bridge and runner are processes of their own, in real time. The kernel stamps each packet on the loopback interface (a packet socket, which
-a network namespace of one's own grants): poses of the vehicle go to the runner by MAVLink, sticks to the firmware by MSP. Commands are
-not held back here. The runner's own share is its stage ``total``: from its look for messages to the command's bytes out.
-"""
+Bridge and runner are processes of their own, in real time. The kernel stamps each packet on the
+loopback interface (a packet socket, which a network namespace of one's own grants): poses of the
+vehicle go to the runner by MAVLink, sticks to the firmware by MSP. Commands are not held back here.
+The runner's own share is its stage ``total``: from its look for messages to the command's bytes
+out."""
 
 import argparse
 import json
@@ -33,7 +35,9 @@ IP, ETHER, UDP = 20, 14, 8
 
 
 class Wire(threading.Thread):
-    """What goes over the loopback interface: kernel's stamps [s] of the vehicle's poses and of set sticks."""
+    """What goes over the loopback interface: kernel's stamps [s] of the vehicle's poses and of set
+    sticks.
+    """
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -49,7 +53,9 @@ class Wire(threading.Thread):
         """Listen until the process ends."""
         while True:
             data, more, _, where = self._socket.recvmsg(65536, 256)
-            if where[2] == socket.PACKET_OUTGOING:  # each packet is seen as it goes out and as it comes in
+            if (
+                where[2] == socket.PACKET_OUTGOING
+            ):  # each packet is seen as it goes out and as it comes in
                 continue
             seconds, nanoseconds = STAMP.unpack(more[0][2])
             self._take(data[ETHER:], seconds + 1e-9 * nanoseconds)
@@ -64,7 +70,9 @@ class Wire(threading.Thread):
                     self.poses.append(stamp)
         elif packet[9] == socket.IPPROTO_TCP and port == COMMANDS:
             body = packet[head + 4 * (packet[head + 12] >> 4) :]
-            self.commands += [stamp for frame in self._msp.parse(body) if frame.command == msp.SET_RAW_RC]
+            self.commands += [
+                stamp for frame in self._msp.parse(body) if frame.command == msp.SET_RAW_RC
+            ]
 
     def times(self) -> np.ndarray:
         """Of each command, since the newest pose before it [s]."""
@@ -78,16 +86,37 @@ def flown(folder: Path, seconds: float, speed: float) -> dict:
     wire = Wire()
     words = ("--speed", str(speed))
     bridge = visthrow(
-        "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(folder / "firmware"), *words,
-        "--out", str(folder / "bridge.json"), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+        "hil",
+        "fake",
+        "--kind",
+        "betaflight-sitl",
+        "--firmware",
+        str(program()),
+        "--folder",
+        str(folder / "firmware"),
+        *words,
+        "--out",
+        str(folder / "bridge.json"),
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+    )
     try:
         wait_for(bridge, "it flies")
         sets = (f"states.armed_least={seconds}", f"states.armed={seconds + 20.0}", "delay.hold=0.0")
         runner = visthrow(
-            "hil", "run", "--config", "betaflight_sitl", "--auto-arm", "--bare", *words, "--out", str(folder / "run"),
-            *(word for text in sets for word in ("--set", text)), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
-        )  # fmt: skip
+            "hil",
+            "run",
+            "--config",
+            "betaflight_sitl",
+            "--auto-arm",
+            "--bare",
+            *words,
+            "--out",
+            str(folder / "run"),
+            *(word for text in sets for word in ("--set", text)),
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+        )
         wait_for(runner, " s  armed ")
         wire.start()
         with_time = threading.Timer(seconds / speed, runner.send_signal, (signal.SIGINT,))
@@ -97,14 +126,21 @@ def flown(folder: Path, seconds: float, speed: float) -> dict:
         bridge.communicate()
     finally:
         bridge.kill()
-    summary, report = (json.loads((folder / name).read_text()) for name in ("run/summary.json", "bridge.json"))
+    summary, report = (
+        json.loads((folder / name).read_text()) for name in ("run/summary.json", "bridge.json")
+    )
     p50, p99 = (1e3 * float(np.quantile(wire.times(), share)) for share in (0.5, 0.99))
     own = summary["latency"]["total"]
     return {
-        "commands": len(wire.commands), "poses": len(wire.poses), "pose_to_command_ms": {"p50": p50, "p99": p99},
-        "own_ms": {"p50": own["p50_ms"], "p99": own["p99_ms"]}, "late_periods": report["late_periods"],
-        "periods": round(report["time"] / 0.002), "missed_ticks": summary["missed"], "speed": speed,
-    }  # fmt: skip
+        "commands": len(wire.commands),
+        "poses": len(wire.poses),
+        "pose_to_command_ms": {"p50": p50, "p99": p99},
+        "own_ms": {"p50": own["p50_ms"], "p99": own["p99_ms"]},
+        "late_periods": report["late_periods"],
+        "periods": round(report["time"] / 0.002),
+        "missed_ticks": summary["missed"],
+        "speed": speed,
+    }
 
 
 def main() -> None:

@@ -1,13 +1,13 @@
 """The loop closed on Betaflight's firmware: throws before, what the diagnosis found, throws after.
 
-    python -m tests.sitl.loop                                                             # the committed record
-    python tests/sitl/alone.py python -m tests.sitl.loop --name after                     # and again
-    python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision
+    python -m tests.sitl.loop                                                             # the
+    committed record python tests/sitl/alone.py python -m tests.sitl.loop --name after
+    # and again python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision
 
-Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1 mm and 0.2 deg of noise at 100 Hz, and
-the same throws on our own block with the policy's own vehicle (``own``). A series that was cut goes on where it was. The record
-keeps error and separation of each throw; the runs and the firmware's blackboxes are left in the folder.
-"""
+Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1
+mm and 0.2 deg of noise at 100 Hz, and the same throws on our own block with the policy's own
+vehicle (``own``). A series that was cut goes on where it was. The record keeps error and separation
+of each throw; the runs and the firmware's blackboxes are left in the folder."""
 
 import argparse
 import json
@@ -32,16 +32,35 @@ DISTANCES = (2.0, 1.5, 2.5)
 
 def flown(where: str, distance: float, seed: int, policy: str, plant: str, folder: Path) -> dict:
     """One throw, through the firmware or on our own block; what became of it."""
-    params = config.load(HilParams, config.find("hil", "betaflight_sitl"), [f"goal_w=[{distance},0.0,0.0]", f'policy="{policy}"'])
+    params = config.load(
+        HilParams,
+        config.find("hil", "betaflight_sitl"),
+        [f"goal_w=[{distance},0.0,0.0]", f'policy="{policy}"'],
+    )
     loaded = Policy.load(find_policy(policy))
     if where == "own":
         report = Direct(make(policy, seed), loaded, params, MocapParams(), seed).throw()
     else:
-        report = throw(program(), folder / f"{distance:g}-{seed:02d}", params, loaded, make_motors(plant, seed), MocapParams(), seed)
+        report = throw(
+            program(),
+            folder / f"{distance:g}-{seed:02d}",
+            params,
+            loaded,
+            make_motors(plant, seed),
+            MocapParams(),
+            seed,
+        )
     landing = report["landing_w"]
     error = None if landing is None else round(math.hypot(landing[0] - distance, landing[1]), 5)
     why = report.get("run", {}).get("reason", "")
-    return {"where": where, "distance": distance, "seed": seed, "error": error, "landing_w": landing, "ended": why}
+    return {
+        "where": where,
+        "distance": distance,
+        "seed": seed,
+        "error": error,
+        "landing_w": landing,
+        "ended": why,
+    }
 
 
 def series(args: argparse.Namespace) -> list[dict]:
@@ -54,7 +73,9 @@ def series(args: argparse.Namespace) -> list[dict]:
         for distance in args.distances:
             for seed in range(args.seeds):
                 if (where, distance, seed) not in done:
-                    found.append(flown(where, distance, seed, args.policy, args.plant, args.out / args.name))
+                    found.append(
+                        flown(where, distance, seed, args.policy, args.plant, args.out / args.name)
+                    )
                     with open(lines, "a") as out:
                         out.write(json.dumps(found[-1]) + "\n")
                     print(json.dumps(found[-1]), flush=True)
@@ -63,21 +84,30 @@ def series(args: argparse.Namespace) -> list[dict]:
 
 def table(record: dict) -> str:
     """A record as a table of Markdown: mean, greatest error [m], and how many landed."""
-    out = ["| | " + " | ".join(f"{d:g} m" for d in sorted(DISTANCES)) + " |", "|---|" + "---|" * len(DISTANCES)]
+    out = [
+        "| | " + " | ".join(f"{d:g} m" for d in sorted(DISTANCES)) + " |",
+        "|---|" + "---|" * len(DISTANCES),
+    ]
     for name, one in record.items():
         for where, words in (("firmware", "through the firmware"), ("own", "on our own block")):
             cells = []
             for distance in sorted(DISTANCES):
-                throws = [t for t in one["throws"] if t["where"] == where and t["distance"] == distance]
+                throws = [
+                    t for t in one["throws"] if t["where"] == where and t["distance"] == distance
+                ]
                 errors = [t["error"] for t in throws if t["error"] is not None]
-                told = f"{np.mean(errors):.3f} m (to {max(errors):.3f})" if errors else "none landed"
+                told = (
+                    f"{np.mean(errors):.3f} m (to {max(errors):.3f})" if errors else "none landed"
+                )
                 cells.append(f"{told}, {len(errors)} of {len(throws)}")
             out.append(f"| {name}, {one['policy']}, {words} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 
 
 def draw(path: Path, record: dict) -> None:
-    """Draw where the throws through the firmware landed: a panel a distance, the goal in the middle."""
+    """Draw where the throws through the firmware landed: a panel a distance, the goal in the
+    middle.
+    """
     from visthrow.common import style
 
     style.use()
@@ -86,13 +116,23 @@ def draw(path: Path, record: dict) -> None:
     figure, axes = plt.subplots(1, len(DISTANCES), figsize=(9.6, 2.7), sharex=True, sharey=True)
     for axis, distance in zip(axes, sorted(DISTANCES)):
         for i, one in enumerate(record.values()):
-            points = [t["landing_w"] for t in one["throws"] if t["where"] == "firmware" and t["distance"] == distance]
+            points = [
+                t["landing_w"]
+                for t in one["throws"]
+                if t["where"] == "firmware" and t["distance"] == distance
+            ]
             x, y = 100.0 * (np.array(points)[:, :2] - [distance, 0.0]).T
             axis.plot(x, y, "ox"[i % 2], color=style.COLOURS[i], ms=4.5, label=one["policy"])
         axis.add_patch(plt.Circle((0.0, 0.0), 3.0, fill=False, color=style.INK, lw=0.8))
         axis.set(xlabel="beyond the goal [cm]", title=f"{distance:g} m", aspect="equal")
     axes[0].set_ylabel("to the left [cm]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=len(record), fontsize=8, bbox_to_anchor=(0.5, -0.07))
+    figure.legend(
+        *axes[0].get_legend_handles_labels(),
+        loc="lower center",
+        ncols=len(record),
+        fontsize=8,
+        bbox_to_anchor=(0.5, -0.07),
+    )
     figure.tight_layout()
     figure.savefig(path, dpi=110, bbox_inches="tight")
 
@@ -100,18 +140,32 @@ def draw(path: Path, record: dict) -> None:
 def main() -> None:
     """Show the record, or make a series of it anew."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--name", choices=("gains", "after"), help="of the series to fly; left out: show the record")
-    parser.add_argument("--policy", default="vision_betaflight", help="that throws: a shipped name or a file")
-    parser.add_argument("--plant", default="vision", help="policy whose vehicle is behind the firmware")
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="throws of each distance (default: 20)")
+    parser.add_argument(
+        "--name", choices=("gains", "after"), help="of the series to fly; left out: show the record"
+    )
+    parser.add_argument(
+        "--policy", default="vision_betaflight", help="that throws: a shipped name or a file"
+    )
+    parser.add_argument(
+        "--plant", default="vision", help="policy whose vehicle is behind the firmware"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=20, metavar="N", help="throws of each distance (default: 20)"
+    )
     parser.add_argument("--distances", type=float, nargs="+", default=DISTANCES)
     parser.add_argument("--out", type=Path, default=Path("out/loop"))
-    parser.add_argument("--record", action="store_true", help="keep the series in the committed record")
+    parser.add_argument(
+        "--record", action="store_true", help="keep the series in the committed record"
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the record's landings")
     args = parser.parse_args()
     record = json.loads(RECORD.read_text())
     if args.name:
-        made = {"policy": Path(args.policy).stem, "commit": provenance.commit(), "throws": series(args)}
+        made = {
+            "policy": Path(args.policy).stem,
+            "commit": provenance.commit(),
+            "throws": series(args),
+        }
         record["loop"] = {**record.get("loop", {}), args.name: made}
         if args.record:
             RECORD.write_text(json.dumps(record, indent=1) + "\n")

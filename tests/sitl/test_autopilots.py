@@ -1,12 +1,13 @@
-"""The same suite against real autopilots in software: connect, audit, arm, a step of a body rate, the release, the hold.
+"""The same suite against real autopilots in software: connect, audit, arm, a step of a body rate,
+the release, the hold.
 
 Each is run where its address stands in the environment, and fails where nothing answers there:
 
     VISTHROW_SITL_ARDUPILOT=tcp:127.0.0.1:5760     arducopter --model quad, or sim_vehicle.py
     VISTHROW_SITL_PX4=udp:127.0.0.1:14540          PX4's offboard port, make px4_sitl sihsim_quadx
 
-They prove protocol, order and failsafes; nothing of aerodynamics, cable or policy. Betaflight's firmware has tests of its own beside these.
-"""
+They prove protocol, order and failsafes; nothing of aerodynamics, cable or policy. Betaflight's
+firmware has tests of its own beside these."""
 
 import os
 import time
@@ -30,7 +31,9 @@ ANSWER = 15.0
 """Time in which an autopilot that runs says something [s]."""
 
 STEP, HALF_STEP = 1.5, 0.25
-"""Body rate that is asked for [rad/s], and the time in which half of it must be there [s]: 55 to 98 ms were measured."""
+"""Body rate that is asked for [rad/s], and the time in which half of it must be there [s]: 55 to 98
+ms were measured.
+"""
 
 PERIOD = 0.02
 """Between two commands [s]."""
@@ -40,7 +43,9 @@ POSITION = 60.0
 """ArduPilot's estimator takes so long at most to know where the vehicle is [s]."""
 
 HOVER_SHARE = {"ardupilot": ("ardupilot.thrust.hover=0.39",), "px4": ()}
-"""Of the vehicle in the autopilot's own software: with the fakes' share it does not lift, or shoots away."""
+"""Of the vehicle in the autopilot's own software: with the fakes' share it does not lift, or shoots
+away.
+"""
 
 
 class Bench:
@@ -52,7 +57,9 @@ class Bench:
             pytest.skip(f"VISTHROW_SITL_{kind.upper()} is not set")
         names = {"ardupilot": "fake", "px4": "fake_px4"}
         self.kind = kind
-        self.params = config.load(HilParams, config.find("hil", names[kind]), (*HOVER_SHARE[kind], *overrides))
+        self.params = config.load(
+            HilParams, config.find("hil", names[kind]), (*HOVER_SHARE[kind], *overrides)
+        )
         port = open_port(check_device(address))
         self.rates, self.placed = [], False
         self.tables: list[str] = []
@@ -91,7 +98,17 @@ class Bench:
     def connect(self):
         assert self.turn(ANSWER, until=self.heard), "nothing answers"
         for number in (mav.MAVLINK_MSG_ID_ATTITUDE, mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW):
-            values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 10_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            values = (
+                mav.MAV_CMD_SET_MESSAGE_INTERVAL,
+                0,
+                number,
+                10_000.0,
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+            )
             self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
         self.turn(ANSWER, until=lambda: self.backend.audit.done)
         if self.kind == "ardupilot":
@@ -143,10 +160,23 @@ def test_clocks_are_known(bench, kind):
 
 
 def flying(desk, placed=False):
-    """Taken over and armed, commands followed; on the ground, with a thrust that does not lift. ``placed``: its position is known."""
+    """Taken over and armed, commands followed; on the ground, with a thrust that does not lift.
+
+    ``placed``: its position is known.
+    """
     params = getattr(desk.params, desk.kind)
     if placed and desk.kind == "ardupilot":
-        values = (mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 100_000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        values = (
+            mav.MAV_CMD_SET_MESSAGE_INTERVAL,
+            0,
+            mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+            100_000.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        )
         desk.link.send(mav.MAVLink_command_long_message(1, 1, *values))
         assert desk.turn(POSITION, until=lambda: desk.placed), "no position"
     idle = (0.3 * params.thrust.weight, 0.0, 0.0, 0.0)
@@ -157,13 +187,21 @@ def flying(desk, placed=False):
 
 
 TAKE = {
-    "ardupilot": ("ardupilot.take=true", "ardupilot.arm=true", "ardupilot.follow_mode=20", "ardupilot.audit=false"),
+    "ardupilot": (
+        "ardupilot.take=true",
+        "ardupilot.arm=true",
+        "ardupilot.follow_mode=20",
+        "ardupilot.audit=false",
+    ),
     "px4": ("px4.arm=true", "px4.audit=false"),
 }
 """Bench settings: the runner arms; GUIDED_NOGPS needs no position."""
 
 WRITTEN = {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "SERVO9_FUNCTION": 0.0}
-"""Of ArduPilot: without the first a thrust is a climb rate. Not what the audit wants of its position: here it comes from a GPS."""
+"""Of ArduPilot: without the first a thrust is a climb rate.
+
+Not what the audit wants of its position: here it comes from a GPS.
+"""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -200,7 +238,9 @@ def test_the_release_is_answered_and_moves(bench, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_autopilots_own_hold_takes_over(bench, kind):
-    """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its estimator is fed with."""
+    """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its
+    estimator is fed with.
+    """
     more = ("ardupilot.hold_mode=5", "ardupilot.follow_mode=4") if kind == "ardupilot" else ()
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind], *more)
     params = flying(desk, placed=True)

@@ -1,9 +1,10 @@
-"""Betaflight's own firmware flies the simulated vehicle: take-over, steps, a whole throw with release and recovery, silence.
+"""Betaflight's own firmware flies the simulated vehicle: take-over, steps, a whole throw with
+release and recovery, silence.
 
-``make test-sitl`` builds the firmware (the package `betaflight` holds its sources; GPL-3, a tool of these tests alone) and runs
-this file in a network of its own. Its clock goes in lock step with the vehicle; where two processes fly, both are paced to
-``VISTHROW_SITL_SPEED`` of real time, 0.5 where it is not set.
-"""
+``make test-sitl`` builds the firmware (the package `betaflight` holds its sources; GPL-3, a tool of
+these tests alone) and runs this file in a network of its own. Its clock goes in lock step with the
+vehicle; where two processes fly, both are paced to ``VISTHROW_SITL_SPEED`` of real time, 0.5 where
+it is not set."""
 
 import json
 import os
@@ -45,7 +46,9 @@ STEP = np.array([1.5, 1.5, 1.0])
 """Rates that are asked for about x, y, z [rad/s]."""
 
 HALF_STEP = 0.15
-"""Time to half of a step [s]: 55 to 90 ms were measured; a period of the commands and a late machine besides."""
+"""Time to half of a step [s]: 55 to 90 ms were measured; a period of the commands and a late
+machine besides.
+"""
 
 STIFF = {"p": "11", "i": "20", "d": "8", "d_max": "8"}
 """Gains of roll and pitch that hold a rate against the swinging ball."""
@@ -54,19 +57,30 @@ FASTER, SETTLED, RAMP = 20.0, 0.03, 0.15
 """Angular acceleration [rad/s^2], from when to when its answer is looked at [s]."""
 
 LEAD = 5 * 0.000529 / (5 * 0.032029) - 1.0 / (2.0 * np.pi * 250.0) - 1.0 / (2.0 * np.pi * 500.0)
-"""Of the output before the rate while it grows, 15.6 ms: D over P of roll (pid.h), less what the gyro's two filters cost [s]."""
+"""Of the output before the rate while it grows, 15.6 ms:
+
+D over P of roll (pid.h), less what the gyro's two filters cost [s].
+"""
 
 OTHERS = 0.25
-"""Rate of the other axes beside a step, as a share of it: 0.03 of 1.5 rad/s were measured on a quiet machine."""
+"""Rate of the other axes beside a step, as a share of it: 0.03 of 1.5 rad/s were measured on a
+quiet machine.
+"""
 
 LIFT = 0.25
-"""Share by which a step of thrust may differ from what was asked for: the battery's voltage has changed since the calibration."""
+"""Share by which a step of thrust may differ from what was asked for: the battery's voltage has
+changed since the calibration.
+"""
 
 IDLE, DISARM = (0.2, 0.6), (1.0, 2.5)
-"""Silence after which the motors idle and after which it disarms [s]: 0.36 and 1.6 s were measured."""
+"""Silence after which the motors idle and after which it disarms [s]: 0.36 and 1.6 s were measured.
+"""
 
 MISS = 0.35
-"""Of a landing [m]; a payload that just hangs is 2 m off. Throws on a quiet machine land 0.02 to 0.15 m off."""
+"""Of a landing [m]; a payload that just hangs is 2 m off.
+
+Throws on a quiet machine land 0.02 to 0.15 m off.
+"""
 
 ON = 10.0
 """Flown on after a landing [s]: the runner hovers again 3 s and has landed 6 s after it."""
@@ -106,7 +120,9 @@ class Bench:
         self.firmware.start()
         self.plant = make_motors("vision", 0)
         nobody = Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID)
-        self.fake = BetaflightSitl(self.plant, nobody, MocapParams(), 0, Options(), self.params, self.firmware.stands)
+        self.fake = BetaflightSitl(
+            self.plant, nobody, MocapParams(), 0, Options(), self.params, self.firmware.stands
+        )
         self.backend = Betaflight(open_port(check_device(self.params.device)), self.params)
         self.fake.sensors.start()
         self._next = 0.0
@@ -118,7 +134,9 @@ class Bench:
         while self.plant.time < end:
             self.fake.step()
             now = self.plant.time
-            self.rows.append((now, *self.plant.rate_b, self.plant.force_b[2], self.fake.motors.sum()))
+            self.rows.append(
+                (now, *self.plant.rate_b, self.plant.force_b[2], self.fake.motors.sum())
+            )
             if now >= self._next:
                 self._next = now + TICK
                 if command is not None:
@@ -138,7 +156,9 @@ class Bench:
         assert self.turn(10.0, idle, until=known), "the firmware answers on both ports"
         following = lambda: self.backend.status(self.plant.time).mode == FOLLOW  # noqa: E731
         assert self.turn(10.0, idle, FOLLOW, until=following), self.backend.status(self.plant.time)
-        assert self.turn(3.0, hover, until=lambda: not self.plant.held), f"motors {self.fake.motors}"
+        assert self.turn(3.0, hover, until=lambda: not self.plant.held), (
+            f"motors {self.fake.motors}"
+        )
         self.turn(0.4, hover)
         return hover
 
@@ -157,7 +177,9 @@ def bench(tmp_path, settings):
 
 @pytest.fixture
 def stiff(tmp_path):
-    """With `STIFF` gains: those of the throws hold no rate against the ball, as the training's do not."""
+    """With `STIFF` gains: those of the throws hold no rate against the ball, as the training's do
+    not.
+    """
     params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
     gains = {f"{gain}_{axis}": value for axis in ("roll", "pitch") for gain, value in STIFF.items()}
     folder = tmp_path / "stiff"
@@ -191,7 +213,10 @@ def test_it_is_taken_armed_and_follows_steps(stiff):
             rate = sign * rows[:, 1 + axis] / STEP[axis]
             half = rows[np.argmax(rate > 0.5), 0] - begun
             reached, others = rate[-25:].mean(), np.delete(rows[-25:, 1:4], axis, 1)
-            print(f"{name} {sign * STEP[axis]:+.1f} rad/s: reached {reached:.2f}, half after {1e3 * half:.0f} ms")
+            print(
+                f"{name} {sign * STEP[axis]:+.1f} rad/s: reached {reached:.2f}, half after"
+                f" {1e3 * half:.0f} ms"
+            )
             assert (rate > 0.5).any()
             assert half < HALF_STEP
             assert 0.8 < reached < 1.3
@@ -207,7 +232,9 @@ def test_it_is_taken_armed_and_follows_steps(stiff):
 
 
 def test_its_d_and_its_gyro_are_those_of_its_settings(bench):
-    """The vehicle turns faster and faster: motors lead its rate by D and lag it by the gyro's filters. A sample a period: 11.1 ms."""
+    """The vehicle turns faster and faster: motors lead its rate by D and lag it by the gyro's
+    filters. A sample a period: 11.1 ms.
+    """
     hover, plant, rows = bench.take(), bench.plant, []
 
     def turned(motors, *_):
@@ -239,7 +266,9 @@ def test_silence_idles_the_motors_and_disarms(bench):
 
 
 def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeypatch):
-    """The runner with its link, the firmware and the vehicle on one clock, down to the ground: what a busy machine cannot change."""
+    """The runner with its link, the firmware and the vehicle on one clock, down to the ground: what
+    a busy machine cannot change.
+    """
     monkeypatch.setattr(sys.modules[throw.__module__], "AFTER", ON)
     shutil.copytree(settings[0], tmp_path / "settings")
     params = config.load(HilParams, config.find("hil", "betaflight_sitl"))
@@ -254,9 +283,16 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
     assert one["separation_time"] == again["separation_time"]
     assert one["releases"] == 1
     assert error < MISS
-    ticks = (json.loads(line) for line in (tmp_path / "first" / "run" / "ticks.jsonl").read_text().splitlines())
+    ticks = (
+        json.loads(line)
+        for line in (tmp_path / "first" / "run" / "ticks.jsonl").read_text().splitlines()
+    )
     ends = dict.fromkeys((tick["state"], tick["reason"]) for tick in ticks)
-    assert list(ends)[-3:] == [("recover", "separated"), ("land", "hovering again"), ("done", "landed")]
+    assert list(ends)[-3:] == [
+        ("recover", "separated"),
+        ("land", "hovering again"),
+        ("done", "landed"),
+    ]
     assert (tmp_path / "first" / "run" / "throw-01.npz").exists()
     assert list((tmp_path / "first").glob("LOG*")), "the firmware wrote its blackbox"
 
@@ -264,15 +300,22 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
 @pytest.mark.parametrize("state", endings.STATES)
 @pytest.mark.parametrize("way", [*endings.REASONS, "output raises", "SIGINT twice"])
 def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeypatch):
-    """In hover and in a throw: the runner descends, except where it is gone at once, and the firmware disarms when it falls silent."""
+    """In hover and in a throw: the runner descends, except where it is gone at once, and the
+    firmware disarms when it falls silent.
+    """
     shutil.copytree(settings[0], tmp_path / "settings")
-    abort = 1.2 if way == "source raises" else 1.5  # [s]; without poses nothing is sent, and after 1.5 s the firmware would disarm
+    abort = (
+        1.2 if way == "source raises" else 1.5
+    )  # [s]; without poses nothing is sent, and after 1.5 s the firmware would disarm
     overrides = (*endings.QUICK, f"states.abort={abort}", *endings.STATES[state])
     params = config.load(HilParams, config.find("hil", "betaflight_sitl"), overrides)
     monkeypatch.setattr(endings, "OVER", OVER[state])
     if way == "SIGINT twice":
         endings.twice(monkeypatch)
-    reason = {"output raises": "BrokenPipeError: nobody reads", "SIGINT twice": endings.REASONS["SIGINT"]} | endings.REASONS
+    reason = {
+        "output raises": "BrokenPipeError: nobody reads",
+        "SIGINT twice": endings.REASONS["SIGINT"],
+    } | endings.REASONS
     plant = make_motors("vision", 0)
     with opened(program(), tmp_path / way, params, endings.NEVER, plant, MocapParams(), 0) as parts:
         run = endings.Told(way.split(" twice")[0], state, parts, monkeypatch)
@@ -280,7 +323,10 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
         assert fake.armed, "up to the end of the run"
         low = plant.state["pos_w"][2]
         clock.sleep_until(clock.now() + DISARM[1])
-    print(f"\n{way}, {state}: {run.summary['reason']}, {low - run.heights.get('abort', low):+.2f} m, {fake.events}")
+    print(
+        f"\n{way}, {state}: {run.summary['reason']}, {low - run.heights.get('abort', low):+.2f} m,"
+        f" {fake.events}"
+    )
     assert run.summary["aborted"]
     assert reason[way] in run.summary["reason"]
     assert fake.report()["releases"] == 0
@@ -304,20 +350,49 @@ def wait_for(process, words):
 
 
 def test_a_whole_throw(tmp_path):
-    """Take-over, throw, release, recovery and landing with the page's two commands; the error is printed."""
+    """Take-over, throw, release, recovery and landing with the page's two commands; the error is
+    printed.
+    """
     report, folder = tmp_path / "report.json", tmp_path / "firmware"
     bridge = visthrow(
-        "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(folder), "--policy",
-        "vision", "--speed", str(SPEED), "--after", "9", "--out", str(report), stderr=subprocess.PIPE,
+        "hil",
+        "fake",
+        "--kind",
+        "betaflight-sitl",
+        "--firmware",
+        str(program()),
+        "--folder",
+        str(folder),
+        "--policy",
+        "vision",
+        "--speed",
+        str(SPEED),
+        "--after",
+        "9",
+        "--out",
+        str(report),
+        stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
     runner = None
     try:
         wait_for(bridge, "it flies")
         runner = visthrow(
-            "hil", "run", "--config", "betaflight_sitl", "--auto-arm", "--bare", "--speed", str(SPEED), "--out",
-            str(tmp_path / "run"), "--set", "realtime.priority=10", stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+            "hil",
+            "run",
+            "--config",
+            "betaflight_sitl",
+            "--auto-arm",
+            "--bare",
+            "--speed",
+            str(SPEED),
+            "--out",
+            str(tmp_path / "run"),
+            "--set",
+            "realtime.priority=10",
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
         told, states = runner.communicate(timeout=LONG)
         bridge.communicate(timeout=LONG)
     finally:
@@ -327,34 +402,62 @@ def test_a_whole_throw(tmp_path):
     error = float(np.hypot(found["landing_w"][0] - 2.0, found["landing_w"][1]))
     lag = found["separation_time"] - found["release_time"]
     late = found["late_periods"] / (found["time"] / 0.002)
-    print(f"\nlanding error {error:.3f} m, {100 * late:.1f} % of the periods late, loop {found['loop_us']:.0f} us, {lag:.3f} s")
+    print(
+        f"\nlanding error {error:.3f} m, {100 * late:.1f} % of the periods late, loop"
+        f" {found['loop_us']:.0f} us, {lag:.3f} s"
+    )
     print(told.splitlines()[0])
     assert found["releases"] == 1
     assert error < MISS, states
     assert "recover" in states
-    # Late commands may let the fence foresee a braking point below the ground: the runner then lands at once. On time it hovers again, as
-    # the throws in lock step say.
+    # Late commands may let the fence foresee a braking point below the ground: the runner then
+    # lands at once. On time it hovers again, as the throws in lock step say.
     assert "hovering again" in states or "after the throw, fence" in states
     assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
 
 
 @pytest.mark.parametrize("state", endings.STATES)
 def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path, state):
-    """SIGKILL in hover and in a throw: the motors stop and it disarms, with nothing of the runner left."""
+    """SIGKILL in hover and in a throw: the motors stop and it disarms, with nothing of the runner
+    left.
+    """
     endings.NEVER.save(tmp_path / "never.npz")
     overrides = (f'policy="{tmp_path / "never.npz"}"', *endings.QUICK, *endings.STATES[state])
     report, run = tmp_path / "report.json", tmp_path / "run"
     bridge = visthrow(
-        "hil", "fake", "--kind", "betaflight-sitl", "--firmware", str(program()), "--folder", str(tmp_path / "firmware"),
-        "--speed", str(SPEED), "--out", str(report), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+        "hil",
+        "fake",
+        "--kind",
+        "betaflight-sitl",
+        "--firmware",
+        str(program()),
+        "--folder",
+        str(tmp_path / "firmware"),
+        "--speed",
+        str(SPEED),
+        "--out",
+        str(report),
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+    )
     runner = None
     try:
         wait_for(bridge, "it flies")
         runner = visthrow(
-            "hil", "run", "--config", "betaflight_sitl", "--auto-arm", "--bare", "--speed", str(SPEED), "--out", str(run),
-            *(word for text in overrides for word in ("--set", text)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-        )  # fmt: skip
+            "hil",
+            "run",
+            "--config",
+            "betaflight_sitl",
+            "--auto-arm",
+            "--bare",
+            "--speed",
+            str(SPEED),
+            "--out",
+            str(run),
+            *(word for text in overrides for word in ("--set", text)),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
         wait_for(runner, f" s  {state} ")
         time.sleep(0.3 / SPEED)
         runner.kill()

@@ -15,13 +15,17 @@ def same_bits(one_thread):
 
 @pytest.fixture(autouse=True)
 def few_throws(monkeypatch):
-    """An evaluation throws 20 times for 200: that it is made, written and printed does not hang on how many."""
+    """An evaluation throws 20 times for 200: that it is made, written and printed does not hang on
+    how many.
+    """
     monkeypatch.setattr(trainer, "EVALUATED", 20)
 
 
 @pytest.fixture
 def signalled(monkeypatch):
-    """Function that runs a command's training of four iterations, sends a signal in the second, and resumes it."""
+    """Function that runs a command's training of four iterations, sends a signal in the second, and
+    resumes it.
+    """
 
     def run(algorithm, words, number):
         learn = algorithm.learn

@@ -1,4 +1,6 @@
-"""`visthrow detector`: a training of two steps, resumed; keypoints from rendered pictures in a flight; what is refused."""
+"""`visthrow detector`: a training of two steps, resumed; keypoints from rendered pictures in a
+flight; what is refused.
+"""
 
 from types import SimpleNamespace
 
@@ -21,7 +23,8 @@ from visthrow.view.eyes import HANGING, Eyes
 
 SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
 NEAR = {"contours": 0.01, "learnt": 0.015}
-"""Of a keypoint that is found on a clean picture from where it projects to [-]: 3 and 5 px of 320."""
+"""Of a keypoint that is found on a clean picture from where it projects to [-]: 3 and 5 px of 320.
+"""
 
 
 def train(folder, *words: str) -> int:
@@ -52,19 +55,38 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
     rope = config.load(RopeParams, config.find("rope", "paper"))
-    eyes = Eyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 3, by=by, nuisances=Nuisances(*(0.0,) * 8), keep=True)
+    eyes = Eyes(
+        camera,
+        rope.mount,
+        rope.length + rope.payload_offset,
+        1,
+        3,
+        by=by,
+        nuisances=Nuisances(*(0.0,) * 8),
+        keep=True,
+    )
     zero = np.zeros((1, 3))
     now = SimpleNamespace(
-        pos_w=np.array([[0.0, 0.0, 1.3]]), quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]), vel_w=zero, rate_b=zero,
-        payload_pos_w=np.array([[0.05, -0.03, 0.93]]), payload_vel_w=zero, time=0.0,
-    )  # fmt: skip
+        pos_w=np.array([[0.0, 0.0, 1.3]]),
+        quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]),
+        vel_w=zero,
+        rate_b=zero,
+        payload_pos_w=np.array([[0.05, -0.03, 0.93]]),
+        payload_vel_w=zero,
+        time=0.0,
+    )
     goal = np.array([[1.0, 0.2, 0.0]])
     points, valid = eyes.look(now, now, goal, np.array([True]))
     pilot = KeypointCamera(camera, dtype=torch.float64)
     quat = torch.tensor(now.quat_wb / np.linalg.norm(now.quat_wb))
     from visthrow.onboard.observations import rotation_from_quat
 
-    tensors = torch.tensor(now.pos_w), rotation_from_quat(quat), torch.tensor(goal), torch.tensor(now.payload_pos_w)
+    tensors = (
+        torch.tensor(now.pos_w),
+        rotation_from_quat(quat),
+        torch.tensor(goal),
+        torch.tensor(now.payload_pos_w),
+    )
     true, _ = keypoints(pilot, *tensors)
     assert valid.all()
     assert np.abs(points - true.numpy()).max() < NEAR[by]
@@ -74,7 +96,9 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
 
 
 class Blind:
-    """Eyes that see nothing, and say of some vehicles that they do not; counts how often they are asked."""
+    """Eyes that see nothing, and say of some vehicles that they do not; counts how often they are
+    asked.
+    """
 
     def __init__(self, lost=None) -> None:
         self.looks, self.seen, self._lost = 0, None, lost or {}
@@ -116,11 +140,15 @@ def test_a_throw_is_refused_where_the_hover_does_not_see(name):
 
 def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
     """The ball hangs 0.4 m below the first lens and flies 1.5 m beside the second."""
-    rot = torch.linalg.qr(torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    rot = torch.linalg.qr(
+        torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )[0]
     ball = torch.tensor([[0.1, 0.2, 0.3], [1.5, 0.0, 0.1]], dtype=torch.float64)
     truth = Truth(ball, torch.zeros(2, 4, 3), rot, torch.ones(2), torch.ones(2))
     asked = [("nothing", 0), ("pose", 1), ("track", 0), ("track", 1)]
-    nothing, pose, *tracks = (detector.known_of(known, truth, 1.2, e, np.random.default_rng(e)) for known, e in asked)
+    nothing, pose, *tracks = (
+        detector.known_of(known, truth, 1.2, e, np.random.default_rng(e)) for known, e in asked
+    )
     assert nothing == Known()
     np.testing.assert_allclose([pose.up_c, pose.north_c], rot[1, [2, 0]])
     assert (pose.height, pose.ball_ray_c, pose.ball_distance) == (1.2, None, None)

@@ -1,4 +1,6 @@
-"""Distillation: it learns, its policy remembers on board as in training, and it goes on bit for bit after a stop."""
+"""Distillation: it learns, its policy remembers on board as in training, and it goes on bit for bit
+after a stop.
+"""
 
 import signal
 
@@ -14,11 +16,18 @@ from visthrow.training.distillation import Distillation
 from visthrow.training.env import ThrowEnv
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
-SMALL = ['algorithm="distillation"', "ppo.environments=48", "distillation.hidden=64", "distillation.memory=32"]
+SMALL = [
+    'algorithm="distillation"',
+    "ppo.environments=48",
+    "distillation.hidden=64",
+    "distillation.memory=32",
+]
 FLOWN = 25
 """Control steps that the memory is compared over."""
 AGREES = 2e-5
-"""Of float32 between torch's recurrent layer and the exported step, and between a batch and single throws."""
+"""Of float32 between torch's recurrent layer and the exported step, and between a batch and single
+throws.
+"""
 
 
 def overrides(*extra):
@@ -26,8 +35,24 @@ def overrides(*extra):
 
 
 def words(folder, *extra):
-    sets = overrides("task.observation.located=true", "distillation.iterations=4", "distillation.horizon=12", "task.bounds.time_limit=0.4")
-    return ["train", "vision_ideal", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
+    sets = overrides(
+        "task.observation.located=true",
+        "distillation.iterations=4",
+        "distillation.horizon=12",
+        "task.bounds.time_limit=0.4",
+    )
+    return [
+        "train",
+        "vision_ideal",
+        "--device",
+        "cpu",
+        "--out",
+        str(folder),
+        "--checkpoint-every",
+        "1",
+        *sets,
+        *extra,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +66,15 @@ def whole(tmp_path_factory):
 
 def trained(iterations, sign=1.0):
     """Trainer after so many iterations of a short schedule; ``sign`` turns every gradient."""
-    sets = (*SMALL[:2], "distillation.iterations=14", "distillation.horizon=60", "distillation.hidden=128", "distillation.memory=64",
-            "distillation.epochs=2", "distillation.learning_rate=0.005")  # fmt: skip
+    sets = (
+        *SMALL[:2],
+        "distillation.iterations=14",
+        "distillation.horizon=60",
+        "distillation.hidden=128",
+        "distillation.memory=64",
+        "distillation.epochs=2",
+        "distillation.learning_rate=0.005",
+    )
     trainer = Trainer(config.load(Experiment, config.find("train", "vision_ideal"), sets), "cpu", 1)
     for parameter in trainer.algorithm.network.parameters():
         parameter.register_hook(lambda gradient: sign * gradient)
@@ -51,7 +83,9 @@ def trained(iterations, sign=1.0):
 
 
 def test_it_learns():
-    """A dozen rollouts of 48 throws teach it to throw; with the gradient's sign turned they do not."""
+    """A dozen rollouts of 48 throws teach it to throw; with the gradient's sign turned
+    they do not.
+    """
     trainer, losses = trained(14)
     assert losses[-1] < 0.5 * losses[0]
     summary = trainer.throw(2.0, 64).summary()
@@ -75,10 +109,16 @@ def test_the_exported_policy_remembers_as_the_network_does(whole):
 
 
 def test_the_pilot_remembers_as_training_does(whole):
-    """The same commands from poses on board as from the environment's observations, with a memory that starts anew."""
+    """The same commands from poses on board as from the environment's observations, with a memory
+    that starts anew.
+    """
     noise = ("observation_step", "observation_bias", "command_step", "command_bias")
-    quiet = [*(f"task.noise.{name}=0.0" for name in noise), "camera.noise.step_std=0.0", "camera.noise.bias_std=0.0",
-             "task.observation.latency=[0.0,0.0]"]  # fmt: skip
+    quiet = [
+        *(f"task.noise.{name}=0.0" for name in noise),
+        "camera.noise.step_std=0.0",
+        "camera.noise.bias_std=0.0",
+        "task.observation.latency=[0.0,0.0]",
+    ]
     experiment = config.load(Experiment, whole / "config.toml", quiet)
     policy = Policy.load(whole / "policy.npz")
     env, pilot = ThrowEnv(experiment, "cpu", 3, 3), Pilot(policy, experiment.camera, 3)
@@ -88,7 +128,12 @@ def test_the_pilot_remembers_as_training_does(whole):
         for _ in range(8):
             state = {key: value.numpy().copy() for key, value in env.views.state.items()}
             views = [state[key] for key in ("pos_w", "quat_wb", "vel_w", "rate_b")]
-            out = pilot.act(*views, env.views.out["payload_pos_w"].numpy().copy(), env.views.goal_w.numpy().copy(), state["attached"])
+            out = pilot.act(
+                *views,
+                env.views.out["payload_pos_w"].numpy().copy(),
+                env.views.goal_w.numpy().copy(),
+                state["attached"],
+            )
             action = act(seen)
             np.testing.assert_allclose(out.action, action.clamp(-1.0, 1.0).numpy(), atol=AGREES)
             seen = env.carry(action)["actor"]
@@ -113,7 +158,11 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
     assert "the policy is one with a memory" in capsys.readouterr().err
     # as it was trained
-    late = ("task.observation.latency=[0.004,0.04]", "task.observation.latency_jitter=0.004", "task.observation.response=8")
+    late = (
+        "task.observation.latency=[0.004,0.04]",
+        "task.observation.latency_jitter=0.004",
+        "task.observation.response=8",
+    )
     assert cli.main([*words(tmp_path / "b"), "--from", "vision", *overrides(*late)]) == 2
     assert "the policy is one without a memory" in capsys.readouterr().err
 
@@ -127,6 +176,19 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     ],
 )
 def test_what_cannot_be_distilled_is_refused(tmp_path, capsys, change, said):
-    assert cli.main(["train", "vision", "--device", "cpu", "--out", str(tmp_path / "run"), *overrides(change)]) == 2
+    assert (
+        cli.main(
+            [
+                "train",
+                "vision",
+                "--device",
+                "cpu",
+                "--out",
+                str(tmp_path / "run"),
+                *overrides(change),
+            ]
+        )
+        == 2
+    )
     assert said in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

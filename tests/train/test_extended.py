@@ -21,14 +21,39 @@ SMALL = ["ppo.environments=12", "ppo.steps=4", "ppo.hidden=[8]", "ppo.minibatche
 def test_training_in_an_extended_simulator():
     """Two iterations with effects, plants drawn from what is uncertain of them, and a law."""
     plain = config.load(Experiment, config.find("train", "state"), SMALL)
-    loose = DiagnosedParams(("payload_drag", "com_x", "release_lag"), ((1e-8, 0.0, 0.0), (0.0, 1e-8, 0.0), (0.0, 0.0, 1e-6)), 4)
-    found = extended(plain, {"payload_drag": 1e-3, "com_x": 1e-3, "motor_tau_down": 0.01, "kick_along": 0.1, "wind_x": 0.2,
-                             "payload_side": 1e-4, "rope_elastic": 1e-3})  # fmt: skip
+    loose = DiagnosedParams(
+        ("payload_drag", "com_x", "release_lag"),
+        ((1e-8, 0.0, 0.0), (0.0, 1e-8, 0.0), (0.0, 0.0, 1e-6)),
+        4,
+    )
+    found = extended(
+        plain,
+        {
+            "payload_drag": 1e-3,
+            "com_x": 1e-3,
+            "motor_tau_down": 0.01,
+            "kick_along": 0.1,
+            "wind_x": 0.2,
+            "payload_side": 1e-4,
+            "rope_elastic": 1e-3,
+        },
+    )
     trainer = Trainer(dataclasses.replace(found, laws=(LAW,), diagnosed=loose), "cpu", 0)
     figures = [trainer.step() for _ in range(2)]
     assert all(np.isfinite(f["value"]) for f in figures)
-    assert trainer.algorithm.env.sim.extensions >= {"payload_drag", "wind", "kick", "push", "payload_spin", "compliance"}
-    assert len(trainer.algorithm.env.sim._vehicles.numpy()) == len(trainer.algorithm.env.sim._ropes.numpy()) > 4
+    assert trainer.algorithm.env.sim.extensions >= {
+        "payload_drag",
+        "wind",
+        "kick",
+        "push",
+        "payload_spin",
+        "compliance",
+    }
+    assert (
+        len(trainer.algorithm.env.sim._vehicles.numpy())
+        == len(trainer.algorithm.env.sim._ropes.numpy())
+        > 4
+    )
 
 
 @pytest.mark.slow

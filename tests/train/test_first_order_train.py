@@ -1,4 +1,6 @@
-"""First-order training through the command: what it leaves behind, and that it goes on bit for bit however it was stopped."""
+"""First-order training through the command: what it leaves behind, and that it goes on bit for bit
+however it was stopped.
+"""
 
 import os
 import signal
@@ -16,19 +18,39 @@ from visthrow.task import Experiment, contract_of
 from visthrow.training.first_order.algorithm import FirstOrder
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
-SMALL = ['algorithm="first_order"', "ppo.environments=16", "ppo.hidden=[16,16]", "ppo.minibatches=1",
-         "task.bounds.time_limit=0.4", "first_order.horizon=12", "first_order.iterations=4"]  # fmt: skip
+SMALL = [
+    'algorithm="first_order"',
+    "ppo.environments=16",
+    "ppo.hidden=[16,16]",
+    "ppo.minibatches=1",
+    "task.bounds.time_limit=0.4",
+    "first_order.horizon=12",
+    "first_order.iterations=4",
+]
 PATIENCE = 300.0
 """Longest wait for what takes seconds on an idle machine [s]."""
 
 
 def words(folder, *extra):
     sets = [part for item in SMALL for part in ("--set", item)]
-    return ["train", "state", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1", *sets, *extra]
+    return [
+        "train",
+        "state",
+        "--device",
+        "cpu",
+        "--out",
+        str(folder),
+        "--checkpoint-every",
+        "1",
+        *sets,
+        *extra,
+    ]
 
 
 def same(one, two):
-    weights = [[w.numpy() for w in Policy.load(folder / "policy.npz").weights] for folder in (one, two)]
+    weights = [
+        [w.numpy() for w in Policy.load(folder / "policy.npz").weights] for folder in (one, two)
+    ]
     for a, b in zip(*weights, strict=True):
         np.testing.assert_array_equal(a, b)
     return (two / "progress.csv").read_text().count("\n") == 1 + 4
@@ -66,7 +88,9 @@ def test_killed_it_goes_on(whole, tmp_path):
     """SIGKILL, as a machine without power would."""
     folder = tmp_path / "run"
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    running = subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words(folder)], env=environment)
+    running = subprocess.Popen(
+        [sys.executable, "-m", "visthrow.cli", *words(folder)], env=environment
+    )
     end = time.monotonic() + PATIENCE
     while not (folder / CHECKPOINT).exists():
         assert time.monotonic() < end, "no checkpoint came"
@@ -84,15 +108,19 @@ def test_what_it_cannot_train_is_refused(tmp_path, capsys):
     assert cli.main(words(tmp_path / "b", "--set", "task.target.speed=[0.0,0.5]")) == 2
     assert "stand still" in capsys.readouterr().err
     assert cli.main(words(tmp_path / "c", "--set", 'task.observation.layout="vision"')) == 2
-    assert "layout = \"state\"" in capsys.readouterr().err
+    assert 'layout = "state"' in capsys.readouterr().err
 
 
 @pytest.mark.gpu
 def test_replayed_from_graphs_it_computes_what_it_computes_eagerly():
-    """Six iterations: three that warm up, one that captures, two that replay, with fresh noise each."""
+    """Six iterations: three that warm up, one that captures, two that replay, with fresh noise
+    each.
+    """
 
     def errors(eager):
-        trainer = Trainer(config.load(Experiment, config.find("train", "state"), SMALL), "cuda:0", 1)
+        trainer = Trainer(
+            config.load(Experiment, config.find("train", "state"), SMALL), "cuda:0", 1
+        )
         if eager:
             trainer.algorithm.rollout = trainer.algorithm._fly
         return [trainer.step()["cost"] for _ in range(6)]

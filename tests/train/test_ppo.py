@@ -1,4 +1,6 @@
-"""The update for a GPU computes what rsl_rl's own computes: the same samples, order, losses, gradients, rates."""
+"""The update for a GPU computes what rsl_rl's own computes: the same samples, order, losses,
+gradients, rates.
+"""
 
 import contextlib
 import copy
@@ -20,22 +22,45 @@ from visthrow.training.ranks import Ranks
 ENVIRONMENTS, STEPS, SEEN, KNOWN, ACTIONS = 32, 8, 7, 9, 5
 
 SAME = {"rtol": 2e-4, "atol": 2e-6}
-"""Float32 sums in another order, over some twenty steps of Adam, whose first ones divide by a gradient's own size."""
+"""Float32 sums in another order, over some twenty steps of Adam, whose first ones divide by a
+gradient's own size.
+"""
 
 
 def params(**changes) -> PPOParams:
     table = {
-        "environments": ENVIRONMENTS, "steps": STEPS, "iterations": 10, "hidden": [16, 16], "activation": "elu", "normalize": True,
-        "initial_std": 0.5, "epochs": 3, "minibatches": 4, "learning_rate": 1e-3, "schedule": "adaptive", "desired_kl": 0.01,
-        "final_kl": 0.01, "discount": 0.99, "gae_lambda": 0.95, "clip": 0.2, "entropy": 0.01, "value_coefficient": 1.0,
+        "environments": ENVIRONMENTS,
+        "steps": STEPS,
+        "iterations": 10,
+        "hidden": [16, 16],
+        "activation": "elu",
+        "normalize": True,
+        "initial_std": 0.5,
+        "epochs": 3,
+        "minibatches": 4,
+        "learning_rate": 1e-3,
+        "schedule": "adaptive",
+        "desired_kl": 0.01,
+        "final_kl": 0.01,
+        "discount": 0.99,
+        "gae_lambda": 0.95,
+        "clip": 0.2,
+        "entropy": 0.01,
+        "value_coefficient": 1.0,
         "max_grad_norm": 0.5,
-    }  # fmt: skip
-    text = "\n".join(f"{k} = {str(v).lower() if isinstance(v, bool) else repr(v)}" for k, v in (table | changes).items())
+    }
+    text = "\n".join(
+        f"{k} = {str(v).lower() if isinstance(v, bool) else repr(v)}"
+        for k, v in (table | changes).items()
+    )
     return config.loads(PPOParams, text, (), name="test")
 
 
 def observations(device: str = "cpu") -> TensorDict:
-    drawn = {"actor": 2.0 * torch.randn(ENVIRONMENTS, SEEN) + 1.0, "critic": torch.randn(ENVIRONMENTS, KNOWN)}
+    drawn = {
+        "actor": 2.0 * torch.randn(ENVIRONMENTS, SEEN) + 1.0,
+        "critic": torch.randn(ENVIRONMENTS, KNOWN),
+    }
     return TensorDict(drawn, batch_size=[ENVIRONMENTS]).to(device)
 
 
@@ -45,7 +70,9 @@ def build(p: PPOParams, own: bool, device: str = "cpu") -> PPO:
     if not own:
         cfg["algorithm"]["class_name"] = "PPO"
         for name in ("actor", "critic"):
-            cfg[name] = {k: v for k, v in cfg[name].items() if k != "bfloat16"} | {"class_name": "MLPModel"}
+            cfg[name] = {k: v for k, v in cfg[name].items() if k != "bfloat16"} | {
+                "class_name": "MLPModel"
+            }
     torch.manual_seed(0)
     env = SimpleNamespace(num_envs=ENVIRONMENTS, num_actions=ACTIONS)
     with contextlib.redirect_stdout(io.StringIO()):
@@ -71,7 +98,13 @@ def iterate(alg: PPO, seed: int) -> dict[str, float]:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"schedule": "fixed"}, {"desired_kl": 1e-5}, {"desired_kl": 1.0}, {"normalize": False, "epochs": 1, "minibatches": 8}],
+    [
+        {},
+        {"schedule": "fixed"},
+        {"desired_kl": 1e-5},
+        {"desired_kl": 1.0},
+        {"normalize": False, "epochs": 1, "minibatches": 8},
+    ],
     ids=["adaptive", "fixed", "rate falls", "rate rises", "one pass"],
 )
 def test_the_update_is_rsl_rls(changes):
@@ -100,18 +133,28 @@ def test_a_turned_gradient_is_noticed(monkeypatch):
     monkeypatch.setattr(torch.autograd, "grad", lambda *a: [-g for g in gradients(*a)])
     iterate(ours, 0)
     iterate(theirs, 0)
-    worst = max(float((a - b).detach().abs().max()) for a, b in zip(ours.actor.parameters(), theirs.actor.parameters()))
+    worst = max(
+        float((a - b).detach().abs().max())
+        for a, b in zip(ours.actor.parameters(), theirs.actor.parameters())
+    )
     assert worst > 10 * SAME["atol"]
 
 
 def test_the_host_reads_once_and_buffers_keep_their_places(monkeypatch):
-    """What a CUDA graph needs: no value is looked at inside the epochs, and what they read and write does not move."""
+    """What a CUDA graph needs: no value is looked at inside the epochs, and what they read and
+    write does not move.
+    """
     alg = build(params(), own=True)
     iterate(alg, 0)
     alg.storage.step = 0
 
     def places():
-        stored = [alg.storage.advantages, alg.storage.returns, alg.storage.values, *alg.storage.distribution_params]
+        stored = [
+            alg.storage.advantages,
+            alg.storage.returns,
+            alg.storage.values,
+            *alg.storage.distribution_params,
+        ]
         kept = [alg.rate, alg.target_kl, alg.actor.obs_normalizer._std, alg._spread, *alg._layers]
         adam = [t for state in alg.optimizer.state.values() for t in state.values()]
         return [t.data_ptr() for t in (*stored, *kept, *adam)]
@@ -131,14 +174,20 @@ def test_the_host_reads_once_and_buffers_keep_their_places(monkeypatch):
 
 
 def test_products_in_bfloat16_follow_those_in_float32():
-    """The same minibatches; weights stay float32 and end within the rounding of the products, moved some ten times as far."""
-    plain, short = (build(params(schedule="fixed", products=kind), own=True) for kind in ("float32", "bfloat16"))
+    """The same minibatches; weights stay float32 and end within the rounding of the products, moved
+    some ten times as far.
+    """
+    plain, short = (
+        build(params(schedule="fixed", products=kind), own=True) for kind in ("float32", "bfloat16")
+    )
     start = [w.detach().clone() for w in plain.actor.parameters()]
     for seed in range(3):
         iterate(plain, seed)
         iterate(short, seed)
     assert {w.dtype for w in [short._spread, *short._layers]} == {torch.float32}
-    off = torch.cat([(a - b).flatten() for a, b in zip(plain.actor.parameters(), short.actor.parameters())]).norm()
+    off = torch.cat(
+        [(a - b).flatten() for a, b in zip(plain.actor.parameters(), short.actor.parameters())]
+    ).norm()
     way = torch.cat([(a - b).flatten() for a, b in zip(plain.actor.parameters(), start)]).norm()
     assert 0.0 < off < 0.3 * way
 
@@ -146,7 +195,9 @@ def test_products_in_bfloat16_follow_those_in_float32():
 def test_the_critic_learns_alone_while_the_actor_is_held():
     alg = build(params(), own=True)
     alg.actor_learns.zero_()
-    held, moving = ([w.detach().clone() for w in model.parameters()] for model in (alg.actor, alg.critic))
+    held, moving = (
+        [w.detach().clone() for w in model.parameters()] for model in (alg.actor, alg.critic)
+    )
     iterate(alg, 0)
     for a, b in zip(held, alg.actor.parameters()):
         torch.testing.assert_close(a, b.detach(), rtol=0, atol=0)
@@ -167,7 +218,9 @@ def test_a_state_that_was_saved_goes_on_the_same():
 def test_time_outs_are_refused():
     alg = build(params(), own=True)
     with pytest.raises(ValueError, match="time_outs"):
-        alg.process_env_step(observations(), torch.zeros(ENVIRONMENTS), torch.zeros(ENVIRONMENTS), {"time_outs": 1})
+        alg.process_env_step(
+            observations(), torch.zeros(ENVIRONMENTS), torch.zeros(ENVIRONMENTS), {"time_outs": 1}
+        )
 
 
 def test_the_sample_is_the_gaussians():
@@ -192,7 +245,11 @@ def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
         assert figures[0] == pytest.approx(figures[1], rel=1e-3, abs=1e-5)
     assert captured._graph is not None
     assert launched._graph is None
-    for a, b, c in zip(captured._layers, launched._layers, [*theirs.actor.mlp.parameters(), *theirs.critic.parameters()]):
+    for a, b, c in zip(
+        captured._layers,
+        launched._layers,
+        [*theirs.actor.mlp.parameters(), *theirs.critic.parameters()],
+    ):
         torch.testing.assert_close(a, b, **SAME)
         if products == "float32":
             torch.testing.assert_close(a, c, **SAME)

@@ -1,4 +1,6 @@
-"""A training in two processes: one policy, data of their own each, and each goes on where it was."""
+"""A training in two processes: one policy, data of their own each, and each goes on
+where it was.
+"""
 
 import multiprocessing
 import socket
@@ -16,8 +18,17 @@ from visthrow.training.trainer import Trainer
 SMALL = ["ppo.environments=16", "ppo.hidden=[16,16]", "task.bounds.time_limit=0.4"]
 PPO = ["ppo.steps=4", "ppo.minibatches=2"]
 FIRST_ORDER = ['algorithm="first_order"', "ppo.minibatches=1", "first_order.horizon=12"]
-DISTILLATION = ['algorithm="distillation"', "distillation.hidden=16", "distillation.memory=16", "distillation.horizon=8"]
-RUNS = {"ppo": ("state", PPO), "first_order": ("state", FIRST_ORDER), "distillation": ("vision", DISTILLATION)}
+DISTILLATION = [
+    'algorithm="distillation"',
+    "distillation.hidden=16",
+    "distillation.memory=16",
+    "distillation.horizon=8",
+]
+RUNS = {
+    "ppo": ("state", PPO),
+    "first_order": ("state", FIRST_ORDER),
+    "distillation": ("vision", DISTILLATION),
+}
 PATIENCE = 300.0
 """Longest wait for what takes seconds on an idle machine [s]."""
 
@@ -32,7 +43,13 @@ def process(rank: int, port: int, folder: Path) -> None:
     """Four iterations at a stretch, and two after a checkpoint that was written on the way."""
     import os
 
-    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    os.environ |= {
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank),
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
     torch.set_num_threads(1)
     ranks = Ranks.join(on_gpu=False)
     for name, (base, sets) in RUNS.items():
@@ -48,7 +65,12 @@ def process(rank: int, port: int, folder: Path) -> None:
         for _ in range(2):
             resumed.step()
         places = whole.algorithm.env.views.state["pos_w"].numpy().copy()
-        np.savez(folder / f"{name}-{rank}.npz", whole=weights(whole), resumed=weights(resumed), places=places)
+        np.savez(
+            folder / f"{name}-{rank}.npz",
+            whole=weights(whole),
+            resumed=weights(resumed),
+            places=places,
+        )
     assert ranks.agree(3 * rank) == 3
     ranks.leave()
 
@@ -62,7 +84,9 @@ def folder(tmp_path_factory):
         port = free.getsockname()[1]
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["rsl_rl.env"])  # which takes longest, once for both
-    both = [context.Process(target=process, args=(rank, port, folder), daemon=True) for rank in range(2)]
+    both = [
+        context.Process(target=process, args=(rank, port, folder), daemon=True) for rank in range(2)
+    ]
     for one in both:
         one.start()
     for one in both:
@@ -85,11 +109,15 @@ def test_each_process_goes_on_bit_for_bit_where_it_was(folder, name):
 
 
 def test_a_process_that_a_checkpoint_does_not_know_throws_on_its_own(folder):
-    """Two processes' checkpoint taken up by three: the third must not collect the first one's data again."""
+    """Two processes' checkpoint taken up by three: the third must not collect the first one's data
+    again.
+    """
     experiment = config.load(Experiment, config.find("train", "state"), [*SMALL, *PPO])
     first, third = (Trainer(experiment, "cpu", 1) for _ in range(2))
     third.ranks = Ranks(rank=2, world=3)
     for trainer in (first, third):
         trainer.load(folder / "ppo.pt")
     np.testing.assert_array_equal(weights(first), weights(third))
-    assert not torch.equal(first.algorithm.env.views.state["pos_w"], third.algorithm.env.views.state["pos_w"])
+    assert not torch.equal(
+        first.algorithm.env.views.state["pos_w"], third.algorithm.env.views.state["pos_w"]
+    )

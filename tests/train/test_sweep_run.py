@@ -1,4 +1,7 @@
-"""A sweep in real processes: killed in the middle of its runs, started again, and through submitit. Tiny networks."""
+"""A sweep in real processes: killed in the middle of its runs, started again, and through submitit.
+
+Tiny networks.
+"""
 
 import os
 import signal
@@ -16,7 +19,8 @@ from visthrow.throws import results
 
 LIST = """
 changes = [
-    "ppo.environments=32", "ppo.steps=8", "ppo.hidden=[16,16]", "ppo.iterations=30", "ppo.minibatches=4",
+    "ppo.environments=32", "ppo.steps=8", "ppo.hidden=[16,16]", "ppo.iterations=30",
+    "ppo.minibatches=4",
     "task.bounds.time_limit=0.4",
 ]
 most_throws = 2
@@ -44,8 +48,24 @@ def path(tmp_path):
 
 
 def sweep(path, out, *extra):
-    words = [sys.executable, "-m", "visthrow.cli", "sweep", "run", path, "--out", str(out), "--devices", "cpu", "--jobs", "1"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # the same bits need the same number of threads
+    words = [
+        sys.executable,
+        "-m",
+        "visthrow.cli",
+        "sweep",
+        "run",
+        path,
+        "--out",
+        str(out),
+        "--devices",
+        "cpu",
+        "--jobs",
+        "1",
+    ]
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+    }  # the same bits need the same number of threads
     return subprocess.Popen([*words, *extra], env=environment, start_new_session=True)
 
 
@@ -62,7 +82,9 @@ def rows(source, out):
 
 
 def children(process):
-    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
+    listed = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
+    )
     return [int(word) for word in listed.stdout.split()]
 
 
@@ -76,7 +98,9 @@ def same(work, one, two):
 
 @pytest.mark.slow
 def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_path):
-    """A SIGKILL of everything, a SIGKILL of the parent alone, a Ctrl-C; the end equals a run without any of it, bit for bit."""
+    """A SIGKILL of everything, a SIGKILL of the parent alone, a Ctrl-C; the end equals a run
+    without any of it, bit for bit.
+    """
     work, whole, broken = load_list(path), tmp_path / "whole", tmp_path / "broken"
     assert sweep(path, whole).wait(PATIENCE) == 0
     first, second = work.sources
@@ -88,7 +112,9 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
     running.wait()
     assert 6 <= rows(first, broken) < 30
 
-    running = sweep(path, broken)  # its children end by themselves, with a checkpoint, when it is gone
+    running = sweep(
+        path, broken
+    )  # its children end by themselves, with a checkpoint, when it is gone
     wait_for(lambda: rows(first, broken) >= 15)
     orphans = children(running)
     running.kill()
@@ -119,7 +145,9 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
 
 @pytest.mark.slow
 def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
-    """The same tasks as jobs of submitit's local executor, in pieces so short that each holds one iteration."""
+    """The same tasks as jobs of submitit's local executor, in pieces so short that each holds one
+    iteration.
+    """
     pytest.importorskip("submitit")
     from visthrow.evidence.sweep import pool
     from visthrow.evidence.sweep.cluster import Cluster

@@ -1,4 +1,7 @@
-"""Training: what a run leaves behind, resuming, interruption, a full disk. Tiny networks and batches."""
+"""Training: what a run leaves behind, resuming, interruption, a full disk.
+
+Tiny networks and batches.
+"""
 
 import errno
 import json
@@ -20,7 +23,13 @@ from visthrow.task import Experiment, contract_of
 from visthrow.training.ppo.algorithm import PPOTraining
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
-SMALL = ["ppo.environments=32", "ppo.steps=8", "ppo.hidden=[16,16]", "ppo.iterations=4", "task.bounds.time_limit=0.4"]
+SMALL = [
+    "ppo.environments=32",
+    "ppo.steps=8",
+    "ppo.hidden=[16,16]",
+    "ppo.iterations=4",
+    "task.bounds.time_limit=0.4",
+]
 
 
 def train(folder, *extra):
@@ -46,7 +55,14 @@ def whole(tmp_path_factory):
 
 def test_a_run_leaves_config_log_checkpoint_summary_and_policy(whole):
     names = {p.name for p in whole.iterdir()}
-    assert {"config.toml", "provenance.json", "progress.csv", CHECKPOINT, "summary.json", "policy.npz"} <= names
+    assert {
+        "config.toml",
+        "provenance.json",
+        "progress.csv",
+        CHECKPOINT,
+        "summary.json",
+        "policy.npz",
+    } <= names
     rows = (whole / "progress.csv").read_text().splitlines()
     assert len(rows) == 1 + 4
     experiment = config.load(Experiment, whole / "config.toml")
@@ -59,12 +75,25 @@ def test_exported_policy_equals_the_network(whole):
     trainer.load(whole / CHECKPOINT)
     obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
     with torch.inference_mode():
-        difference = (trainer.algorithm.alg.actor({"actor": obs}) - Policy.load(whole / "policy.npz").act(obs)).abs().max()
+        difference = (
+            (
+                trainer.algorithm.alg.actor({"actor": obs})
+                - Policy.load(whole / "policy.npz").act(obs)
+            )
+            .abs()
+            .max()
+        )
     assert difference < 1e-6
 
 
 def test_networks_may_round_their_products_and_observations_do_not(whole, monkeypatch):
-    experiment, allowed = config.load(Experiment, whole / "config.toml"), {"observed": set(), "learnt": set()}
+    experiment, allowed = (
+        config.load(Experiment, whole / "config.toml"),
+        {
+            "observed": set(),
+            "learnt": set(),
+        },
+    )
 
     def watched(owner, name, place):
         work = getattr(owner, name)
@@ -93,11 +122,15 @@ def test_resume_goes_on_bit_for_bit(whole, tmp_path):
 
 def iterations_of(folder) -> list[int]:
     """First column of the log, to see that none is missing or made twice."""
-    return [int(row.split(",")[0]) for row in (folder / "progress.csv").read_text().splitlines()[1:]]
+    return [
+        int(row.split(",")[0]) for row in (folder / "progress.csv").read_text().splitlines()[1:]
+    ]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
-def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(whole, tmp_path, monkeypatch, capsys, number):
+def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(
+    whole, tmp_path, monkeypatch, capsys, number
+):
     folder = tmp_path / "run"
     step = Trainer.step
 
@@ -115,7 +148,9 @@ def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(w
     assert not (folder / "summary.json").exists()
     command = capsys.readouterr().err.split("go on with: visthrow ")[1].split("\n")[0]
     monkeypatch.setattr(Trainer, "step", step)
-    assert cli.main([*command.split(), "--device", "cpu"]) == 0  # without --set: the folder has its configuration
+    assert (
+        cli.main([*command.split(), "--device", "cpu"]) == 0
+    )  # without --set: the folder has its configuration
     assert iterations_of(folder) == [1, 2, 3, 4]
     assert (folder / "summary.json").exists()
     assert not (folder / "evaluation.json").exists()
@@ -126,15 +161,22 @@ def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(w
 def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):
     folder = tmp_path / "run"
     words = ["train", "laptop", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1"]
-    changes = [word for item in [*SMALL[:3], "ppo.iterations=4", SMALL[4]] for word in ("--set", item)]
+    changes = [
+        word for item in [*SMALL[:3], "ppo.iterations=4", SMALL[4]] for word in ("--set", item)
+    ]
     slowed = (
-        "import sys, time; from visthrow import cli; from visthrow.training.trainer import Trainer; step = Trainer.step; "
-        "Trainer.step = lambda self: (time.sleep(1.0 if self.iteration == 2 else 0.0), step(self))[1]; cli.main(sys.argv[1:])"
+        "import sys, time; from visthrow import cli; from visthrow.training.trainer import Trainer;"
+        " step = Trainer.step; Trainer.step = lambda self: (time.sleep(1.0 if self.iteration == 2"
+        " else 0.0), step(self))[1]; cli.main(sys.argv[1:])"
     )
     run = subprocess.Popen(
-        [sys.executable, "-c", slowed, *words, *changes], stdout=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        [sys.executable, "-c", slowed, *words, *changes],
+        stdout=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
-    while run.poll() is None and not ((folder / "progress.csv").exists() and len(iterations_of(folder)) == 2):
+    while run.poll() is None and not (
+        (folder / "progress.csv").exists() and len(iterations_of(folder)) == 2
+    ):
         time.sleep(0.01)
     run.kill()
     assert run.wait() == -signal.SIGKILL
@@ -151,18 +193,44 @@ def test_minutes_leave_a_policy(tmp_path, capsys):
     assert Policy.load(folder / "policy.npz").made_by["figures"]["iterations"] == 1
     told = capsys.readouterr()
     assert "success" not in told.out
-    assert "the time is over after iteration 1 of 4; go on with: visthrow train --resume" in told.err
+    assert (
+        "the time is over after iteration 1 of 4; go on with: visthrow train --resume" in told.err
+    )
 
 
 def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, capsys):
-    """The critic alone learns at first, so the actor is the shipped one to the bit; it lands within a metre at once."""
+    """The critic alone learns at first, so the actor is the shipped one to the bit; it lands within
+    a metre at once.
+    """
     folder = tmp_path / "run"
-    words = ["train", "laptop", "--from", "state", "--until", "1.0", "--evaluate-every", "1", "--out", str(folder)]
-    words += ["--device", "cpu", "--set", "ppo.environments=16", "--set", "ppo.steps=4", "--set", "rope.length=0.5"]
+    words = [
+        "train",
+        "laptop",
+        "--from",
+        "state",
+        "--until",
+        "1.0",
+        "--evaluate-every",
+        "1",
+        "--out",
+        str(folder),
+    ]
+    words += [
+        "--device",
+        "cpu",
+        "--set",
+        "ppo.environments=16",
+        "--set",
+        "ppo.steps=4",
+        "--set",
+        "rope.length=0.5",
+    ]
     assert cli.main(words) == 0
     assert iterations_of(folder) == [1]
     shipped, taken = Policy.load(find_policy("state")), Policy.load(folder / "policy.npz")
-    for a, b in zip([*shipped.weights, *shipped.biases], [*taken.weights, *taken.biases], strict=True):
+    for a, b in zip(
+        [*shipped.weights, *shipped.biases], [*taken.weights, *taken.biases], strict=True
+    ):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
     torch.testing.assert_close(taken.mean, shipped.mean, atol=1e-4, rtol=0)
     torch.testing.assert_close(taken.std, shipped.std, atol=1e-4, rtol=1e-4)
@@ -225,7 +293,10 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda f: (f / CHECKPOINT).write_bytes((f / CHECKPOINT).read_bytes()[:1000]), "not a readable checkpoint"),
+        (
+            lambda f: (f / CHECKPOINT).write_bytes((f / CHECKPOINT).read_bytes()[:1000]),
+            "not a readable checkpoint",
+        ),
         (lambda f: (f / CHECKPOINT).unlink(), "no checkpoint.pt to resume from"),
     ],
 )

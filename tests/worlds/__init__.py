@@ -1,1 +1,3 @@
-"""Worlds with a hidden effect: plants, pilots and logs that share no code with the package under test."""
+"""Worlds with a hidden effect: plants, pilots and logs that share no code with the package under
+test.
+"""

@@ -1,9 +1,9 @@
-"""The worlds' camera: a Kannala-Brandt fisheye under the vehicle, and a detector that marks goal square and ball.
+"""The worlds' camera: a Kannala-Brandt fisheye under the vehicle, and a detector that marks goal
+square and ball.
 
-The camera looks down, the top of its image is the vehicle's front; pixel (0, 0) is the centre of the first pixel. The detector
-marks four corners of a square on the ground and draws a box around the ball; both are off by the noise of a pixel. Numbers are
-those of the shipped camera.
-"""
+The camera looks down, the top of its image is the vehicle's front; pixel (0, 0) is the centre of
+the first pixel. The detector marks four corners of a square on the ground and draws a box around
+the ball; both are off by the noise of a pixel. Numbers are those of the shipped camera."""
 
 import numpy as np
 
@@ -31,7 +31,9 @@ def bent(angle: np.ndarray, k1: float) -> np.ndarray:
 
 
 def imaged(rays: np.ndarray, w) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of rays in the camera's frame, shape (..., 3) to (..., 2), and whether the lens and the sensor see them."""
+    """Pixels of rays in the camera's frame, shape (..., 3) to (..., 2), and whether the lens and
+    the sensor see them.
+    """
     level = np.hypot(rays[..., 0], rays[..., 1])
     angle = np.arctan2(level, rays[..., 2])
     reach = FOCAL * (1.0 + w.camera_focal) * bent(angle, w.camera_k1) / np.maximum(level, 1e-12)
@@ -53,8 +55,11 @@ def outline(ball: np.ndarray, radius: float) -> np.ndarray:
     return np.sqrt(1.0 - sine**2) * ahead[:, None] + sine * ring
 
 
-def marks(flight, lane: int, time: np.ndarray, goal: np.ndarray, w) -> tuple[np.ndarray, np.ndarray]:
-    """What a perfect detector marks of the scene at times: corners (T, 4, 2) and sides of the box (T, 4, 2) [px].
+def marks(
+    flight, lane: int, time: np.ndarray, goal: np.ndarray, w
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a perfect detector marks of the scene at times: corners (T, 4, 2) and sides of the box
+    (T, 4, 2) [px].
 
     Each side is given as a point, left, top, right, bottom, of which one coordinate is the box's.
 
@@ -74,21 +79,32 @@ def marks(flight, lane: int, time: np.ndarray, goal: np.ndarray, w) -> tuple[np.
     (left, top), (right, bottom) = around.min(1).T, around.max(1).T
     u, v = 0.5 * (left + right), 0.5 * (top + bottom)
     box = np.stack([left, v, u, top, right, v, u, bottom], -1).reshape(-1, 4, 2)
-    return np.concatenate([points, box], 1), np.concatenate([seen, np.tile(whole.all(1)[:, None], 4)], 1)
+    return np.concatenate([points, box], 1), np.concatenate(
+        [seen, np.tile(whole.all(1)[:, None], 4)], 1
+    )
 
 
 def looked(
-    flight, lane: int, goal: np.ndarray, landed: float, w, noise: float, dropouts: float, rng: np.random.Generator
+    flight,
+    lane: int,
+    goal: np.ndarray,
+    landed: float,
+    w,
+    noise: float,
+    dropouts: float,
+    rng: np.random.Generator,
 ) -> dict:
     """What the camera's detector put down in a flight; of the ball until it has ``landed`` [s].
 
     Returns:
-        ``look_time`` (N,); ``look``, points in units of the edge of the view of the camera as it is believed to be, (N, 8, 2);
-        ``look_seen`` (N, 8); ``look_lost``, frames without a detection, (N,); ``goal``.
+        ``look_time`` (N,); ``look``, points in units of the edge of the view of the camera as it is
+        believed to be, (N, 8, 2); ``look_seen`` (N, 8); ``look_lost``, frames without a detection,
+        (N,); ``goal``.
     """
     stamps = np.arange(0.1, flight.time[-1] - 1e-9, 1.0 / RATE)
     points, seen = marks(flight, lane, stamps - w.camera_late, goal, w)
-    if w.camera_row:  # each point's row has its own time; that it moves meanwhile by a row or so matters to nothing
+    # each point's row has its own time; that it moves meanwhile by a row or so matters to nothing
+    if w.camera_row:
         for k in range(points.shape[1]):
             then = stamps - w.camera_late + w.camera_row * points[:, k, 1]
             points[:, k], seen[:, k] = (x[:, k] for x in marks(flight, lane, then, goal, w))
@@ -98,5 +114,10 @@ def looked(
     u, v = 0.5 * (left + right), 0.5 * (top + bottom)
     off[:, 4:] = np.stack([left, v, u, top, right, v, u, bottom], -1).reshape(-1, 4, 2)
     look = (points + off - CENTRE) / (FOCAL * HALF_VIEW)
-    return {"look_time": stamps, "look": np.where(seen[..., None], look, 0.0), "look_seen": seen,
-            "look_lost": rng.random(len(stamps)) < dropouts, "goal": goal}  # fmt: skip
+    return {
+        "look_time": stamps,
+        "look": np.where(seen[..., None], look, 0.0),
+        "look_seen": seen,
+        "look_lost": rng.random(len(stamps)) < dropouts,
+        "goal": goal,
+    }

@@ -1,24 +1,41 @@
-"""World P1: the rope as fifteen rods on ball joints in MuJoCo, RK4; the vehicle's actuators beside it.
+"""World P1: the rope as fifteen rods on ball joints in MuJoCo, RK4; the vehicle's actuators beside
+it.
 
-The actuators advance by the midpoint rule with the motion that MuJoCo finds; their wrench acts in the body frame through
-actuators on the centre of mass, so that MuJoCo turns it with the vehicle within a step. Armature 0; the rods' inertia about
-their axes is so small that the twist that the joints' damping passes on matters to nothing.
-"""
+The actuators advance by the midpoint rule with the motion that MuJoCo finds; their wrench acts in
+the body frame through actuators on the centre of mass, so that MuJoCo turns it with the vehicle
+within a step. Armature 0; the rods' inertia about their axes is so small that the twist that the
+joints' damping passes on matters to nothing."""
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from tests.worlds.vehicle import REAL, V3, V4, Body, Numbers, along, ball_force, rotation, vehicle_load
+from tests.worlds.vehicle import (
+    REAL,
+    V3,
+    V4,
+    Body,
+    Numbers,
+    along,
+    ball_force,
+    rotation,
+    vehicle_load,
+)
 
 SEGMENTS = 15
 TWIST = 2e-8
-"""Inertia of a rod about its axis [kg m^2]: at rest relative to its neighbours within a few milliseconds."""
+"""Inertia of a rod about its axis [kg m^2]: at rest relative to its neighbours within a few
+milliseconds.
+"""
 STEP = 5e-4
 TAUT = 3.0
-"""Pull [N] up to which RK4 follows the chain's highest mode, sqrt(12 T / (m l)) for rods of mass m and length l, at ``STEP``."""
+"""Pull [N] up to which RK4 follows the chain's highest mode, sqrt(12 T / (m l)) for rods of mass m
+and length l, at ``STEP``.
+"""
 SLACK = 0.2
-"""Pull [N] below which a snap may come within a millisecond, and share of the step that is then taken."""
+"""Pull [N] below which a snap may come within a millisecond, and share of the step that is then
+taken.
+"""
 
 
 @wp.func
@@ -36,11 +53,22 @@ def inner(b: Body, of: Body):
 
 @wp.kernel(module="unique", enable_backward=False)
 def ahead(
-    numbers: wp.array(dtype=Numbers), bodies: wp.array(dtype=Body), middle: wp.array(dtype=Body), before: wp.array(dtype=Body),
-    commands: wp.array(dtype=V4), push: wp.array(dtype=V3), twist: wp.array(dtype=V3), ball_v: wp.array(dtype=V3), h: REAL,
-    force: wp.array(dtype=V3), torque: wp.array(dtype=V3), on_ball: wp.array(dtype=V3),
-):  # fmt: skip
-    """Wrench half a step ahead, in the body frame: turning and moving as over the last step, actuators by their own rates."""
+    numbers: wp.array(dtype=Numbers),
+    bodies: wp.array(dtype=Body),
+    middle: wp.array(dtype=Body),
+    before: wp.array(dtype=Body),
+    commands: wp.array(dtype=V4),
+    push: wp.array(dtype=V3),
+    twist: wp.array(dtype=V3),
+    ball_v: wp.array(dtype=V3),
+    h: REAL,
+    force: wp.array(dtype=V3),
+    torque: wp.array(dtype=V3),
+    on_ball: wp.array(dtype=V3),
+):
+    """Wrench half a step ahead, in the body frame: turning and moving as over the last step,
+    actuators by their own rates.
+    """
     i = wp.tid()
     p, b = numbers[i], bodies[i]
     m = inner(b, b)
@@ -63,10 +91,19 @@ def ahead(
 
 @wp.kernel(module="unique", enable_backward=False)
 def behind(
-    numbers: wp.array(dtype=Numbers), bodies: wp.array(dtype=Body), middle: wp.array(dtype=Body), before: wp.array(dtype=Body),
-    commands: wp.array(dtype=V4), push: wp.array(dtype=V3), twist: wp.array(dtype=V3), hanging: wp.array(dtype=wp.bool), h: REAL,
-):  # fmt: skip
-    """From the frame's origin to the centre of mass, and the inner states over the whole step by their rates half-way."""
+    numbers: wp.array(dtype=Numbers),
+    bodies: wp.array(dtype=Body),
+    middle: wp.array(dtype=Body),
+    before: wp.array(dtype=Body),
+    commands: wp.array(dtype=V4),
+    push: wp.array(dtype=V3),
+    twist: wp.array(dtype=V3),
+    hanging: wp.array(dtype=wp.bool),
+    h: REAL,
+):
+    """From the frame's origin to the centre of mass, and the inner states over the whole step by
+    their rates half-way.
+    """
     i = wp.tid()
     p, was = numbers[i], before[i]
     b, m = inner(bodies[i], bodies[i]), inner(bodies[i], middle[i])
@@ -88,15 +125,24 @@ def model_of(w) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.0, 0.0, -9.81]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    )
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint()
-    body.mass, body.ipos, body.inertia, body.explicitinertial = w.mass, w.com.tolist(), w.inertia.tolist(), True
+    body.mass, body.ipos, body.inertia, body.explicitinertial = (
+        w.mass,
+        w.com.tolist(),
+        w.inertia.tolist(),
+        True,
+    )
     body.add_site(name="centre", pos=w.com.tolist())
     for i in range(6):
         gear = [0.0] * 6
         gear[i] = 1.0
-        spec.add_actuator(name=f"a{i}", trntype=mujoco.mjtTrn.mjTRN_SITE, target="centre", gear=gear)
+        spec.add_actuator(
+            name=f"a{i}", trntype=mujoco.mjtTrn.mjTRN_SITE, target="centre", gear=gear
+        )
     length, mass = w.length / SEGMENTS, w.rope_mass / SEGMENTS
     parent, at = body, w.mount.tolist()
     for i in range(SEGMENTS):
@@ -106,9 +152,18 @@ def model_of(w) -> mujoco.MjModel:
             reach = length + w.ball_reach
             total = mass + w.ball_mass
             centre = (mass * length / 2 + w.ball_mass * reach) / total
-            inertia += w.ball_inertia + mass * (centre - length / 2) ** 2 + w.ball_mass * (reach - centre) ** 2
+            inertia += (
+                w.ball_inertia
+                + mass * (centre - length / 2) ** 2
+                + w.ball_mass * (reach - centre) ** 2
+            )
             rod.add_site(name="ball", pos=[0.0, 0.0, -reach])
-        rod.mass, rod.ipos, rod.inertia, rod.explicitinertial = total, [0.0, 0.0, -centre], [inertia, inertia, TWIST], True
+        rod.mass, rod.ipos, rod.inertia, rod.explicitinertial = (
+            total,
+            [0.0, 0.0, -centre],
+            [inertia, inertia, TWIST],
+            True,
+        )
         rod.add_joint(type=mujoco.mjtJoint.mjJNT_BALL).damping[0] = w.joint_damping
         parent, at = rod, [0.0, 0.0, -length]
     return spec.compile()
@@ -120,7 +175,9 @@ class Chain:
     def __init__(self, worlds, bodies: np.ndarray, numbers: wp.array):
         for w in worlds:
             if w.bending or w.stretch or w.joint_damping_square:
-                raise ValueError("the chain of MuJoCo has no bending, stretch or quadratic joint damping")
+                raise ValueError(
+                    "the chain of MuJoCo has no bending, stretch or quadratic joint damping"
+                )
         cache, count = {}, len(worlds)
         self.models = [cache.setdefault(repr(vars(w)), model_of(w)) for w in worlds]
         self.data = [mujoco.MjData(m) for m in self.models]
@@ -132,13 +189,24 @@ class Chain:
         kinds = {"bodies": Body, "middle": Body, "before": Body, "commands": V4} | dict.fromkeys(
             ("push", "twist", "ball_v", "force", "torque", "on_ball"), V3
         )
-        arrays = {k: wp.zeros(count, dtype=d) for k, d in kinds.items()} | {"hanging": wp.full(count, True, dtype=wp.bool)}
-        state = [numbers, *(arrays[k] for k in ("bodies", "middle", "before", "commands", "push", "twist"))]
+        arrays = {k: wp.zeros(count, dtype=d) for k, d in kinds.items()} | {
+            "hanging": wp.full(count, True, dtype=wp.bool)
+        }
+        state = [
+            numbers,
+            *(arrays[k] for k in ("bodies", "middle", "before", "commands", "push", "twist")),
+        ]
         loads = [arrays[k] for k in ("force", "torque", "on_ball")]
-        self._ahead = wp.launch(ahead, count, [*state, arrays["ball_v"], 0.0, *loads], record_cmd=True)
+        self._ahead = wp.launch(
+            ahead, count, [*state, arrays["ball_v"], 0.0, *loads], record_cmd=True
+        )
         self._behind = wp.launch(behind, count, [*state, arrays["hanging"], 0.0], record_cmd=True)
         self._view = {k: v.numpy() for k, v in arrays.items()}
-        self.bodies, self.ball_v, self.hanging = self._view["bodies"], self._view["ball_v"], self._view["hanging"]
+        self.bodies, self.ball_v, self.hanging = (
+            self._view["bodies"],
+            self._view["ball_v"],
+            self._view["hanging"],
+        )
         self.bodies[:] = bodies
         self._view["middle"][:] = bodies
         for d, b, w in zip(self.data, self.bodies, worlds):
@@ -150,7 +218,9 @@ class Chain:
         self.look(1.0)
 
     def look(self, now: float) -> None:
-        """Positions and velocities of the hanging balls, and the ropes' tension from what they did since the last look."""
+        """Positions and velocities of the hanging balls, and the ropes' tension from what they did
+        since the last look.
+        """
         since = max(now - self._seen, 1e-4)
         self._seen = now
         out = np.zeros(6)
@@ -167,11 +237,15 @@ class Chain:
     def _step(self, lanes: np.ndarray) -> float:
         """Integration step for the ropes' pull at the last look [s]."""
         pull = self.tension[lanes]
-        share = np.where(pull < SLACK, SLACK, np.minimum(1.0, np.sqrt(TAUT / np.maximum(pull, SLACK))))
+        share = np.where(
+            pull < SLACK, SLACK, np.minimum(1.0, np.sqrt(TAUT / np.maximum(pull, SLACK)))
+        )
         return STEP * float(share.min())
 
     def run(self, start: float, stop: float, commands: np.ndarray, push, twist, ball) -> None:
-        """Advance the hanging lanes from ``start`` to ``stop`` under constant commands and gusts."""
+        """Advance the hanging lanes from ``start`` to ``stop`` under constant commands
+        and gusts.
+        """
         lanes = np.flatnonzero(self.hanging)
         if not len(lanes) or stop - start < 1e-9:
             return
@@ -195,11 +269,25 @@ class Chain:
             for e in lanes:
                 d, rod = self.data[e], self.rod[e]
                 d.ctrl[:3], d.ctrl[3:] = v["force"][e], v["torque"][e]
-                # MuJoCo applies it at the rod's centre of mass; the couple moves it to the ball's centre.
-                (a0, a1, a2), (f0, f1, f2) = (self.ball_x[e] - d.xipos[rod]).tolist(), on_ball[e].tolist()
-                d.xfrc_applied[rod] = f0, f1, f2, a1 * f2 - a2 * f1, a2 * f0 - a0 * f2, a0 * f1 - a1 * f0
+                # MuJoCo applies it at the rod's centre of mass; the couple moves it to the ball's
+                # centre.
+                (a0, a1, a2), (f0, f1, f2) = (
+                    (self.ball_x[e] - d.xipos[rod]).tolist(),
+                    on_ball[e].tolist(),
+                )
+                d.xfrc_applied[rod] = (
+                    f0,
+                    f1,
+                    f2,
+                    a1 * f2 - a2 * f1,
+                    a2 * f0 - a0 * f2,
+                    a0 * f1 - a1 * f0,
+                )
                 mujoco.mj_step(self.models[e], d)
                 x[e], q[e], speed[e], rate[e] = d.qpos[:3], d.qpos[3:7], d.qvel[:3], d.qvel[3:6]
             self._behind.launch()
         if any(self.data[e].warning.number.any() for e in lanes):
-            raise RuntimeError(f"MuJoCo's chain became unstable at {stop:.4f} s with a pull of {self.tension[lanes].max():.1f} N")
+            raise RuntimeError(
+                f"MuJoCo's chain became unstable at {stop:.4f} s with a pull of"
+                f" {self.tension[lanes].max():.1f} N"
+            )

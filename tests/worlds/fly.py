@@ -1,4 +1,6 @@
-"""Fly a world: lanes of one or many worlds in step, 50 Hz commands, recordings at 1 kHz, all in float64 on the CPU."""
+"""Fly a world: lanes of one or many worlds in step, 50 Hz commands, recordings at 1 kHz, all in
+float64 on the CPU.
+"""
 
 from types import SimpleNamespace
 
@@ -29,7 +31,9 @@ def rows(worlds: list[SimpleNamespace]) -> np.ndarray:
 
 
 def ornstein(rng: np.random.Generator, sizes: np.ndarray, ticks: int) -> np.ndarray:
-    """Gusts at the period's edges, shape (ticks + 1, lanes, 3), of standard deviation ``sizes``, shape (lanes,)."""
+    """Gusts at the period's edges, shape (ticks + 1, lanes, 3), of standard deviation ``sizes``,
+    shape (lanes,).
+    """
     keep = np.exp(-PERIOD / GUST_TIME)
     out = np.empty((ticks + 1, len(sizes), 3))
     out[0] = rng.normal(size=(len(sizes), 3))
@@ -60,9 +64,12 @@ def hover(worlds: list[SimpleNamespace], starts: np.ndarray, used: np.ndarray) -
 class Hanging:
     """Lanes of one plant between two commands, whatever the plant is."""
 
-    def __init__(self, kind: str, worlds: list[SimpleNamespace], bodies: np.ndarray, starts: np.ndarray):
+    def __init__(
+        self, kind: str, worlds: list[SimpleNamespace], bodies: np.ndarray, starts: np.ndarray
+    ):
         self.kind, self.lanes = kind, len(worlds)
-        # After the separation all plants are alike: the chain's lanes then go on in the kernel of the rod.
+        # After the separation all plants are alike: the chain's lanes then go on in the kernel of
+        # the rod.
         self._advance, nodes = build("rod" if kind == "chain" else kind)
         at = np.zeros((self.lanes, nodes, 3))
         for e, w in enumerate(worlds):
@@ -74,7 +81,10 @@ class Hanging:
                 at[e] = starts[e] + w.mount
                 at[e, :, 2] -= reach
         if nodes > 1:  # half of the first piece of rope rides on the mount
-            worlds = [SimpleNamespace(**vars(w) | {"mass": w.mass + 0.5 * w.rope_mass / nodes}) for w in worlds]
+            worlds = [
+                SimpleNamespace(**vars(w) | {"mass": w.mass + 0.5 * w.rope_mass / nodes})
+                for w in worlds
+            ]
         self.worlds = worlds
         self._numbers = wp.array(rows(worlds), dtype=Numbers)
         self._bodies = wp.array(bodies, dtype=Body)
@@ -107,7 +117,9 @@ class Hanging:
         self.rides.assign(r)
 
     def period(self, t: float, queue: np.ndarray, stamps: np.ndarray, blow: np.ndarray):
-        """Advance by one period; position, quaternion, ball, rate at each record, shape (E, RECORDS, ...)."""
+        """Advance by one period; position, quaternion, ball, rate at each record, shape (E,
+        RECORDS, ...).
+        """
         marks = t + PERIOD * np.arange(1, RECORDS + 1) / RECORDS
         begin = np.full(self.lanes, t)
         early = None
@@ -115,12 +127,27 @@ class Hanging:
             early = self._hang(t, marks, begin, queue, stamps, blow)
         if self._chain is None or not self._chain.hanging.all():
             wp.launch(
-                self._advance, self.lanes,
-                [self._numbers, self._bodies, self.rides, self._places, self._speeds, wp.array(queue, dtype=V4),
-                 wp.array(stamps, dtype=REAL), wp.array(self._delays, dtype=REAL), wp.array(blow, dtype=Gust),
-                 wp.array(self._kicks, dtype=V3), t, PERIOD, wp.array(begin, dtype=REAL), wp.array(marks, dtype=REAL),
-                 STEPS.get(self.kind, STEPS["rod"]), *self._out],
-            )  # fmt: skip
+                self._advance,
+                self.lanes,
+                [
+                    self._numbers,
+                    self._bodies,
+                    self.rides,
+                    self._places,
+                    self._speeds,
+                    wp.array(queue, dtype=V4),
+                    wp.array(stamps, dtype=REAL),
+                    wp.array(self._delays, dtype=REAL),
+                    wp.array(blow, dtype=Gust),
+                    wp.array(self._kicks, dtype=V3),
+                    t,
+                    PERIOD,
+                    wp.array(begin, dtype=REAL),
+                    wp.array(marks, dtype=REAL),
+                    STEPS.get(self.kind, STEPS["rod"]),
+                    *self._out,
+                ],
+            )
         out = [o.numpy().copy() for o in self._out]
         if early is not None:
             for mine, theirs in zip(out, early):
@@ -129,16 +156,22 @@ class Hanging:
         return out
 
     def _hang(self, t, marks, begin, queue, stamps, blow):
-        """MuJoCo's part of a period: all hanging lanes from event to event; ``begin`` becomes where the rest starts."""
+        """MuJoCo's part of a period: all hanging lanes from event to event; ``begin`` becomes where
+        the rest starts.
+        """
         chain, ride = self._chain, self.rides.numpy()
         out = [np.full((self.lanes, RECORDS, n), np.nan) for n in (3, 4, 3, 3)]
         acts = stamps + self._delays[:, None]
-        events = np.unique(np.round(np.concatenate([marks, acts.ravel(), ride["release_at"][chain.hanging]]), 9))
+        events = np.unique(
+            np.round(np.concatenate([marks, acts.ravel(), ride["release_at"][chain.hanging]]), 9)
+        )
         now, last = t, marks[-1]
         for stop in events[(events > t + 1e-9) & (events <= last + 1e-9)]:
             active = np.array([np.flatnonzero(a <= now + 1e-9)[-1] for a in acts])
             part = (0.5 * (now + stop) - t) / PERIOD
-            gust = [blow[n] + part * (blow[n + "_end"] - blow[n]) for n in ("push", "twist", "ball")]
+            gust = [
+                blow[n] + part * (blow[n + "_end"] - blow[n]) for n in ("push", "twist", "ball")
+            ]
             chain.run(now, stop, queue[np.arange(self.lanes), active], *gust)
             now = stop
             hit = np.flatnonzero(np.abs(marks - now) < 1e-9)
@@ -156,7 +189,10 @@ class Hanging:
                 body[e] = chain.bodies[e]
                 self._bodies.assign(body)
                 ride["hanging"][e], ride["separated_at"][e], begin[e] = 0, now, now
-                ride["ball_x"][e], ride["ball_v"][e] = chain.ball_x[e], chain.ball_v[e] + self._kicks[e]
+                ride["ball_x"][e], ride["ball_v"][e] = (
+                    chain.ball_x[e],
+                    chain.ball_v[e] + self._kicks[e],
+                )
         begin[chain.hanging] = last + 1.0  # nothing left to do in the other kernel
         self.rides.assign(ride)
         return out
@@ -167,13 +203,22 @@ class Flights:
 
     def __init__(self, time, pos, quat, ball, commands, release_at, separated_at, rate, volt):
         self.time, self.pos, self.quat, self.ball = time, pos, quat, ball
-        self.commands, self.release_at, self.separated_at, self.rate = commands, release_at, separated_at, rate
+        self.commands, self.release_at, self.separated_at, self.rate = (
+            commands,
+            release_at,
+            separated_at,
+            rate,
+        )
         self.volt = volt  # at the start of each period, shape (E, ticks)
 
 
 def fly(*args, **options) -> Flights:
-    """Fly lanes of a plant, on the CPU whatever else there is; see :func:`_fly` for the arguments."""
-    with wp.ScopedDevice("cpu"):  # state is looked at and changed through views of the kernels' memory
+    """Fly lanes of a plant, on the CPU whatever else there is; see :func:`_fly` for the
+    arguments.
+    """
+    with wp.ScopedDevice(
+        "cpu"
+    ):  # state is looked at and changed through views of the kernels' memory
         return _fly(*args, **options)
 
 
@@ -184,7 +229,8 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
         kind: "chain", "string" or "rod".
         worlds: numbers of each lane.
         pilots: function (t, pos, vel, quat, hanging) -> commands (E, 4).
-        references: of each lane, with ``at(0)`` the start and ``release`` the time of its release command.
+        references: of each lane, with ``at(0)`` the start and ``release`` the time of its release
+            command.
         seconds: to fly.
         gusts: standard deviations of force [N], torque [N m], force on the ball [N].
         seed: of the gusts.
@@ -198,11 +244,18 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
     plant = Hanging(kind, worlds, hover(worlds, starts, used), starts)
     level = np.zeros((lanes, 4))
     level[:, 0] = [EARTH * (w.mass + w.ball_mass + w.rope_mass) for w in worlds]
-    queue, stamps = np.repeat(level[:, None], QUEUE, 1), np.tile(np.arange(-QUEUE, 0) * PERIOD - 1.0, (lanes, 1))
+    queue, stamps = (
+        np.repeat(level[:, None], QUEUE, 1),
+        np.tile(np.arange(-QUEUE, 0) * PERIOD - 1.0, (lanes, 1)),
+    )
     blows = [ornstein(rng, np.full(lanes, size), ticks) for size in gusts]
     jitter = rng.normal(size=lanes)
     pos, ball, rate = (np.empty((lanes, ticks * RECORDS + 1, 3)) for _ in range(3))
-    quat, sent, volts = np.empty((lanes, ticks * RECORDS + 1, 4)), np.empty((lanes, ticks, 4)), np.empty((lanes, ticks))
+    quat, sent, volts = (
+        np.empty((lanes, ticks * RECORDS + 1, 4)),
+        np.empty((lanes, ticks, 4)),
+        np.empty((lanes, ticks)),
+    )
     pos[:, 0], quat[:, 0], rate[:, 0] = starts, (1.0, 0.0, 0.0, 0.0), 0.0
     ball[:, 0] = [s + w.mount - [0, 0, w.length + w.ball_reach] for s, w in zip(starts, worlds)]
     asked, link = np.full(lanes, np.inf), np.random.default_rng([seed, 9])
@@ -215,7 +268,9 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
             if not np.isfinite(asked[e]) and t >= reference.release - 1e-9:
                 asked[e] = t
                 excess = tension[e] - EARTH * w.ball_mass
-                plant.latch(e, t + w.release_lag + w.lag_per_newton * excess + w.lag_jitter * jitter[e])
+                plant.latch(
+                    e, t + w.release_lag + w.lag_per_newton * excess + w.lag_jitter * jitter[e]
+                )
         arrived = np.where(link.random((lanes, 1)) < lost, queue[:, -1], sent[:, k])
         queue = np.concatenate([queue[:, 1:], arrived[:, None]], 1)
         stamps = np.concatenate([stamps[:, 1:], np.full((lanes, 1), t)], 1)
@@ -223,6 +278,10 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
         for name, series in zip(("push", "twist", "ball"), blows):
             blow[name], blow[name + "_end"] = series[k], series[k + 1]
         span = slice(now + 1, now + RECORDS + 1)
-        pos[:, span], quat[:, span], ball[:, span], rate[:, span] = plant.period(t, queue, stamps, blow)
+        pos[:, span], quat[:, span], ball[:, span], rate[:, span] = plant.period(
+            t, queue, stamps, blow
+        )
     time = np.arange(ticks * RECORDS + 1) * PERIOD / RECORDS
-    return Flights(time, pos, quat, ball, sent, asked, plant.rides.numpy()["separated_at"], rate, volts)
+    return Flights(
+        time, pos, quat, ball, sent, asked, plant.rides.numpy()["separated_at"], rate, volts
+    )

@@ -1,4 +1,6 @@
-"""A proposed manoeuvre flown in a world: a reference table, what it adds to the commands, and the record of that flight."""
+"""A proposed manoeuvre flown in a world: a reference table, what it adds to the commands, and the
+record of that flight.
+"""
 
 import csv
 import io
@@ -53,7 +55,9 @@ class Table:
         """Place, speed, acceleration and heading at a time."""
         i = self.row(t)
         last = min(i + 1, len(self.yaw) - 1)
-        push = (self.speed[last] - self.speed[max(i - 1, 0)]) / (0.02 * max(last - max(i - 1, 0), 1))
+        push = (self.speed[last] - self.speed[max(i - 1, 0)]) / (
+            0.02 * max(last - max(i - 1, 0), 1)
+        )
         return self.place[i], self.speed[i], push, self.yaw[i]
 
 
@@ -62,17 +66,31 @@ def table_of(text: str, payload: bool) -> Table:
     rows = list(csv.reader(io.StringIO(text)))
     names = [name.split(" [")[0] for name in rows[0]]
     value = dict(zip(names, np.array(rows[1:], dtype=float).T))
-    columns = [np.column_stack([value[name] for name in group]) for group in (
-        ("x_w", "y_w", "z_w"), ("vx_w", "vy_w", "vz_w"), ("added rate_x_b", "added rate_y_b", "added rate_z_b"),
-    )]  # fmt: skip
-    return Table(columns[0], columns[1], value["yaw"], columns[2], value["thrust factor"], value["release"], payload)
+    columns = [
+        np.column_stack([value[name] for name in group])
+        for group in (
+            ("x_w", "y_w", "z_w"),
+            ("vx_w", "vy_w", "vz_w"),
+            ("added rate_x_b", "added rate_y_b", "added rate_z_b"),
+        )
+    ]
+    return Table(
+        columns[0],
+        columns[1],
+        value["yaw"],
+        columns[2],
+        value["thrust factor"],
+        value["release"],
+        payload,
+    )
 
 
 class Follower(Tracker):
-    """The tracking pilot, softer so that a vehicle without payload stays calm, who adds what the table asks for.
+    """The tracking pilot, softer so that a vehicle without payload stays calm, who adds what the
+    table asks for.
 
-    An integral brings him to the height that is asked for, whatever air or battery do to the thrust, as any autopilot's does.
-    """
+    An integral brings him to the height that is asked for, whatever air or battery do to the
+    thrust, as any autopilot's does."""
 
     gains = 2.0, 2.4, 4.5
     patience = 1.0
@@ -89,24 +107,37 @@ class Follower(Tracker):
 
 
 def follow(recipe: Recipe, tables: list[Table], seed: int) -> list[dict]:
-    """Fly tables in a world, all of them in step, and record each as :func:`tests.worlds.world.recorded` does.
+    """Fly tables in a world, all of them in step, and record each as
+    :func:`tests.worlds.world.recorded` does.
 
-    A flight without payload drops it first; its record begins afterwards and shows neither payload nor release.
-    """
+    A flight without payload drops it first; its record begins afterwards and shows neither payload
+    nor release."""
     rng = np.random.default_rng([recipe.seed, seed])
     known = hide({})
     pilot = Follower(tables, known.mass, known.ball_mass + known.rope_mass, rng)
     flown = fly(
-        recipe.plant, [world_of(recipe)] * len(tables), pilot.command, tables, max(t.seconds for t in tables),
-        [recipe.gusts * g for g in GUSTS], int(rng.integers(2**31)), rng.uniform(0.0, 0.4, len(tables)),
-    )  # fmt: skip
+        recipe.plant,
+        [world_of(recipe)] * len(tables),
+        pilot.command,
+        tables,
+        max(t.seconds for t in tables),
+        [recipe.gusts * g for g in GUSTS],
+        int(rng.integers(2**31)),
+        rng.uniform(0.0, 0.4, len(tables)),
+    )
     out = recorded(replace(recipe, seed=int(rng.integers(2**31))), [flown])
     return [_trimmed(record, table) for record, table in zip(out, tables)]
 
 
 def _trimmed(record: dict, table: Table) -> dict:
     seen = (record["time"] >= table.begin) & (record["time"] < table.seconds)
-    sent = (record["sent_time"] >= table.begin - 1e-9) & (record["sent_time"] < table.seconds - 1e-9)
+    sent = (record["sent_time"] >= table.begin - 1e-9) & (
+        record["sent_time"] < table.seconds - 1e-9
+    )
     record = record | {name: record[name][seen] for name in ("time", "pos", "quat", "ball")}
     record |= {name: record[name][sent] for name in ("sent_time", "sent", "volt")}
-    return record if table.payload else record | {"ball": np.full_like(record["ball"], np.nan), "release": None}
+    return (
+        record
+        if table.payload
+        else record | {"ball": np.full_like(record["ball"], np.nan), "release": None}
+    )

@@ -1,4 +1,6 @@
-"""RK4 of vehicle and rope between events: command switches, the separation and the instants of recording fall on step edges."""
+"""RK4 of vehicle and rope between events: command switches, the separation and the instants of
+recording fall on step edges.
+"""
 
 from functools import cache
 
@@ -39,7 +41,9 @@ class Ride:
 
 @wp.struct
 class Gust:
-    """Forces [N, world], torque [N m, body] at the start and the end of a period, linear between."""
+    """Forces [N, world], torque [N m, body] at the start and the end of a period,
+    linear between.
+    """
 
     push: V3
     push_end: V3
@@ -57,13 +61,26 @@ def build(kind: str):
 
     @wp.kernel(module="unique", enable_backward=False)
     def advance(
-        numbers: wp.array(dtype=Numbers), bodies: wp.array(dtype=Body), rides: wp.array(dtype=Ride),
-        places: wp.array2d(dtype=V3), speeds: wp.array2d(dtype=V3),
-        commands: wp.array2d(dtype=V4), stamps: wp.array2d(dtype=REAL), delays: wp.array(dtype=REAL),
-        gusts: wp.array(dtype=Gust), kicks: wp.array(dtype=V3), edge: REAL, period: REAL,
-        starts: wp.array(dtype=REAL), marks: wp.array(dtype=REAL), step: REAL,
-        out_x: wp.array2d(dtype=V3), out_q: wp.array2d(dtype=V4), out_ball: wp.array2d(dtype=V3), out_w: wp.array2d(dtype=V3),
-    ):  # fmt: skip
+        numbers: wp.array(dtype=Numbers),
+        bodies: wp.array(dtype=Body),
+        rides: wp.array(dtype=Ride),
+        places: wp.array2d(dtype=V3),
+        speeds: wp.array2d(dtype=V3),
+        commands: wp.array2d(dtype=V4),
+        stamps: wp.array2d(dtype=REAL),
+        delays: wp.array(dtype=REAL),
+        gusts: wp.array(dtype=Gust),
+        kicks: wp.array(dtype=V3),
+        edge: REAL,
+        period: REAL,
+        starts: wp.array(dtype=REAL),
+        marks: wp.array(dtype=REAL),
+        step: REAL,
+        out_x: wp.array2d(dtype=V3),
+        out_q: wp.array2d(dtype=V4),
+        out_ball: wp.array2d(dtype=V3),
+        out_w: wp.array2d(dtype=V3),
+    ):
         lane = wp.tid()
         p = numbers[lane]
         b = bodies[lane]
@@ -126,7 +143,9 @@ def build(kind: str):
                         on_ball = g.ball + part * (g.ball_end - g.ball)
                         d = Body()
                         if r.hanging == 1:
-                            d, pull, thrust = rates(p, stage, command, push, twist, on_ball, r.tension, xs, vs, a)
+                            d, pull, thrust = rates(
+                                p, stage, command, push, twist, on_ball, r.tension, xs, vs, a
+                            )
                             if s == 0:
                                 r.thrust = thrust
                                 first_pull = pull

@@ -1,13 +1,19 @@
-"""Who flies the worlds: references and a position controller that commands collective thrust and body rates at 50 Hz."""
+"""Who flies the worlds: references and a position controller that commands collective thrust and
+body rates at 50 Hz.
+"""
 
 import numpy as np
 
 PERIOD = 0.02
 GRAVITY = 9.81
 POSITION, VELOCITY, ATTITUDE = np.array([3.0, 3.0, 6.0]), np.array([2.8, 2.8, 4.0]), 4.5
-"""Gains [1/s^2], [1/s], [1/s] of the tracking controller: calm with 20 ms more of delay or motor lag, or 30 % less rate gain."""
+"""Gains [1/s^2], [1/s], [1/s] of the tracking controller: calm with 20 ms more of delay or motor
+lag, or 30 % less rate gain.
+"""
 LEAD = 0.06
-"""How far ahead the pilot reads off the reference how to turn [s]: the delay and the motors' lag that he knows."""
+"""How far ahead the pilot reads off the reference how to turn [s]: the delay and the motors' lag
+that he knows.
+"""
 SHAKE = np.array([0.8, 0.8, 0.0])
 """Deviation of rates that are added to free flights, to excite the vehicle [rad/s]."""
 TONES = 5
@@ -24,9 +30,15 @@ def smooth(x: np.ndarray) -> np.ndarray:
 
 
 def gentle(t: float, rise: float = 2.0):
-    """A clock that starts from rest, its rate and the change of its rate: cubic rate over ``rise`` seconds, then 1."""
+    """A clock that starts from rest, its rate and the change of its rate: cubic rate over ``rise``
+    seconds, then 1.
+    """
     x = min(t / rise, 1.0)
-    return rise * (x**3 - 0.5 * x**4) + max(t - rise, 0.0), x * x * (3 - 2 * x), 6 * x * (1 - x) / rise
+    return (
+        rise * (x**3 - 0.5 * x**4) + max(t - rise, 0.0),
+        x * x * (3 - 2 * x),
+        6 * x * (1 - x) / rise,
+    )
 
 
 class FreeFlight:
@@ -39,11 +51,16 @@ class FreeFlight:
         self.centre = np.array([0.0, 0.0, height])
         self.yaw = rng.uniform(-0.8, 0.8), rng.uniform(0.2, 0.6)
         self.release = np.inf
-        self.tones, self.phases = rng.uniform(0.8, 4.0, (TONES, 3)) * 2 * np.pi, rng.uniform(0, 2 * np.pi, (TONES, 3))
+        self.tones, self.phases = (
+            rng.uniform(0.8, 4.0, (TONES, 3)) * 2 * np.pi,
+            rng.uniform(0, 2 * np.pi, (TONES, 3)),
+        )
 
     def shaken(self, t: float) -> np.ndarray:
         """Rates that are added [rad/s]."""
-        return SHAKE * gentle(t)[1] * np.sqrt(2 / TONES) * np.sin(self.tones * t + self.phases).sum(0)
+        return (
+            SHAKE * gentle(t)[1] * np.sqrt(2 / TONES) * np.sin(self.tones * t + self.phases).sum(0)
+        )
 
     def at(self, t: float):
         tau, pace, change = gentle(t)
@@ -51,17 +68,26 @@ class FreeFlight:
         p = self.centre + (self.size * np.sin(arg)).sum(0)
         slope = (self.size * self.frequency * np.cos(arg)).sum(0)
         bend = -(self.size * self.frequency**2 * np.sin(arg)).sum(0)
-        return p, slope * pace, bend * pace**2 + slope * change, self.yaw[0] * np.sin(self.yaw[1] * tau)
+        return (
+            p,
+            slope * pace,
+            bend * pace**2 + slope * change,
+            self.yaw[0] * np.sin(self.yaw[1] * tau),
+        )
 
 
 class Throw:
-    """Hover for a second, swing back, accelerate, release, brake; at ``push`` [m/s^2] for half a second."""
+    """Hover for a second, swing back, accelerate, release, brake; at ``push`` [m/s^2] for half a
+    second.
+    """
 
     def __init__(self, rng: np.random.Generator, push: float, heading: float):
         self.along = np.array([np.cos(heading), np.sin(heading), 0.0])
         self.back, self.push = rng.uniform(1.5, 3.0), push * rng.uniform(0.9, 1.1)
         self.lift = rng.uniform(0.3, 1.2)
-        self.home = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(1.5, 2.0)])
+        self.home = np.array(
+            [rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(1.5, 2.0)]
+        )
         self.release = 1.0 + 0.70 + rng.uniform(-0.04, 0.06)
         grid = np.arange(0.0, 4.0, 0.005)
         a = np.outer(self._push(grid), self.along) + np.outer(self._rise(grid), [0.0, 0.0, 1.0])
@@ -90,13 +116,17 @@ class Throw:
 
 def turn_rate(reference, t: float, step: float = 0.01) -> np.ndarray:
     """How fast the thrust that a reference asks for turns [rad/s], world frame."""
-    before, after = (np.asarray(reference.at(t + h)[2]) + [0.0, 0.0, GRAVITY] for h in (-step, step))
+    before, after = (
+        np.asarray(reference.at(t + h)[2]) + [0.0, 0.0, GRAVITY] for h in (-step, step)
+    )
     before, after = before / np.linalg.norm(before), after / np.linalg.norm(after)
     return np.cross(before, after) / (2 * step)
 
 
 class Tracker:
-    """Flies lanes along their references from position, velocity, attitude with the noise of a tracking system."""
+    """Flies lanes along their references from position, velocity, attitude with the noise of a
+    tracking system.
+    """
 
     gains = POSITION, VELOCITY, ATTITUDE
     patience = 0.0  # gain of the integral of what is left of the position [1/s^3]
@@ -108,7 +138,9 @@ class Tracker:
         self.off = np.zeros((len(references), 3))  # integral of the position's error [m s]
 
     def command(self, t: float, x, v, q, hanging) -> np.ndarray:
-        """Thrust [N] and body rates [rad/s], shape (E, 4), from position, velocity (world), attitude (wxyz)."""
+        """Thrust [N] and body rates [rad/s], shape (E, 4), from position, velocity (world),
+        attitude (wxyz).
+        """
         want = [r.at(t) for r in self.references]
         p_r, v_r, a_r = (np.array([w[i] for w in want]) for i in range(3))
         yaw = np.array([w[3] for w in want])
@@ -130,7 +162,9 @@ class Tracker:
         side /= np.linalg.norm(side, axis=1, keepdims=True)
         front = np.cross(side, up)
         error = 0.5 * (np.cross(body_x, front) + np.cross(body_y, side) + np.cross(body_z, up))
-        in_body = np.stack([(error * body_x).sum(1), (error * body_y).sum(1), (error * body_z).sum(1)], -1)
+        in_body = np.stack(
+            [(error * body_x).sum(1), (error * body_y).sum(1), (error * body_z).sum(1)], -1
+        )
         rates = 2 * attitude * in_body * [1, 1, 0.5]
         if self.lead:
             turning = np.array([turn_rate(r, t + self.lead) for r in self.references])

@@ -2,7 +2,17 @@
 
 import warp as wp
 
-from tests.worlds.vehicle import EARTH, REAL, V3, Body, Numbers, ball_force, free_motion, rotation, vehicle_load
+from tests.worlds.vehicle import (
+    EARTH,
+    REAL,
+    V3,
+    Body,
+    Numbers,
+    ball_force,
+    free_motion,
+    rotation,
+    vehicle_load,
+)
 
 
 def build():
@@ -11,10 +21,20 @@ def build():
 
     @wp.func
     def rates(
-        p: Numbers, b: Body, command: wp.vec4d, push: V3, twist: V3, ball_push: V3,
-        tension: REAL, place: wp.array(dtype=V3), speed: wp.array(dtype=V3), change: wp.array(dtype=V3),
-    ):  # fmt: skip
-        """Derivative of the body; ``place`` is the rod's direction, ``speed`` its derivative, ``change`` the second one."""
+        p: Numbers,
+        b: Body,
+        command: wp.vec4d,
+        push: V3,
+        twist: V3,
+        ball_push: V3,
+        tension: REAL,
+        place: wp.array(dtype=V3),
+        speed: wp.array(dtype=V3),
+        change: wp.array(dtype=V3),
+    ):
+        """Derivative of the body; ``place`` is the rod's direction, ``speed`` its derivative,
+        ``change`` the second one.
+        """
         force, torque, thrust, d = vehicle_load(p, b, command, push, twist)
         rot = rotation(b.q)
         n, u = place[0], speed[0]
@@ -23,7 +43,11 @@ def build():
         reach = p.length + p.ball_reach
         total = p.rope_mass + p.ball_mass
         first = REAL(0.5) * p.rope_mass * p.length + p.ball_mass * reach
-        second = p.rope_mass * p.length * p.length / REAL(3.0) + p.ball_inertia + p.ball_mass * reach * reach
+        second = (
+            p.rope_mass * p.length * p.length / REAL(3.0)
+            + p.ball_inertia
+            + p.ball_mass * reach * reach
+        )
         gravity = V3(REAL(0.0), REAL(0.0), -REAL(EARTH))
         eye = wp.identity(n=3, dtype=REAL)
         flat = eye - wp.outer(n, n)
@@ -36,10 +60,15 @@ def build():
         air = ball_force(p, ball_v, rot, thrust, 1) + ball_push - p.rope_drag * (flat * ball_v)
         d = free_motion(p, b, force, torque - wp.transpose(rot) * couple, d)
         mount_a = d.v + rot * (wp.cross(d.w, arm_b) + wp.cross(b.w, wp.cross(b.w, arm_b)))
-        inverse = wp.diag(V3(REAL(1.0) / p.inertia[0], REAL(1.0) / p.inertia[1], REAL(1.0) / p.inertia[2]))
+        inverse = wp.diag(
+            V3(REAL(1.0) / p.inertia[0], REAL(1.0) / p.inertia[1], REAL(1.0) / p.inertia[2])
+        )
         lever = rot * wp.skew(arm_b)
         mobility = eye / p.mass + lever * inverse * wp.transpose(lever)
-        bare = -wp.dot(u, u) * n + (flat * (first * gravity + reach * air) + wp.cross(couple, n)) / second
+        bare = (
+            -wp.dot(u, u) * n
+            + (flat * (first * gravity + reach * air) + wp.cross(couple, n)) / second
+        )
         lhs = eye + mobility * (total * eye - (first * first / second) * flat)
         a = wp.inverse(lhs) * (mount_a + mobility * (total * gravity - first * bare + air))
         change[0] = bare - (first / second) * (flat * a)

@@ -1,12 +1,22 @@
 """World P2: a string of point masses with constrained distances, bending stiffness and stretch.
 
-Coordinates are positions of the masses. The tensions solve the tridiagonal system that keeps each distance at its length
-(twice differentiated, with critically damped feedback of what is left), so nothing here resembles a recursion over joints.
-"""
+Coordinates are positions of the masses. The tensions solve the tridiagonal system that keeps each
+distance at its length (twice differentiated, with critically damped feedback of what is left), so
+nothing here resembles a recursion over joints."""
 
 import warp as wp
 
-from tests.worlds.vehicle import EARTH, REAL, V3, Body, Numbers, ball_force, free_motion, rotation, vehicle_load
+from tests.worlds.vehicle import (
+    EARTH,
+    REAL,
+    V3,
+    Body,
+    Numbers,
+    ball_force,
+    free_motion,
+    rotation,
+    vehicle_load,
+)
 
 PULL_BACK = 400.0
 """Natural frequency of the feedback on the distances [rad/s]."""
@@ -25,10 +35,20 @@ def build(nodes: int = 24):
 
     @wp.func
     def rates(
-        p: Numbers, b: Body, command: wp.vec4d, push: V3, twist: V3, ball_push: V3,
-        tension: REAL, place: wp.array(dtype=V3), speed: wp.array(dtype=V3), change: wp.array(dtype=V3),
-    ):  # fmt: skip
-        """Derivative of the body; ``place`` and ``speed`` are positions and velocities of the masses, ``change`` accelerations."""
+        p: Numbers,
+        b: Body,
+        command: wp.vec4d,
+        push: V3,
+        twist: V3,
+        ball_push: V3,
+        tension: REAL,
+        place: wp.array(dtype=V3),
+        speed: wp.array(dtype=V3),
+        change: wp.array(dtype=V3),
+    ):
+        """Derivative of the body; ``place`` and ``speed`` are positions and velocities of the
+        masses, ``change`` accelerations.
+        """
         pull = wp.zeros(shape=(N,), dtype=REAL)
         upper = wp.zeros(shape=(N,), dtype=REAL)
         side = wp.zeros(shape=(N,), dtype=V3)
@@ -78,12 +98,24 @@ def build(nodes: int = 24):
             above, above_rate = n, rate
         last = normal[N - 1]
         ball_v = speed[N - 1]
-        air = ball_force(p, ball_v, rot, thrust, 1) + ball_push - p.rope_drag * (ball_v - wp.dot(ball_v, last) * last)
+        air = (
+            ball_force(p, ball_v, rot, thrust, 1)
+            + ball_push
+            - p.rope_drag * (ball_v - wp.dot(ball_v, last) * last)
+        )
         side[N - 1] = side[N - 1] + air
 
-        d = free_motion(p, b, force + load, torque + wp.transpose(rot) * reaction + wp.cross(arm_b, wp.transpose(rot) * load), d)
+        d = free_motion(
+            p,
+            b,
+            force + load,
+            torque + wp.transpose(rot) * reaction + wp.cross(arm_b, wp.transpose(rot) * load),
+            d,
+        )
         mount_a = d.v + rot * (wp.cross(d.w, arm_b) + wp.cross(b.w, wp.cross(b.w, arm_b)))
-        inverse = wp.diag(V3(REAL(1.0) / p.inertia[0], REAL(1.0) / p.inertia[1], REAL(1.0) / p.inertia[2]))
+        inverse = wp.diag(
+            V3(REAL(1.0) / p.inertia[0], REAL(1.0) / p.inertia[1], REAL(1.0) / p.inertia[2])
+        )
         lever = rot * wp.skew(arm_b)
         mobility = wp.identity(n=3, dtype=REAL) / p.mass + lever * inverse * wp.transpose(lever)
 
@@ -109,7 +141,12 @@ def build(nodes: int = 24):
             right = wp.dot(n, free_here - free_there) + (wp.dot(d_v, d_v) - along * along) / size
             right += REAL(2.0) * w0 * along + w0 * w0 * (size - rest)
             # The rope gives, not the ball at its end.
-            diagonal = REAL(1.0) / node_mass(p, i) + weight_there - coupling_there * below + w0 * w0 * bit * p.stretch
+            diagonal = (
+                REAL(1.0) / node_mass(p, i)
+                + weight_there
+                - coupling_there * below
+                + w0 * w0 * bit * p.stretch
+            )
             known = right + REAL(0.0)
             if i > 0:
                 known = right + coupling_there * pull[i - 1]

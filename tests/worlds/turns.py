@@ -23,10 +23,18 @@ def matrix(q: np.ndarray) -> np.ndarray:
 
 
 def quaternion(r: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz of rotation matrices far from half turns about x or y, shape (T, 3, 3) to (T, 4)."""
+    """Quaternions wxyz of rotation matrices far from half turns about x or y, shape (T, 3, 3) to
+    (T, 4).
+    """
     w = 0.5 * np.sqrt(np.maximum(1 + r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2], 1e-12))
     return np.stack(
-        [w, (r[:, 2, 1] - r[:, 1, 2]) / (4 * w), (r[:, 0, 2] - r[:, 2, 0]) / (4 * w), (r[:, 1, 0] - r[:, 0, 1]) / (4 * w)], -1
+        [
+            w,
+            (r[:, 2, 1] - r[:, 1, 2]) / (4 * w),
+            (r[:, 0, 2] - r[:, 2, 0]) / (4 * w),
+            (r[:, 1, 0] - r[:, 0, 1]) / (4 * w),
+        ],
+        -1,
     )
 
 

@@ -1,8 +1,8 @@
 """The quadrotor of the worlds: equations of motion in float64, written for the tests alone.
 
-World frame z up, body frame x forward, y left, z up, quaternions wxyz. The centre of mass may lie off the frame's origin;
-positions that are logged are those of the origin. A Warp struct holds one vehicle's numbers, another one its state.
-"""
+World frame z up, body frame x forward, y left, z up, quaternions wxyz. The centre of mass may lie
+off the frame's origin; positions that are logged are those of the origin. A Warp struct holds one
+vehicle's numbers, another one its state."""
 
 import warp as wp
 
@@ -14,7 +14,10 @@ EARTH = 9.81
 
 @wp.struct
 class Numbers:
-    """What a world's vehicle, rope and payload are. SI units; ``believed_`` is what its flight controller assumes."""
+    """What a world's vehicle, rope and payload are.
+
+    SI units; ``believed_`` is what its flight controller assumes.
+    """
 
     mass: REAL
     inertia: V3
@@ -69,7 +72,9 @@ class Numbers:
     slew_thrust: REAL  # thrust grows with the collective's change [s]: likewise
     yaw_swirl: REAL  # side force e_z x v [kg/s]: likewise
     power_drag: REAL  # drag along -|v|^1/2 v [kg/s (s/m)^1/2]: outside the grammar of laws as well
-    sink_push: REAL  # force along body z wherever the vehicle sinks faster than SINKING [N]: likewise
+    sink_push: (
+        REAL  # force along body z wherever the vehicle sinks faster than SINKING [N]: likewise
+    )
     mount: V3  # from the frame's origin
     length: REAL
     rope_mass: REAL
@@ -109,10 +114,16 @@ def rotation(q: V4):
     w, x, y, z = q[0], q[1], q[2], q[3]
     one, two = REAL(1.0), REAL(2.0)
     return M3(
-        one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
-        two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
-        two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y),
-    )  # fmt: skip
+        one - two * (y * y + z * z),
+        two * (x * y - w * z),
+        two * (x * z + w * y),
+        two * (x * y + w * z),
+        one - two * (x * x + z * z),
+        two * (y * z - w * x),
+        two * (x * z - w * y),
+        two * (y * z + w * x),
+        one - two * (x * x + y * y),
+    )
 
 
 @wp.func
@@ -172,14 +183,17 @@ def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
     share, yaw_share = REAL(1.0), REAL(1.0)
     if p.geometric == 1:
         for i in range(4):
-            f[i] = wp.clamp(command[0] / REAL(4.0) + level[i] + p.spin[i] * yaw, p.thrust_min, limit)
+            f[i] = wp.clamp(
+                command[0] / REAL(4.0) + level[i] + p.spin[i] * yaw, p.thrust_min, limit
+            )
     else:
         room = limit - p.thrust_min
         spread = wp.max(level) - wp.min(level)
         if spread > room:
             share = room / spread
         level = share * level
-        # The yaw share moves the rotors of one sense up and the others down; the spread of all four must stay in the room.
+        # The yaw share moves the rotors of one sense up and the others down; the spread of all four
+        # must stay in the room.
         most = REAL(1.0e9)
         least = -REAL(1.0e9)
         for i in range(4):
@@ -216,7 +230,9 @@ def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
 
 @wp.func
 def vehicle_load(p: Numbers, b: Body, command: V4, push: V3, twist: V3):
-    """Force [N, world] and torque [N m, body] on the vehicle without rope and weight, thrust [N], and its inner derivatives."""
+    """Force [N, world] and torque [N m, body] on the vehicle without rope and weight, thrust [N],
+    and its inner derivatives.
+    """
     d = Body()
     demand, d = motor_demand(p, b, command, d)
     speed = b.spin
@@ -239,7 +255,12 @@ def vehicle_load(p: Numbers, b: Body, command: V4, push: V3, twist: V3):
     torque = twist
     total, power, momentum, slew = REAL(0.0), p.idle_power + REAL(0.0), REAL(0.0), REAL(0.0)
     for i in range(4):
-        thrust = (p.thrust_square * speed[i] * speed[i] + p.thrust_linear * speed[i]) * volts * p.rotor_gain[i] * cushion
+        thrust = (
+            (p.thrust_square * speed[i] * speed[i] + p.thrust_linear * speed[i])
+            * volts
+            * p.rotor_gain[i]
+            * cushion
+        )
         slew += REAL(2.0) * p.thrust_square * speed[i] * d.spin[i]
         arm = V3(p.rotor_x[i], p.rotor_y[i], p.rotor_z) - p.com
         hub = air + wp.cross(b.w, arm)
@@ -286,7 +307,9 @@ def ball_force(p: Numbers, v: V3, rot: M3, thrust: REAL, hanging: wp.int32):
         level = wp.sqrt(air[0] * air[0] + air[1] * air[1])
         if level > REAL(0.0):
             up = V3(-air[0] * air[2] / level, -air[1] * air[2] / level, level)
-            out += wp.length(air) * (p.ball_side * V3(-air[1], air[0], REAL(0.0)) + p.ball_lift * up)
+            out += wp.length(air) * (
+                p.ball_side * V3(-air[1], air[0], REAL(0.0)) + p.ball_lift * up
+            )
     if hanging == 1:
         out -= p.jet_push * thrust * (rot * V3(REAL(0.0), REAL(0.0), REAL(1.0)))
     return out

@@ -1,11 +1,12 @@
-"""Flies planned throws: in the controller's own pendulum (idealised), and on the plants behind :mod:`visthrow.throws.plants`.
+"""Flies planned throws: in the controller's own pendulum (idealised), and on the plants behind
+:mod:`visthrow.throws.plants`.
 
-The own model knows no delay, no noise, no lag of the release and no aerodynamics: what is flown there is an upper bound.
-On the plants the pendulum's state is put together from what the plant measures, payload velocity included, and smoothed
-by the model. To make up for delays the controller looks ahead by what it knows of them (measurement, command queue,
-motors) through its own model under the commands on their way, and trips the latch early by the release's lag;
-:data:`COMPENSATIONS` names which of the two it does.
-"""
+The own model knows no delay, no noise, no lag of the release and no aerodynamics: what is flown
+there is an upper bound. On the plants the pendulum's state is put together from what the plant
+measures, payload velocity included, and smoothed by the model. To make up for delays the controller
+looks ahead by what it knows of them (measurement, command queue, motors) through its own model
+under the commands on their way, and trips the latch early by the release's lag;
+:data:`COMPENSATIONS` names which of the two it does."""
 
 import math
 from dataclasses import dataclass
@@ -21,30 +22,48 @@ from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws, pilots_hover
-from visthrow.throws.flight import FALL_TIME, Decision, Flight, Pilots, Scores, Smoothness, hover, throw
+from visthrow.throws.flight import (
+    FALL_TIME,
+    Decision,
+    Flight,
+    Pilots,
+    Scores,
+    Smoothness,
+    hover,
+    throw,
+)
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
 
-FINE = 4  # Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one
+# Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one
+FINE = 4
 
 
 SENT = 8  # commands on their way that the controller looks back at; more than any delay holds
 
 TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
-"""Share of a measurement in the estimate of payload position and velocity, cable direction and rate, and attitude."""
+"""Share of a measurement in the estimate of payload position and velocity, cable direction and
+rate, and attitude.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flown(Throws):
     """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model."""
 
-    position_error: np.ndarray  # of the payload at separation against the planned release [m], shape (N,)
+    position_error: (
+        np.ndarray
+    )  # of the payload at separation against the planned release [m], shape (N,)
     velocity_error: np.ndarray  # the same [m/s], shape (N,)
-    tracking: np.ndarray  # root mean square distance of the payload from the path until the release [m], shape (N,)
+    tracking: (
+        np.ndarray
+    )  # root mean square distance of the payload from the path until the release [m], shape (N,)
     step_times: np.ndarray  # of all steps of the controller [s], shape (K,)
 
 
-def _off(plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray) -> dict[str, np.ndarray]:
+def _off(
+    plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray
+) -> dict[str, np.ndarray]:
     """How far payloads were from the planned release at separation; NaN where a throw failed."""
     blank = np.where(good, 1.0, np.nan)
     return {
@@ -60,11 +79,12 @@ def _normalised(params: MPCParams, command: np.ndarray) -> np.ndarray:
 
 
 def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
-    """Hover with the rest of a pilot's hover, by ``configs/start/hover.toml``: states, shape (N, 16).
+    """Hover with the rest of a pilot's hover, by ``configs/start/hover.toml``: states, shape (N,
+    16).
 
-    What varies between throws: position and velocity of the payload, direction and rate of the cable, attitude. The
-    vehicle's mass, the cable's length and the battery, which vary in training too, are the model's own here.
-    """
+    What varies between throws: position and velocity of the payload, direction and rate of the
+    cable, attitude. The vehicle's mass, the cable's length and the battery, which vary in training
+    too, are the model's own here."""
     start, rng = pilots_hover(), np.random.default_rng(seed)
 
     def drawn(spread) -> np.ndarray:
@@ -83,11 +103,11 @@ def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
 
 
 def fly_pendulum(plan: Plan, count: int = 10, seed: int = 0, landing_height: float = 0.04) -> Flown:
-    """Fly a plan so many times in the pendulum that the controller believes in; the landing's height [m] is the payload's centre's.
+    """Fly a plan so many times in the pendulum that the controller believes in; the landing's
+    height [m] is the payload's centre's.
 
-    A throw fails when the controller's programme is not solved, the cable slackens or the payload falls short. The release comes
-    at the plan's time, within a control period if need be.
-    """
+    A throw fails when the controller's programme is not solved, the cable slackens or the payload
+    falls short. The release comes at the plan's time, within a control period if need be."""
     params = MPCParams()
     controller = MPC(plan.model, params)
     steps, horizon = math.ceil(plan.path.duration / params.period - 1e-6), params.stages
@@ -103,11 +123,15 @@ def fly_pendulum(plan: Plan, count: int = 10, seed: int = 0, landing_height: flo
             for k in range(steps):
                 off = state[e, pm.POS] - reference[0][k, pm.POS]
                 tracking[e] += off @ off
-                command = controller.step(state[e], (reference[0][k : k + horizon + 1], reference[1][k : k + horizon]))
+                command = controller.step(
+                    state[e], (reference[0][k : k + horizon + 1], reference[1][k : k + horizon])
+                )
                 times.append(controller.step_time)
                 change.add(_normalised(params, command[None]))
                 good[e] &= pm.tension(plan.model, state[e], command) > 0.0
-                state[e] = pm.step(plan.model, state[e], command, params.period if k < steps - 1 else last, FINE)
+                state[e] = pm.step(
+                    plan.model, state[e], command, params.period if k < steps - 1 else last, FINE
+                )
         except SolverError:
             good[e] = False
         smoothness[e] = change.value[0]
@@ -117,22 +141,37 @@ def fly_pendulum(plan: Plan, count: int = 10, seed: int = 0, landing_height: flo
     landing = point * blank[:, None]
     error = np.linalg.norm(landing - [plan.target, 0.0], axis=1)
     return Flown(
-        plan.target, good, landing, error, (plan.path.duration + fall) * blank, np.full(count, np.nan), smoothness * blank,
-        **_off(plan, state[:, pm.POS], state[:, pm.VEL], good), tracking=np.sqrt(tracking / steps) * blank,
+        plan.target,
+        good,
+        landing,
+        error,
+        (plan.path.duration + fall) * blank,
+        np.full(count, np.nan),
+        smoothness * blank,
+        **_off(plan, state[:, pm.POS], state[:, pm.VEL], good),
+        tracking=np.sqrt(tracking / steps) * blank,
         step_times=np.array(times),
-    )  # fmt: skip
+    )
 
 
 def pendulum_state(snapshot: Snapshot, mount_b: np.ndarray) -> np.ndarray:
-    """State of the pendulum as a plant shows it, cable straight from mount to payload, shape (E, 16)."""
+    """State of the pendulum as a plant shows it, cable straight from mount to payload, shape (E,
+    16).
+    """
     rot = matrix_of_quat(snapshot.quat_wb)
     arm = rot @ mount_b
     cable = snapshot.payload_pos_w - snapshot.pos_w - arm
     length = np.linalg.norm(cable, axis=1, keepdims=True)
-    moving = snapshot.payload_vel_w - snapshot.vel_w - np.einsum("eij,ej->ei", rot, np.cross(snapshot.rate_b, mount_b))
+    moving = (
+        snapshot.payload_vel_w
+        - snapshot.vel_w
+        - np.einsum("eij,ej->ei", rot, np.cross(snapshot.rate_b, mount_b))
+    )
     direction = cable / length
     rate = np.cross(direction, moving) / length
-    return np.concatenate([snapshot.payload_pos_w, snapshot.payload_vel_w, direction, rate, snapshot.quat_wb], axis=1)
+    return np.concatenate(
+        [snapshot.payload_pos_w, snapshot.payload_vel_w, direction, rate, snapshot.quat_wb], axis=1
+    )
 
 
 @dataclass(frozen=True)
@@ -145,26 +184,43 @@ class Delays:
 
 
 COMPENSATIONS = ("none", "release", "delay", "both")
-"""What is made up for: nothing, as in the paper; the release's lag; delays of measurement, command and motors; all."""
+"""What is made up for: nothing, as in the paper; the release's lag; delays of measurement, command
+and motors; all.
+"""
 
 
 def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
-    """Known delays of a plant: mean age of measurements; command queue, set-point filter and motors; release.
+    """Known delays of a plant: mean age of measurements; command queue, set-point filter and
+    motors; release.
 
     Raises ConfigError: no compensation of that name.
     """
     if compensation not in COMPENSATIONS:
-        raise ConfigError(f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}")
+        raise ConfigError(
+            f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}"
+        )
     vehicle, told = experiment.vehicle, experiment.task.observation.latency
     motors = vehicle.motor.time_constant if vehicle.motor.kind == "first_order" else 0.0
-    setpoint = vehicle.controller.setpoint_time_constant if vehicle.controller.kind == "betaflight" else 0.0
+    setpoint = (
+        vehicle.controller.setpoint_time_constant
+        if vehicle.controller.kind == "betaflight"
+        else 0.0
+    )
     effect = vehicle.queue.delay + setpoint + motors
     across = (float(np.mean(told)), effect) if compensation in ("delay", "both") else (0.0, 0.0)
     return Delays(*across, experiment.release.lag if compensation in ("release", "both") else 0.0)
 
 
-def look_ahead(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: float, begin: float, end: float = 0.0) -> np.ndarray:
-    """Predict states, shape (E, 16), under the commands that were given from ``begin`` to ``end`` [s] ago, each held for a period [s].
+def look_ahead(
+    model: Pendulum,
+    state: np.ndarray,
+    sent: np.ndarray,
+    period: float,
+    begin: float,
+    end: float = 0.0,
+) -> np.ndarray:
+    """Predict states, shape (E, 16), under the commands that were given from ``begin`` to ``end``
+    [s] ago, each held for a period [s].
 
     ``sent``: commands given one period ago, two periods ago and so on, shape (K, E, 4).
     """
@@ -177,11 +233,17 @@ def look_ahead(model: Pendulum, state: np.ndarray, sent: np.ndarray, period: flo
     return state
 
 
-def _started(name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str) -> tuple[Plant, np.ndarray]:
-    """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m], shape (3,)."""
+def _started(
+    name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
+) -> tuple[Plant, np.ndarray]:
+    """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m],
+    shape (3,).
+    """
     task, start = experiment.task, pilots_hover()
     if name == "hybrid":
-        plant = HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency, start)
+        plant = HybridPlant(
+            experiment, count, seed, device, task.noise, task.observation.latency, start
+        )
         return plant, np.array([0.0, 0.0, start.spawn_height])
     plant, rng = batch_plant(experiment, name, target, batch, count, seed)
     return plant, place_in_hover(plant, experiment, rng)
@@ -190,13 +252,19 @@ def _started(name: str, experiment: Experiment, target: float, batch: int, count
 class Controllers(Pilots):
     """MPC of E vehicles as the pilots of a flight: tracks a plan, and trips the latch at its time.
 
-    Attributes: ``latch``, the period of the throw in which the latch trips, ``most`` periods of a throw, ``times`` of all steps [s].
-    """
+    Attributes: ``latch``, the period of the throw in which the latch trips, ``most`` periods of a
+    throw, ``times`` of all steps [s]."""
 
-    def __init__(self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int) -> None:
-        """Begin in hover, with the experiment's limits, mount and release; commands come each period [s]."""
+    def __init__(
+        self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int
+    ) -> None:
+        """Begin in hover, with the experiment's limits, mount and release; commands come each
+        period [s].
+        """
         self.plan, self.delays, self.period, action = plan, delays, period, experiment.task.action
-        self.params = MPCParams(period=period, max_thrust=action.max_thrust, max_rate=action.max_rate)
+        self.params = MPCParams(
+            period=period, max_thrust=action.max_thrust, max_rate=action.max_rate
+        )
         self.latch = round((plan.path.duration - delays.release) / period)
         self.most = self.latch + round((experiment.release.lag + FALL_TIME) / period) + 2
         self.times: list[float] = []
@@ -209,11 +277,17 @@ class Controllers(Pilots):
         self._period = 0
 
     def decide(self, flight: Flight, seen: Snapshot, held: np.ndarray) -> Decision:
-        """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has failed, and is held."""
+        """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has
+        failed, and is held.
+        """
         command, k, n = held.copy(), self._period, self.params.stages
-        sent = np.stack([*flight.commands[: -SENT - 1 : -1], *[self._hover] * (SENT - len(flight.commands))])
+        sent = np.stack(
+            [*flight.commands[: -SENT - 1 : -1], *[self._hover] * (SENT - len(flight.commands))]
+        )
         span = self.delays.measurement + self.delays.command
-        state = look_ahead(self.plan.model, self._estimated(seen, sent, span), sent, self.period, span)
+        state = look_ahead(
+            self.plan.model, self._estimated(seen, sent, span), sent, self.period, span
+        )
         reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
         for e in np.flatnonzero(flight.flown):
             try:
@@ -222,14 +296,20 @@ class Controllers(Pilots):
             except SolverError as error:
                 flight.fail(e, str(error))
         self._period += 1
-        return Decision(command, np.full(len(command), k >= self.latch), _normalised(self.params, command))
+        return Decision(
+            command, np.full(len(command), k >= self.latch), _normalised(self.params, command)
+        )
 
     def _estimated(self, seen: Snapshot, sent: np.ndarray, span: float) -> np.ndarray:
-        """State now: the model's prediction from the period before, corrected by what is measured."""
+        """State now: the model's prediction from the period before, corrected by what
+        is measured.
+        """
         measured = pendulum_state(seen, np.array(self.experiment.rope.mount))
         if self._estimate is None:
             self._estimate = measured
-        then = look_ahead(self.plan.model, self._estimate, sent, self.period, span + self.period, span)
+        then = look_ahead(
+            self.plan.model, self._estimate, sent, self.period, span + self.period, span
+        )
         side = np.sign((then[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
         measured[:, pm.QUAT] *= side
         estimate = then + TRUST * (measured - then)
@@ -258,31 +338,50 @@ class _Tracking(Scores):
         self._period += 1
         elapsed = self._period * flight.plant.period
         due = now.attached & (elapsed <= path.duration)
-        self._sum += due * ((now.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2).sum(1)
+        self._sum += due * ((now.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2).sum(
+            1
+        )
         self._due += due
         for e in np.flatnonzero(seen.attached & ~now.attached):
             back = flight.plant.time - flight.plant.landing.separation_time[e]
             vel = now.payload_vel_w[e] + np.array([0.0, 0.0, GRAVITY * back])
-            self.separated[:, e] = now.payload_pos_w[e] - back * 0.5 * (vel + now.payload_vel_w[e]), vel
+            self.separated[:, e] = (
+                now.payload_pos_w[e] - back * 0.5 * (vel + now.payload_vel_w[e]),
+                vel,
+            )
 
     def flown(self, flight: Flight) -> Flown:
         """Results of all throws."""
         columns = self.columns(flight)
         off = _off(self.pilots.plan, *self.separated, columns["success"])
-        tracking = np.sqrt(self._sum / np.maximum(self._due, 1)) * np.where(columns["success"], 1.0, np.nan)
-        return Flown(self.pilots.plan.target, **columns, **off, tracking=tracking, step_times=np.array(self.pilots.times))
+        tracking = np.sqrt(self._sum / np.maximum(self._due, 1)) * np.where(
+            columns["success"], 1.0, np.nan
+        )
+        return Flown(
+            self.pilots.plan.target,
+            **columns,
+            **off,
+            tracking=tracking,
+            step_times=np.array(self.pilots.times),
+        )
 
 
 def fly_plant(
-    plan: Plan, plant_name: str, experiment: Experiment, delays: Delays, count: int = 10, seed: int = 0, batch: int = 0,
+    plan: Plan,
+    plant_name: str,
+    experiment: Experiment,
+    delays: Delays,
+    count: int = 10,
+    seed: int = 0,
+    batch: int = 0,
     device: str = "cpu",
-) -> Flown:  # fmt: skip
+) -> Flown:
     """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`, the delays made up for.
 
-    The throws are those that learnt policies meet with the same count and seed: in the training simulator the same vehicles,
-    ropes and starts as :func:`visthrow.training.protocol.throw`, on a reference plant the same vehicles, winds and starts as
-    batch ``batch`` of :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller.
-    """
+    The throws are those that learnt policies meet with the same count and seed: in the training
+    simulator the same vehicles, ropes and starts as :func:`visthrow.training.protocol.throw`, on a
+    reference plant the same vehicles, winds and starts as batch ``batch`` of
+    :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller."""
     plant, home = _started(plant_name, experiment, plan.target, batch, count, seed, device)
     pilots = Controllers(plan, experiment, plant.period, delays, count)
     flight = Flight(plant, pilots, tracking := _Tracking(pilots), home)

@@ -9,7 +9,10 @@ SPEEDS = (1.7, 2.2, 2.5, 2.9)  # release speeds of the sweep [m/s]; the paper's 
 WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3))
 """Duration and energy weights of the sweep; the last three are the paper's."""
 
-FRONT_TARGET, FRONT_THROWS = 2.0, 10  # target of the sweep (the paper, Table IV) [m], and throws of a setting, as in the paper
+FRONT_TARGET, FRONT_THROWS = (
+    2.0,
+    10,
+)  # target of the sweep (the paper, Table IV) [m], and throws of a setting, as in the paper
 
 PAPER_FRONT = (
     (2.2, 50e3, 0.005, 0.413, 1.285, 0.044, 0.143),
@@ -17,7 +20,9 @@ PAPER_FRONT = (
     (1.7, 30e3, 0.01, 0.087, 1.461, 0.044, 0.071),
     (1.7, 3e3, 0.3, 0.027, 2.128, 0.037, 0.004),
 )
-"""Release speed [m/s], w_t, rho, landing error [m], duration [s], position [m] and velocity error [m/s] at release (Table IV)."""
+"""Release speed [m/s], w_t, rho, landing error [m], duration [s], position [m] and velocity error
+[m/s] at release (Table IV).
+"""
 
 CORNER = (2.5, 0.5)  # duration [s] and landing error [m] that hypervolumes are measured from
 

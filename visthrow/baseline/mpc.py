@@ -1,13 +1,14 @@
-"""Nonlinear model-predictive controller of the pendulum: one real-time iteration of SQP a control period.
+"""Nonlinear model-predictive controller of the pendulum: one real-time iteration of SQP a control
+period.
 
-Least squares over the horizon, on payload, cable, attitude and control effort (the paper, Sec. IV-A; weights are ours),
-under bounds on thrust and body rates. Each step linearises the model about the last solution moved on by one period,
-and solves one sparse quadratic programme with piqp's multistage factorisation.
+Least squares over the horizon, on payload, cable, attitude and control effort (the paper, Sec.
+IV-A; weights are ours), under bounds on thrust and body rates. Each step linearises the model about
+the last solution moved on by one period, and solves one sparse quadratic programme with piqp's
+multistage factorisation.
 
-Source: Diehl, Bock, Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control",
-SIAM J. Control Optim. 2005; Schwan, Jiang, Kuhn, Jones, "PIQP: A proximal interior-point quadratic programming solver",
-CDC 2023.
-"""
+Source: Diehl, Bock, Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
+feedback control", SIAM J. Control Optim. 2005; Schwan, Jiang, Kuhn, Jones, "PIQP: A proximal
+interior-point quadratic programming solver", CDC 2023."""
 
 import time
 from dataclasses import dataclass
@@ -46,7 +47,10 @@ class MPCParams:
     @property
     def state_weights(self) -> np.ndarray:
         """Shape (16,)."""
-        scale = np.repeat([self.position, self.velocity, self.direction, self.rate, self.attitude], [3, 3, 3, 3, 4])
+        scale = np.repeat(
+            [self.position, self.velocity, self.direction, self.rate, self.attitude],
+            [3, 3, 3, 3, 4],
+        )
         return scale**-2.0
 
     @property
@@ -59,7 +63,10 @@ class MPC:
     """Controller of one vehicle."""
 
     def __init__(self, model: Pendulum, params: MPCParams | None = None) -> None:
-        """Build the programme's pattern; it is factorised symbolically once. ModuleNotFoundError where piqp is not installed."""
+        """Build the programme's pattern; it is factorised symbolically once.
+
+        ModuleNotFoundError where piqp is not installed.
+        """
         import piqp
 
         self.model, self.params = model, params or MPCParams()
@@ -68,7 +75,11 @@ class MPC:
         weights = np.concatenate([self.params.state_weights, self.params.input_weights])
         self._weights = np.concatenate([np.tile(weights, n), self.params.state_weights])
         self._rows_columns()
-        free, last, most = np.full(STATES, np.inf), np.full(STATES, np.inf), np.array(self.params.max_rate)
+        free, last, most = (
+            np.full(STATES, np.inf),
+            np.full(STATES, np.inf),
+            np.array(self.params.max_rate),
+        )
         low = np.concatenate([*[np.r_[-free, self.params.min_thrust, -most]] * n, -last])
         high = np.concatenate([*[np.r_[free, self.params.max_thrust, most]] * n, last])
         self._bounds = low, high
@@ -87,7 +98,9 @@ class MPC:
         self.step_time = 0.0
 
     def _rows_columns(self) -> None:
-        """Pattern of the constraints: stage k's rows hold -[A B] of stage k and 1 of stage k + 1; the first rows x_0."""
+        """Pattern of the constraints: stage k's rows hold -[A B] of stage k and 1 of stage k + 1;
+        the first rows x_0.
+        """
         n, eye = self.params.stages, np.arange(STATES)
         row, column = [eye], [eye]
         for k in range(n):
@@ -99,7 +112,9 @@ class MPC:
         shape = ((n + 1) * STATES, n * WIDTH + STATES)
         count = np.bincount(column, minlength=shape[1])
         pointer = np.concatenate([[0], np.cumsum(count)])
-        self._matrix = sparse.csc_matrix((np.ones(len(row)), row[self._order], pointer), shape=shape)
+        self._matrix = sparse.csc_matrix(
+            (np.ones(len(row)), row[self._order], pointer), shape=shape
+        )
 
     def _fill(self, by_state: np.ndarray, by_input: np.ndarray) -> None:
         n = self.params.stages
@@ -108,10 +123,11 @@ class MPC:
         self._matrix.data[:] = np.concatenate([np.ones(STATES), values])[self._order]
 
     def step(self, state: np.ndarray, reference: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming period, shape (4,).
+        """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming
+        period, shape (4,).
 
-        Raises SolverError: the programme was not solved; the message carries the solver's status; ValueError: a reference of another
-        length.
+        Raises SolverError: the programme was not solved; the message carries the solver's status;
+        ValueError: a reference of another length.
 
         Args:
             state: now.
@@ -121,18 +137,32 @@ class MPC:
         n = self.params.stages
         target, effort = reference
         if target.shape != (n + 1, STATES) or effort.shape != (n, INPUTS):
-            raise ValueError(f"reference of shapes {target.shape}, {effort.shape}; expected ({n + 1}, 16), ({n}, 4)")
+            raise ValueError(
+                f"reference of shapes {target.shape}, {effort.shape}; expected ({n + 1}, 16),"
+                f" ({n}, 4)"
+            )
         if self._states is None:
             self._states, self._inputs = target.copy(), effort.copy()
-        state, *target = _same_side(np.vstack([state, target]), np.vstack([self._states[:1], self._states]))
+        state, *target = _same_side(
+            np.vstack([state, target]), np.vstack([self._states[:1], self._states])
+        )
         target = np.array(target)
-        moved, by_state, by_input = pm.linearise(self.model, self._states[:n], self._inputs, self.params.period)
+        moved, by_state, by_input = pm.linearise(
+            self.model, self._states[:n], self._inputs, self.params.period
+        )
         self._fill(by_state, by_input)
-        free = moved - np.einsum("kij,kj->ki", by_state, self._states[:n]) - np.einsum("kij,kj->ki", by_input, self._inputs)
+        free = (
+            moved
+            - np.einsum("kij,kj->ki", by_state, self._states[:n])
+            - np.einsum("kij,kj->ki", by_input, self._inputs)
+        )
         wanted = np.concatenate([np.concatenate([target[:n], effort], axis=1).ravel(), target[n]])
         solution = self._solve(-self._weights * wanted, np.concatenate([state, free.ravel()]))
         stages = solution[: n * WIDTH].reshape(n, WIDTH)
-        states, inputs = np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]]), stages[:, STATES:]
+        states, inputs = (
+            np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]]),
+            stages[:, STATES:],
+        )
         command = inputs[0].copy()
         self._move_on(states, inputs)
         self.step_time = time.perf_counter() - began
@@ -146,7 +176,9 @@ class MPC:
         status = self._solver.solve()
         if status != self._solved:
             self._ready = False
-            raise SolverError(f"the controller's quadratic programme ended with {status}; expected {self._solved}")
+            raise SolverError(
+                f"the controller's quadratic programme ended with {status}; expected {self._solved}"
+            )
         return np.asarray(self._solver.result.x)
 
     def _set_up(self, linear: np.ndarray, right: np.ndarray) -> None:
@@ -157,9 +189,13 @@ class MPC:
         self._ready = True
 
     def _move_on(self, states: np.ndarray, inputs: np.ndarray) -> None:
-        """Keep the solution as of one period later, its last input held; directions and quaternions back at unit length."""
+        """Keep the solution as of one period later, its last input held; directions and quaternions
+        back at unit length.
+        """
         self._inputs = np.concatenate([inputs[1:], inputs[-1:]])
-        self._states = np.concatenate([states[1:], pm.step(self.model, states[-1], inputs[-1], self.params.period)[None]])
+        self._states = np.concatenate(
+            [states[1:], pm.step(self.model, states[-1], inputs[-1], self.params.period)[None]]
+        )
         for part in (DIR, QUAT):
             self._states[:, part] /= np.linalg.norm(self._states[:, part], axis=1, keepdims=True)
 

@@ -1,17 +1,18 @@
-"""The baseline's model: a point mass under a massless, taut, inextensible cable below a quadrotor that follows body rates.
+"""The baseline's model: a point mass under a massless, taut, inextensible cable below a quadrotor
+that follows body rates.
 
-State of 16 numbers: payload position p and velocity v (world), cable direction q from vehicle to payload and its angular
-velocity w (world, at right angles to q), attitude quaternion (xyzw, body to world). Input of 4: collective thrust c
-[N] and body rates [rad/s]. With the masses M of the vehicle and m of the payload, cable length l, ``b`` the body's z axis:
+State of 16 numbers: payload position p and velocity v (world), cable direction q from vehicle to
+payload and its angular velocity w (world, at right angles to q), attitude quaternion (xyzw, body to
+world). Input of 4: collective thrust c [N] and body rates [rad/s]. With the masses M of the vehicle
+and m of the payload, cable length l, ``b`` the body's z axis:
 
 - ``p' = v``, ``(M + m) (v' + g e_z) = (q . c b - M l |w|^2) q``
 - ``q' = w x q``, ``M l w' = -q x c b``
 - ``quat' = quat * (rates, 0) / 2``
 
-Source: Sreenath, Lee, Kumar, "Geometric control and differential flatness of a quadrotor UAV with a cable-suspended
-load", CDC 2013, eqs. (5) to (8), with the attitude driven by commanded rates. The paper's baseline (Sec. IV-A) uses the
-same sixteen states; the equations are not printed there.
-"""
+Source: Sreenath, Lee, Kumar, "Geometric control and differential flatness of a quadrotor UAV with a
+cable-suspended load", CDC 2013, eqs. (5) to (8), with the attitude driven by commanded rates. The
+paper's baseline (Sec. IV-A) uses the same sixteen states; the equations are not printed there."""
 
 from dataclasses import dataclass
 
@@ -20,14 +21,22 @@ import numpy as np
 from sim.params import GRAVITY, PlantParams
 
 STATES, INPUTS = 16, 4
-POS, VEL, DIR, RATE, QUAT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 16)  # parts of the state
+POS, VEL, DIR, RATE, QUAT = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 9),
+    slice(9, 12),
+    slice(12, 16),
+)  # parts of the state
 
 _TINY = 1e-30  # complex step: so small that the derivative has no truncation error
 
 
 @dataclass(frozen=True)
 class Pendulum:
-    """Masses [kg] and the length of the cable from its mount to the payload's centre [m]; ValueError where one is not positive."""
+    """Masses [kg] and the length of the cable from its mount to the payload's centre [m];
+    ValueError where one is not positive.
+    """
 
     vehicle_mass: float
     payload_mass: float
@@ -47,11 +56,15 @@ class Pendulum:
 def pendulum_of(plant: PlantParams) -> Pendulum:
     """Pendulum of a plant: half of the rope's mass at each of its ends, as in a finite element."""
     rope, half = plant.rope, 0.5 * plant.rope.rope_mass
-    return Pendulum(plant.vehicle.body.mass + half, rope.payload_mass + half, rope.length + rope.payload_offset)
+    return Pendulum(
+        plant.vehicle.body.mass + half, rope.payload_mass + half, rope.length + rope.payload_offset
+    )
 
 
 def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Rate of change of states, shape (16, ...), under thrust [N] and body rates [rad/s], shape (4, ...); complex numbers pass through."""
+    """Rate of change of states, shape (16, ...), under thrust [N] and body rates [rad/s], shape (4,
+    ...); complex numbers pass through.
+    """
     qx, qy, qz, wx, wy, wz, x, y, z, w = state[6:]
     thrust, p, q, r = control
     bx, by, bz = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
@@ -63,7 +76,11 @@ def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.nd
     out[0:3] = state[3:6]
     out[3], out[4], out[5] = pull * qx, pull * qy, pull * qz - GRAVITY
     out[6], out[7], out[8] = wy * qz - wz * qy, wz * qx - wx * qz, wx * qy - wy * qx
-    out[9], out[10], out[11] = turn * (qy * bz - qz * by), turn * (qz * bx - qx * bz), turn * (qx * by - qy * bx)
+    out[9], out[10], out[11] = (
+        turn * (qy * bz - qz * by),
+        turn * (qz * bx - qx * bz),
+        turn * (qx * by - qy * bx),
+    )
     out[12] = 0.5 * (w * p + y * r - z * q)
     out[13] = 0.5 * (w * q + z * p - x * r)
     out[14] = 0.5 * (w * r + x * q - y * p)
@@ -72,20 +89,27 @@ def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.nd
 
 
 def _advance(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float) -> np.ndarray:
-    """One step of the classical Runge-Kutta method, then direction and quaternion at unit length, w across q."""
+    """One step of the classical Runge-Kutta method, then direction and quaternion at unit length, w
+    across q.
+    """
     k1 = derivative(model, state, control)
     k2 = derivative(model, state + (0.5 * period) * k1, control)
     k3 = derivative(model, state + (0.5 * period) * k2, control)
     k4 = derivative(model, state + period * k3, control)
     out = state + (period / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-    out[DIR] /= np.sqrt((out[DIR] * out[DIR]).sum(0))  # written without conjugates for the complex step
+    out[DIR] /= np.sqrt(
+        (out[DIR] * out[DIR]).sum(0)
+    )  # written without conjugates for the complex step
     out[RATE] -= out[DIR] * (out[DIR] * out[RATE]).sum(0)
     out[QUAT] /= np.sqrt((out[QUAT] * out[QUAT]).sum(0))
     return out
 
 
-def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float, substeps: int = 1) -> np.ndarray:
-    """Advance states, shape (..., 16), under constant inputs, shape (..., 4), over a period [s] in so many Runge-Kutta steps.
+def step(
+    model: Pendulum, state: np.ndarray, control: np.ndarray, period: float, substeps: int = 1
+) -> np.ndarray:
+    """Advance states, shape (..., 16), under constant inputs, shape (..., 4), over a period [s] in
+    so many Runge-Kutta steps.
 
     Raises ValueError: arrays of other widths.
     """
@@ -96,13 +120,16 @@ def step(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float,
     return np.moveaxis(columns, 0, -1)
 
 
-def linearise(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex steps, exact to rounding.
+def linearise(
+    model: Pendulum, state: np.ndarray, control: np.ndarray, period: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex
+    steps, exact to rounding.
 
     Returns next states (K, 16), Jacobians by state (K, 16, 16) and by input (K, 16, 4).
 
-    Source: Squire and Trapp, "Using complex variables to estimate derivatives of real functions", SIAM Review 1998.
-    """
+    Source: Squire and Trapp, "Using complex variables to estimate derivatives of real functions",
+    SIAM Review 1998."""
     state, control = _checked(state, control)
     both = np.concatenate([state.T, control.T])  # (20, K)
     count, width = both.shape[1], STATES + INPUTS
@@ -116,7 +143,9 @@ def linearise(model: Pendulum, state: np.ndarray, control: np.ndarray, period: f
 
 
 def tension(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Cable force [N], shape (...); below 0 the model's taut cable would push, and the model does not hold."""
+    """Cable force [N], shape (...); below 0 the model's taut cable would push, and the model does
+    not hold.
+    """
     pull = derivative(model, np.moveaxis(state, -1, 0), np.moveaxis(control, -1, 0))[3:6].copy()
     pull[2] += GRAVITY
     return -model.payload_mass * (pull * np.moveaxis(state, -1, 0)[DIR]).sum(0)
@@ -125,11 +154,15 @@ def tension(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarr
 def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position [m] and velocity [m/s] of the vehicle, shape (..., 3) each."""
     direction, rate = state[..., DIR], state[..., RATE]
-    return state[..., POS] - model.length * direction, state[..., VEL] - model.length * np.cross(rate, direction)
+    return state[..., POS] - model.length * direction, state[..., VEL] - model.length * np.cross(
+        rate, direction
+    )
 
 
 def hover(model: Pendulum, payload_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """State (..., 16) and input (..., 4) of hover with the payload at places [m], shape (..., 3)."""
+    """State (..., 16) and input (..., 4) of hover with the payload at places [m], shape
+    (..., 3).
+    """
     payload_w = np.asarray(payload_w, dtype=float)
     state = np.zeros((*payload_w.shape[:-1], STATES))
     state[..., POS], state[..., 8], state[..., 15] = payload_w, -1.0, 1.0
@@ -140,6 +173,12 @@ def hover(model: Pendulum, payload_w: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _checked(state: np.ndarray, control: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     state, control = np.asarray(state, dtype=float), np.asarray(control, dtype=float)
-    if state.shape[-1:] != (STATES,) or control.shape[-1:] != (INPUTS,) or state.shape[:-1] != control.shape[:-1]:
-        raise ValueError(f"got states {state.shape} and inputs {control.shape}; expected (..., 16) and (..., 4)")
+    if (
+        state.shape[-1:] != (STATES,)
+        or control.shape[-1:] != (INPUTS,)
+        or state.shape[:-1] != control.shape[:-1]
+    ):
+        raise ValueError(
+            f"got states {state.shape} and inputs {control.shape}; expected (..., 16) and (..., 4)"
+        )
     return state, control

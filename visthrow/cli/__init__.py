@@ -1,4 +1,5 @@
-"""The command line, a module a command; each is imported only when chosen, so that ``visthrow --help`` answers at once.
+"""The command line, a module a command; each is imported only when chosen, so that ``visthrow
+--help`` answers at once.
 
 ``hil`` and ``diagnose`` keep their own.
 """
@@ -13,17 +14,41 @@ from visthrow.common.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, add_comm
 from visthrow.common.errors import VisthrowError
 
 COMMANDS = {
-    "demo": ("throw once with the shipped vision policy and compare it with the state policy", "visthrow.cli.demo"),
+    "demo": (
+        "throw once with the shipped vision policy and compare it with the state policy",
+        "visthrow.cli.demo",
+    ),
     "train": ("train a throwing policy from scratch", "visthrow.cli.train"),
     "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.cli.fly"),
-    "compare": ("throw many times with each policy and print landing errors and durations", "visthrow.cli.compare"),
-    "detector": ("train the keypoint detector on rendered frames, and check it", "visthrow.cli.detector"),
+    "compare": (
+        "throw many times with each policy and print landing errors and durations",
+        "visthrow.cli.compare",
+    ),
+    "detector": (
+        "train the keypoint detector on rendered frames, and check it",
+        "visthrow.cli.detector",
+    ),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
-    "baseline": ("throw with trajectory optimisation and MPC; its front against the policies", "visthrow.cli.baseline"),
-    "diagnose": ("say what the simulation gets wrong, from measured flights", "visthrow.diagnose.cli"),
-    "sweep": ("work a list of training runs and throws, on several GPUs or a cluster", "visthrow.cli.sweep"),
-    "report": ("write one page with the paper's tables and figures beside ours", "visthrow.cli.report"),
-    "camera": ("make a camera configuration from a calibration, check it, look at what it sees", "visthrow.cli.camera"),
+    "baseline": (
+        "throw with trajectory optimisation and MPC; its front against the policies",
+        "visthrow.cli.baseline",
+    ),
+    "diagnose": (
+        "say what the simulation gets wrong, from measured flights",
+        "visthrow.diagnose.cli",
+    ),
+    "sweep": (
+        "work a list of training runs and throws, on several GPUs or a cluster",
+        "visthrow.cli.sweep",
+    ),
+    "report": (
+        "write one page with the paper's tables and figures beside ours",
+        "visthrow.cli.report",
+    ),
+    "camera": (
+        "make a camera configuration from a calibration, check it, look at what it sees",
+        "visthrow.cli.camera",
+    ),
     "bench": ("print what was measured, with command, commit and machine", "visthrow.cli.bench"),
     "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
 }
@@ -44,14 +69,19 @@ examples:
   visthrow compare --json out/table.json         state against vision over many throws
   visthrow config vehicle paper                  the values of the simulated vehicle
 
-'visthrow COMMAND --help' tells more about a command. Set VISTHROW_TRACEBACK=1 to see where an error came from.
+'visthrow COMMAND --help' describes a command.
+Set VISTHROW_TRACEBACK=1 to see where an error came from.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Build the parser; only the chosen command's module is imported and asked for its arguments."""
+    """Build the parser; only the chosen command's module is imported and asked for its
+    arguments.
+    """
     form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("visthrow", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=form)
+    parser = argparse.ArgumentParser(
+        "visthrow", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=form
+    )
     parser.add_argument("--version", action="version", version=f"visthrow {__version__}")
     add_commands(parser, COMMANDS, "command", title="commands")
     return parser
@@ -60,8 +90,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 
-    Returns the command's own status; 2 for a mistake of the user, told in one message; 130 after Ctrl-C.
-    """
+    Returns the command's own status; 2 for a mistake of the user, told in one message; 130 after
+    Ctrl-C."""
     try:
         args = build_parser().parse_args(argv)
         return run_command(COMMANDS, args.command, args)
@@ -73,11 +103,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except ModuleNotFoundError as error:
         if hider := _hidden(error):
-            return _refuse(f"{hider} hides visthrow's own package of that name; rename it, or run the command from another folder")
+            return _refuse(
+                f"{hider} hides visthrow's own package of that name; rename it, or run the command"
+                " from another folder"
+            )
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
             raise
-        return _refuse(f"this needs the package '{error.name}'; install it with: pip install 'visthrow[{extra}]'")
+        return _refuse(
+            f"this needs the package '{error.name}'; install it with: pip install"
+            f" 'visthrow[{extra}]'"
+        )
     except (VisthrowError, ValueError, OSError) as error:
         if os.environ.get(TRACEBACK_VARIABLE):
             raise
@@ -85,12 +121,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _hidden(error: ModuleNotFoundError) -> str | None:
-    """File of a foreign module or package that stands where one of ours is looked for, as a ``camera.py`` in the working folder."""
+    """File of a foreign module or package that stands where one of ours is looked for, as a
+    ``camera.py`` in the working folder.
+    """
     name = (error.name or "").partition(".")[0]
     found = sys.modules.get(name)
     here = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     place = getattr(found, "__file__", None)
-    if name not in ("camera", "sim", "hil") or place is None or os.path.abspath(place).startswith(os.path.join(here, name)):
+    if (
+        name not in ("camera", "sim", "hil")
+        or place is None
+        or os.path.abspath(place).startswith(os.path.join(here, name))
+    ):
         return None
     return str(place)
 

@@ -1,4 +1,6 @@
-"""``visthrow baseline``: plan with splines, track with MPC, throw: by target, and its front with learnt policies on it."""
+"""``visthrow baseline``: plan with splines, track with MPC, throw: by target, and its front with
+learnt policies on it.
+"""
 
 import argparse
 from collections.abc import Iterator
@@ -13,43 +15,75 @@ POLICY_THROWS = 100  # throws of each learnt policy for its point on the front
 
 TITLE = "Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}"
 NOTE = (
-    "All our figures are simulated; the plant stands in each row. The paper's TO+MPC figures come from its own pendulum "
-    "model, its policies' from a real vehicle. Own-model throws vary in start only (position, velocity, attitude, cable; "
-    "configs/start/hover.toml); on the plants noise, latency and extras vary too."
+    "All our figures are simulated; the plant stands in each row. The paper's TO+MPC figures come"
+    " from its own pendulum model, its policies' from a real vehicle. Own-model throws vary in"
+    " start only (position, velocity, attitude, cable; configs/start/hover.toml); on the plants"
+    " noise, latency and extras vary too."
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow baseline                              tables at three targets and the sweep at 2.0 m (minutes)\n"
-        "  visthrow baseline --quick                      two throws, a small sweep, own model alone\n"
-        "  visthrow baseline --plants hybrid reference-realistic --no-sweep\n"
-        "\nThe baseline plans the payload's path to a release state by projectile motion, with height and speed of a\n"
-        "learnt policy's release, and tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model, an\n"
-        "idealised upper bound, and on the plants, with and without making up for delays and the release's lag.\n"
-        "What is flown is kept in the output folder; interrupted and started again, the command goes on.\n"
+        "examples:\n  visthrow baseline                              tables at three targets and"
+        " the sweep at 2.0 m (minutes)\n  visthrow baseline --quick                      two"
+        " throws, a small sweep, own model alone\n  visthrow baseline --plants hybrid"
+        " reference-realistic --no-sweep\n\nThe baseline plans the payload's path to a release"
+        " state by projectile motion, with height and speed of a\nlearnt policy's release, and"
+        " tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model,"
+        " an\nidealised upper bound, and on the plants, with and without making up for delays and"
+        " the release's lag.\nWhat is flown is kept in the output folder; interrupted and started"
+        " again, the command goes on.\n"
     )
-    parser.add_argument("--targets", type=float, nargs="+", default=list(TARGETS), metavar="M", help="along x [m]")
-    parser.add_argument("--throws", type=int, default=10, metavar="N", help="a row (default: 10, as in the paper)")
     parser.add_argument(
-        "--plants", nargs="*", default=["hybrid"], metavar="NAME",
+        "--targets", type=float, nargs="+", default=list(TARGETS), metavar="M", help="along x [m]"
+    )
+    parser.add_argument(
+        "--throws", type=int, default=10, metavar="N", help="a row (default: 10, as in the paper)"
+    )
+    parser.add_argument(
+        "--plants",
+        nargs="*",
+        default=["hybrid"],
+        metavar="NAME",
         help="beside the own model: hybrid, reference, reference-realistic (default: hybrid)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--release-from", metavar="POLICY",
-        help="measure release height and speed on its throws (default: as measured on the shipped state policy)",
-    )  # fmt: skip
-    parser.add_argument("--policies", nargs="*", default=["state", "vision"], metavar="POLICY", help="points on the front")
+        "--release-from",
+        metavar="POLICY",
+        help=(
+            "measure release height and speed on its throws (default: as measured on the shipped"
+            " state policy)"
+        ),
+    )
     parser.add_argument(
-        "--payload-bounds", action="store_true",
-        help="bound the payload's path alone, as the paper does, not the vehicle's thrust: plans that tracking may fail on",
-    )  # fmt: skip
+        "--policies",
+        nargs="*",
+        default=["state", "vision"],
+        metavar="POLICY",
+        help="points on the front",
+    )
+    parser.add_argument(
+        "--payload-bounds",
+        action="store_true",
+        help=(
+            "bound the payload's path alone, as the paper does, not the vehicle's thrust: plans"
+            " that tracking may fail on"
+        ),
+    )
     parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
-    parser.add_argument("--quick", action="store_true", help="two throws, one speed and two weights, own model alone")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="two throws, one speed and two weights, own model alone",
+    )
     parser.add_argument("--seed", type=WHOLE, default=0, help="of starts and noise (default: 0)")
-    parser.add_argument("--config", default="state", metavar="NAME", help="train config whose plant is flown (default: state)")
+    parser.add_argument(
+        "--config",
+        default="state",
+        metavar="NAME",
+        help="train config whose plant is flown (default: state)",
+    )
     add_out(parser, "out/baseline", "for page, tables, pictures and the single results")
     add_common(parser, device=False)
 
@@ -73,7 +107,10 @@ def run(args: argparse.Namespace) -> int:
     writable(out)
     if args.quick:
         args.throws, args.plants = min(args.throws, 2), []
-    by_target, swept = list(_by_target(args, bounds)), [] if args.no_sweep else list(_swept(args, bounds))
+    by_target, swept = (
+        list(_by_target(args, bounds)),
+        ([] if args.no_sweep else list(_swept(args, bounds))),
+    )
     found = thrower.flown(by_target + swept, out / "throws", status)
     rows, front = found[: len(by_target)], found[len(by_target) :]
     made = [Section("baseline", "By target", (trade.by_target(rows),))]
@@ -95,7 +132,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _how(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
-    return {"bounds": bounds, "config_name": args.config, "overrides": args.overrides, "seed": args.seed}
+    return {
+        "bounds": bounds,
+        "config_name": args.config,
+        "overrides": args.overrides,
+        "seed": args.seed,
+    }
 
 
 def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
@@ -106,17 +148,24 @@ def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str,
     for target in args.targets:
         height, speed = releases.get(target, (None, None))
         for row in thrower.rows(args.plants):
-            yield thrower.units(*row, target, args.throws, height=height, speed=speed, **_how(args, bounds))
+            yield thrower.units(
+                *row, target, args.throws, height=height, speed=speed, **_how(args, bounds)
+            )
 
 
 def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
-    """Units of each setting of the sweep: in the own model and, all delays made up for, on the plants."""
+    """Units of each setting of the sweep: in the own model and, all delays made up for, on the
+    plants.
+    """
     from visthrow.baseline import front, thrower
 
     speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
     for speed in speeds:
         for w_t, rho in weights:
-            for plant, made_up in [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]:
+            for plant, made_up in [
+                (thrower.OWN, "none"),
+                *((plant, "both") for plant in args.plants),
+            ]:
                 how = {"speed": speed, "w_t": w_t, "rho": rho, **_how(args, bounds)}
                 yield thrower.units(plant, made_up, front.FRONT_TARGET, args.throws, **how)
 

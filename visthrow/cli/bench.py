@@ -6,8 +6,12 @@ import argparse
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the action of the command."""
     records = parser.add_subparsers(dest="bench", metavar="ACTION", required=True).add_parser(
-        "records", help="print the recorded measurements as Markdown",
-        description="Print the recorded measurements as Markdown: the command and commit that made each, and the command of today.",
+        "records",
+        help="print the recorded measurements as Markdown",
+        description=(
+            "Print the recorded measurements as Markdown: the command and commit that made each,"
+            " and the command of today."
+        ),
     )
     records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
 

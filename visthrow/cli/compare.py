@@ -1,4 +1,6 @@
-"""``visthrow compare``: throw many times with each policy and print landing errors and durations."""
+"""``visthrow compare``: throw many times with each policy and print landing errors and
+durations.
+"""
 
 import argparse
 import importlib
@@ -21,25 +23,53 @@ DEFAULT_TARGETS = (1.5, 2.0, 2.5)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow compare                               state against vision, 200 throws at each of three targets\n"
-        "  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own\n"
-        "  visthrow compare state baseline --throws 50    against trajectory optimisation and MPC on the same throws\n"
-        "  visthrow compare --plant reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n"
-        "  visthrow compare --from runs/hil/*              throws of HIL runs, from their folders\n"
-        "\nA throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal distance\n"
-        "from the target, the duration counts from the policy's start to the landing, smoothness is the root mean\n"
-        "square change of the normalised commands from step to step. The policy 'baseline' stands for four rows: in the\n"
-        "controller's own model, an idealised bound, and on the plant with no, most or all of the known delays\n"
-        "made up for.\n"
+        "examples:\n  visthrow compare                               state against vision, 200"
+        " throws at each of three targets\n  visthrow compare vision runs/v2/policy.npz     a"
+        " shipped policy against one of your own\n  visthrow compare state baseline --throws 50   "
+        " against trajectory optimisation and MPC on the same throws\n  visthrow compare --plant"
+        " reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n "
+        " visthrow compare --from runs/hil/*              throws of HIL runs, from their"
+        " folders\n\nA throw starts in hover with the payload near z = 0.95 m. The landing error is"
+        " the horizontal distance\nfrom the target, the duration counts from the policy's start to"
+        " the landing, smoothness is the root mean\nsquare change of the normalised commands from"
+        " step to step. The policy 'baseline' stands for four rows: in the\ncontroller's own model,"
+        " an idealised bound, and on the plant with no, most or all of the known delays\nmade up"
+        " for.\n"
     )
     add = parser.add_argument
-    add("policies", metavar="POLICY", nargs="*", help="shipped names, policy files, or baseline (default: state vision)")
-    add("--from", dest="runs", nargs="+", metavar="RUN", help="throw nothing: take the throws of HIL runs from their folders")
-    add("--targets", type=float, nargs="+", default=list(DEFAULT_TARGETS), metavar="M", help="distances along x [m]")
-    add("--throws", type=int, default=200, metavar="N", help="for each policy and target (default: 200)")
+    add(
+        "policies",
+        metavar="POLICY",
+        nargs="*",
+        help="shipped names, policy files, or baseline (default: state vision)",
+    )
+    add(
+        "--from",
+        dest="runs",
+        nargs="+",
+        metavar="RUN",
+        help="throw nothing: take the throws of HIL runs from their folders",
+    )
+    add(
+        "--targets",
+        type=float,
+        nargs="+",
+        default=list(DEFAULT_TARGETS),
+        metavar="M",
+        help="distances along x [m]",
+    )
+    add(
+        "--throws",
+        type=int,
+        default=200,
+        metavar="N",
+        help="for each policy and target (default: 200)",
+    )
     add_conditions(parser, "each policy's")
-    hover = "begin each throw with a hover that calibrates its camera, as the runner does (vision policies, plant hybrid)"
+    hover = (
+        "begin each throw with a hover that calibrates its camera, as the runner does (vision"
+        " policies, plant hybrid)"
+    )
     add("--calibrate", action="store_true", help=hover)
     add_out(parser, "out/compare", "for table, CSV and plot")
     add_common(parser)
@@ -59,16 +89,25 @@ def run(args: argparse.Namespace) -> int:
 
     known_plant(args.plant)
     if args.calibrate and args.plant != "hybrid":
-        raise ConfigError(f"--calibrate on plant '{args.plant}'; expected 'hybrid', whose cameras differ from throw to throw")
+        raise ConfigError(
+            f"--calibrate on plant '{args.plant}'; expected 'hybrid', whose cameras differ from"
+            " throw to throw"
+        )
     wanted = args.policies or DEFAULT_POLICIES
-    loaded = [load_policy(name, args.config, args.overrides, args.allow) for name in wanted if name != NAME]
+    loaded = [
+        load_policy(name, args.config, args.overrides, args.allow)
+        for name in wanted
+        if name != NAME
+    ]
     writable(Path(args.out))
     if NAME in wanted:
         importlib.import_module("piqp")  # said here rather than after all policies have thrown
     if not loaded:
         throws = []
     elif args.plant == "hybrid":
-        throws = throw_hybrid(loaded, args.targets, args.throws, resolve(args.device), args.seed, args.calibrate)
+        throws = throw_hybrid(
+            loaded, args.targets, args.throws, resolve(args.device), args.seed, args.calibrate
+        )
     else:
         from visthrow.throws.reference_protocol import Throwing
 
@@ -79,7 +118,8 @@ def run(args: argparse.Namespace) -> int:
         entries += throw_baseline(args)
     departures = {item.name: item.departures for item in loaded if item.departures}
     notes = [
-        f"; {name} flown with {', '.join(f'{key} = {value!r}' for key, value in of.items())}, trained otherwise"
+        f"; {name} flown with {', '.join(f'{key} = {value!r}' for key, value in of.items())},"
+        " trained otherwise"
         for name, of in departures.items()
     ]
     title, rows = title_of(args.plant, args.seed) + "".join(notes), rows_of(entries)
@@ -87,8 +127,17 @@ def run(args: argparse.Namespace) -> int:
     return _tell(args, entries, rows, told, title)
 
 
-def _tell(args: argparse.Namespace, entries: Sequence[Entry], rows: Sequence[dict], told: dict, title: str, *more: str | None) -> int:
-    """Print and write a table; ``told`` is its JSON, ``more`` subtitle and note of :func:`write`."""
+def _tell(
+    args: argparse.Namespace,
+    entries: Sequence[Entry],
+    rows: Sequence[dict],
+    told: dict,
+    title: str,
+    *more: str | None,
+) -> int:
+    """Print and write a table; ``told`` is its JSON, ``more`` subtitle and note of
+    :func:`write`.
+    """
     from visthrow.common.storage import write_json
 
     print(report(title, rows, *more[1:]))
@@ -100,11 +149,16 @@ def _tell(args: argparse.Namespace, entries: Sequence[Entry], rows: Sequence[dic
 
 
 def _from_runs(args: argparse.Namespace) -> int:
-    """Print and write the table of the throws in folders of HIL runs; ConfigError where policies were named as well."""
+    """Print and write the table of the throws in folders of HIL runs; ConfigError where policies
+    were named as well.
+    """
     from visthrow.throws import from_runs
 
     if args.policies:
-        raise ConfigError(f"--from with policies {' '.join(args.policies)}; the runs say which policies were flown")
+        raise ConfigError(
+            f"--from with policies {' '.join(args.policies)}; the runs say which policies were"
+            " flown"
+        )
     writable(Path(args.out))
     logs = from_runs.logs_of(args.runs)
     entries = from_runs.entries(logs)
@@ -112,7 +166,9 @@ def _from_runs(args: argparse.Namespace) -> int:
     how = ", ".join(sorted({log.meta["plant_meaning"] for log in logs}))
     title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
     told = {"plant": "runs", "runs": args.runs, "rows": rows}
-    return _tell(args, entries, rows, told, title, f"{len(logs)} throws of HIL runs", from_runs.NOTE)
+    return _tell(
+        args, entries, rows, told, title, f"{len(logs)} throws of HIL runs", from_runs.NOTE
+    )
 
 
 def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:
@@ -122,37 +178,68 @@ def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence
 
 
 def throw_baseline(args: argparse.Namespace) -> list[Entry]:
-    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each compensation."""
+    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each
+    compensation.
+    """
     import tempfile
 
     from visthrow.baseline import thrower
     from visthrow.task.measurement import Throws
     from visthrow.throws.reference_protocol import FIELDS
 
-    rows, how = thrower.rows([args.plant]), {"config_name": args.config or "state", "overrides": args.overrides}
-    sets = [thrower.units(*row, target, args.throws, args.seed, **how) for row in rows for target in args.targets]
+    rows, how = (
+        thrower.rows([args.plant]),
+        {
+            "config_name": args.config or "state",
+            "overrides": args.overrides,
+        },
+    )
+    sets = [
+        thrower.units(*row, target, args.throws, args.seed, **how)
+        for row in rows
+        for target in args.targets
+    ]
     with tempfile.TemporaryDirectory() as folder:
         found = thrower.flown(sets, folder, status)
     status("")
-    throws = [Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in found]
+    throws = [
+        Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in found
+    ]
     each = len(args.targets)
     layouts = ("TO+MPC" if plant == thrower.OWN else "" for plant, _ in rows)
-    return [Entry(thrower.title_of(*row), layout, throws[i * each : (i + 1) * each]) for i, (row, layout) in enumerate(zip(rows, layouts))]
+    return [
+        Entry(thrower.title_of(*row), layout, throws[i * each : (i + 1) * each])
+        for i, (row, layout) in enumerate(zip(rows, layouts))
+    ]
 
 
 def check(targets: Sequence[float], throws: int) -> None:
-    """Refuse no throws, and a target that is no distance or further than a vehicle may fly, with a ConfigError."""
+    """Refuse no throws, and a target that is no distance or further than a vehicle may fly, with a
+    ConfigError.
+    """
     if throws < 1:
         raise ConfigError(f"--throws {throws}; expected 1 or more")
     for target in targets:
         if not (math.isfinite(target) and 0.0 <= target <= 3.0):
-            raise ConfigError(f"--targets {target:g}; expected distances from 0 to 3 m, which a vehicle may not leave")
+            raise ConfigError(
+                f"--targets {target:g}; expected distances from 0 to 3 m, which a vehicle may not"
+                " leave"
+            )
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
 
 
-def throw_hybrid(loaded: Sequence, targets: Sequence[float], count: int, device: str, seed: int, calibrate: bool = False) -> list[list]:
-    """Throw in the training simulator, after a calibration in the hover where asked; for each policy a `Throws` a target."""
+def throw_hybrid(
+    loaded: Sequence,
+    targets: Sequence[float],
+    count: int,
+    device: str,
+    seed: int,
+    calibrate: bool = False,
+) -> list[list]:
+    """Throw in the training simulator, after a calibration in the hover where asked; for each
+    policy a `Throws` a target.
+    """
     from visthrow.throws.calibrated import calibrated_start
     from visthrow.training.env import ThrowEnv
     from visthrow.training.protocol import throw
@@ -162,9 +249,16 @@ def throw_hybrid(loaded: Sequence, targets: Sequence[float], count: int, device:
         policy, row = item.policy.to(device), []
         rows.append(row)
         for target in targets:
-            status(f"throws in the training simulator: {sum(map(len, rows))} of {len(loaded) * len(targets)} sets")
+            status(
+                f"throws in the training simulator: {sum(map(len, rows))} of"
+                f" {len(loaded) * len(targets)} sets"
+            )
             begin = calibrated_start(item.experiment) if calibrate else ThrowEnv.reset
-            row.append(throw(item.experiment, policy.actor(count), target, count, device, seed, begin=begin))
+            row.append(
+                throw(
+                    item.experiment, policy.actor(count), target, count, device, seed, begin=begin
+                )
+            )
     status("")
     return rows
 
@@ -173,8 +267,12 @@ def title_of(plant: str, seed: int) -> str:
     """Heading of a table: which plant, which noise, which seed."""
     meaning = {
         "hybrid": "the training simulator with all its noise and randomisation",
-        "reference": "the reference plant (MuJoCo) without extras: measurements late but exact, still air",
-        "reference-realistic": "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
+        "reference": (
+            "the reference plant (MuJoCo) without extras: measurements late but exact, still air"
+        ),
+        "reference-realistic": (
+            "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise"
+        ),
     }[plant]
     return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
 
@@ -182,7 +280,11 @@ def title_of(plant: str, seed: int) -> str:
 def rows_of(entries: Sequence[Entry]) -> list[dict]:
     """Summaries, target after target, throwers side by side."""
     columns = zip(*(entry.throws for entry in entries))
-    return [{"policy": entry.name, "layout": entry.layout, **of.summary()} for column in columns for entry, of in zip(entries, column)]
+    return [
+        {"policy": entry.name, "layout": entry.layout, **of.summary()}
+        for column in columns
+        for entry, of in zip(entries, column)
+    ]
 
 
 def report(title: str, rows: Sequence[dict], note: str | None = None) -> str:
@@ -193,9 +295,14 @@ def report(title: str, rows: Sequence[dict], note: str | None = None) -> str:
 
 
 def write(
-    folder: Path, entries: Sequence[Entry], rows: Sequence[dict], plant: str, title: str, subtitle: str | None = None,
+    folder: Path,
+    entries: Sequence[Entry],
+    rows: Sequence[dict],
+    plant: str,
+    title: str,
+    subtitle: str | None = None,
     note: str | None = None,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write Markdown, CSV and scatter plot; returns their paths."""
     from visthrow.common.storage import atomic_write
     from visthrow.throws.plants import PLANTS
@@ -204,11 +311,22 @@ def write(
     stem = f"compare-{plant}"
     paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
     atomic_write(paths[0], report(title, rows, note))
-    atomic_write(paths[1], tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]))
+    atomic_write(
+        paths[1],
+        tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]),
+    )
     subtitle = subtitle or f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
     panels = [
-        (f"target {of.target:.1f} m", [(e.name, e.throws[i].landing_w[e.throws[i].success] - (of.target, 0.0)) for e in entries])
+        (
+            f"target {of.target:.1f} m",
+            [
+                (e.name, e.throws[i].landing_w[e.throws[i].success] - (of.target, 0.0))
+                for e in entries
+            ],
+        )
         for i, of in enumerate(entries[0].throws)
     ]
-    atomic_write(paths[2], figures.scatter(panels, heading=f"Landing points from above: {subtitle}"))
+    atomic_write(
+        paths[2], figures.scatter(panels, heading=f"Landing points from above: {subtitle}")
+    )
     return paths

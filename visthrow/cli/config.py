@@ -17,8 +17,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  visthrow config vehicle mine.toml              check a file of your own\n"
         "  visthrow config vehicle paper --set body.mass=0.25\n"
     )
-    parser.add_argument("kind", metavar="KIND", help=f"what to configure: {', '.join(_kind_names())}")
-    parser.add_argument("name", metavar="NAME", nargs="?", help="a shipped name or a TOML file; without it, list the names")
+    parser.add_argument(
+        "kind", metavar="KIND", help=f"what to configure: {', '.join(_kind_names())}"
+    )
+    parser.add_argument(
+        "name",
+        metavar="NAME",
+        nargs="?",
+        help="a shipped name or a TOML file; without it, list the names",
+    )
     add_common(parser, device=False, json=True)
 
 
@@ -29,7 +36,9 @@ def run(args: argparse.Namespace) -> int:
     if args.name is None:
         names = config.available(args.kind)
         if args.overrides:
-            raise ConfigError(f"--set needs the NAME of a config; {args.kind} has: {', '.join(names)}")
+            raise ConfigError(
+                f"--set needs the NAME of a config; {args.kind} has: {', '.join(names)}"
+            )
         print("\n".join(names))
         return 0
     path = config.find(args.kind, args.name)

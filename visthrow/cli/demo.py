@@ -1,4 +1,6 @@
-"""``visthrow demo``: throw once with the shipped vision policy and compare it with the state policy."""
+"""``visthrow demo``: throw once with the shipped vision policy and compare it with the state
+policy.
+"""
 
 import argparse
 import time
@@ -9,21 +11,34 @@ from visthrow.common.arguments import add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 
-THROWS = 100  # at each of compare's targets in the training simulator, for each policy; ``--throws`` asks for another number
+# at each of compare's targets in the training simulator, for each policy; ``--throws`` asks for
+# another number
+THROWS = 100
 
-REFERENCE_THROWS, REFERENCE_TARGETS = 6, (2.0,)  # on the reference plant, for each policy; one such throw costs seconds
+REFERENCE_THROWS, REFERENCE_TARGETS = (
+    6,
+    (2.0,),
+)  # on the reference plant, for each policy; one such throw costs seconds
 
 SEED = 0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = "Takes less than a minute on two CPU cores. No GPU is needed and none is used.\n"
+    parser.epilog = (
+        "Takes less than a minute on two CPU cores. No GPU is needed and none is used.\n"
+    )
     add_out(parser, "out/demo", "for pictures, tables and recording")
     parser.add_argument(
-        "--throws", type=int, default=THROWS, metavar="N",
-        help=f"for each policy and target in the training simulator (default: {THROWS}); on the reference plant {REFERENCE_THROWS} at most",
-    )  # fmt: skip
+        "--throws",
+        type=int,
+        default=THROWS,
+        metavar="N",
+        help=(
+            f"for each policy and target in the training simulator (default: {THROWS}); on the"
+            f" reference plant {REFERENCE_THROWS} at most"
+        ),
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,7 +56,9 @@ def run(args: argparse.Namespace) -> int:
     writable(folder)
     if importlib.util.find_spec("mujoco") is None:
         paths = _here(loaded, folder, args.throws)
-        print("The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n")
+        print(
+            "The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n"
+        )
     else:
         from visthrow.throws.reference_protocol import Throwing
 
@@ -49,7 +66,11 @@ def run(args: argparse.Namespace) -> int:
         throws = (loaded, REFERENCE_TARGETS, few, "reference-realistic", SEED, 1)
         with Throwing(*throws, together=True) as throwing:
             paths = _here(loaded, folder, args.throws)
-            print(f"{few} throws a policy on the reference plant, which stands in for a real vehicle ...", flush=True)
+            print(
+                f"{few} throws a policy on the reference plant, which stands in for a real"
+                " vehicle ...",
+                flush=True,
+            )
             paths += _tabled(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
@@ -62,12 +83,21 @@ def _here(loaded: list, folder: Path, throws: int) -> list[Path]:
     """One recorded throw, and many in the training simulator."""
     from visthrow.throws.recorded import fly as throw_once
 
-    print("About a minute on two CPU cores.\nOne throw at a target 2 m ahead with the vision policy ...", flush=True)
+    print(
+        "About a minute on two CPU cores.\nOne throw at a target 2 m ahead with the vision"
+        " policy ...",
+        flush=True,
+    )
     log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)
     paths = fly.write(folder, log, loaded[1].experiment)
     print(fly.summary_text(log) + "\n")
     print(f"{throws} throws a policy and target in the training simulator ...", flush=True)
-    return paths + _tabled(loaded, compare.throw_hybrid(loaded, compare.DEFAULT_TARGETS, throws, "cpu", SEED), "hybrid", folder)
+    return paths + _tabled(
+        loaded,
+        compare.throw_hybrid(loaded, compare.DEFAULT_TARGETS, throws, "cpu", SEED),
+        "hybrid",
+        folder,
+    )
 
 
 def _tabled(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:

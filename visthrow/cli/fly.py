@@ -18,23 +18,41 @@ FILES = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow fly                                   the shipped vision policy throws at a target 2 m ahead\n"
-        "  visthrow fly --policy state --target 1.5\n"
-        "  visthrow fly --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n"
-        "  visthrow fly --plant reference-realistic       on the stand-in for a real vehicle (about a minute)\n"
-        "\nThe vehicle hovers until the swing is quiet, the policy throws, the hover controller brings it back.\n"
+        "examples:\n  visthrow fly                                   the shipped vision policy"
+        " throws at a target 2 m ahead\n  visthrow fly --policy state --target 1.5\n  visthrow fly"
+        " --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n  visthrow"
+        " fly --plant reference-realistic       on the stand-in for a real vehicle (about a"
+        " minute)\n\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
+        " controller brings it back.\n"
     )
     add = parser.add_argument
-    add("--policy", default="vision", metavar="POLICY", help="a shipped name or a policy file (default: vision)")
-    add("--target", type=float, nargs="+", default=[2.0], metavar="M", help="distance ahead, or x and y [m] (default: 2.0)")
+    add(
+        "--policy",
+        default="vision",
+        metavar="POLICY",
+        help="a shipped name or a policy file (default: vision)",
+    )
+    add(
+        "--target",
+        type=float,
+        nargs="+",
+        default=[2.0],
+        metavar="M",
+        help="distance ahead, or x and y [m] (default: 2.0)",
+    )
     add_conditions(parser, "the policy's")
     pixels = "keypoints by a detector from rendered pictures, in place of projected ones"
     add("--pixels", choices=("learnt", "contours"), help=pixels)
-    saved = "write the policy as it is flown here: one for any vehicle becomes one for this vehicle, as hil takes it"
+    saved = (
+        "write the policy as it is flown here: one for any vehicle becomes one for this vehicle, as"
+        " hil takes it"
+    )
     add("--save", metavar="FILE", help=saved)
     add_out(parser, "out/fly", "for the files")
-    export = "also write the flight for other programs: .mcap (Foxglove), .parquet or .csv; may be repeated"
+    export = (
+        "also write the flight for other programs: .mcap (Foxglove), .parquet or .csv; may be"
+        " repeated"
+    )
     add("--export", action="append", default=[], metavar="FILE", help=export)
     add_common(parser)
 
@@ -52,14 +70,22 @@ def run(args: argparse.Namespace) -> int:
 
     known_plant(args.plant)
     if len(args.target) > 2:
-        raise ConfigError(f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y")
+        raise ConfigError(
+            f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y"
+        )
     formats = (*FORMATS, ".mcap")
     for path in args.export:
         if Path(path).suffix not in formats:
-            raise ConfigError(f"--export {path}: ending '{Path(path).suffix}'; expected one of {', '.join(formats)}")
+            raise ConfigError(
+                f"--export {path}: ending '{Path(path).suffix}'; expected one of"
+                f" {', '.join(formats)}"
+            )
     for override in args.overrides:
         if override.startswith("task.noise.command"):
-            raise ConfigError(f"--set {override}: fly sends commands as they are, without training's noise; compare throws with it")
+            raise ConfigError(
+                f"--set {override}: fly sends commands as they are, without training's noise;"
+                " compare throws with it"
+            )
     loaded = load_policy(args.policy, args.config, args.overrides, args.allow)
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
     check_goal(loaded, goal)
@@ -73,8 +99,18 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.view.eyes import Eyes
 
         if loaded.policy.contract["observation"]["layout"] != "vision":
-            raise ConfigError(f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy")
-        eyes = Eyes(loaded.experiment.camera, rope.mount, rope.length + rope.payload_offset, 1, args.seed, by=args.pixels, keep=True)
+            raise ConfigError(
+                f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
+            )
+        eyes = Eyes(
+            loaded.experiment.camera,
+            rope.mount,
+            rope.length + rope.payload_offset,
+            1,
+            args.seed,
+            by=args.pixels,
+            keep=True,
+        )
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)
     paths = write(Path(args.out), log, loaded.experiment)
     if eyes is not None:
@@ -88,7 +124,13 @@ def run(args: argparse.Namespace) -> int:
     for path in paths:
         print(f"{path}  {FILES[path.name]}")
     if args.json:
-        write_json(args.json, {key: log.meta[key] for key in ("policy", "plant", "goal_w", "seed", "times", "result")})
+        write_json(
+            args.json,
+            {
+                key: log.meta[key]
+                for key in ("policy", "plant", "goal_w", "seed", "times", "result")
+            },
+        )
     return 0 if log.meta["result"]["success"] else 1
 
 
@@ -121,12 +163,16 @@ def summary_text(log) -> str:
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]
     plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"
-    lines = [f"policy '{log.meta['policy']}' on {plant}", f"hover   {start:.2f} s until the swing was quiet"]
+    lines = [
+        f"policy '{log.meta['policy']}' on {plant}",
+        f"hover   {start:.2f} s until the swing was quiet",
+    ]
     if "separation" in times:
         at = log["separation"].values[0]
         lines.append(
-            f"throw   release asked for {times['latch'] - start:.2f} s and done {times['separation'] - start:.2f} s "
-            f"after the start, payload at x {at[0]:.2f} m, z {at[2]:.2f} m"
+            f"throw   release asked for {times['latch'] - start:.2f} s and done"
+            f" {times['separation'] - start:.2f} s after the start, payload at x {at[0]:.2f} m, z"
+            f" {at[2]:.2f} m"
         )
     if "landing" in log:
         x, y, _ = log["landing"].values[0]
@@ -137,5 +183,7 @@ def summary_text(log) -> str:
     if result["failure"]:
         lines.append(f"failed: {result['failure']}")
     end = "hovering again" if result["hovering_again"] else "not hovering again"
-    lines.append(f"after   {times['end'] - times['recovery']:.1f} s of recovery the vehicle was {end}")
+    lines.append(
+        f"after   {times['end'] - times['recovery']:.1f} s of recovery the vehicle was {end}"
+    )
     return "\n".join(lines)

@@ -1,4 +1,6 @@
-"""``visthrow report``: one page with the paper's evidence and ours, from records or from throws made now."""
+"""``visthrow report``: one page with the paper's evidence and ours, from records or from throws
+made now.
+"""
 
 import argparse
 import sys
@@ -11,27 +13,43 @@ from visthrow.common.errors import StorageError, VisthrowError
 TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
 UNITS = "throws"  # folder of single results, in the output folder
 
-QUICK_LIST = "quick"  # list of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and ``gap`` made
+# list of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and
+# ``gap`` made
+QUICK_LIST = "quick"
 
-NO_REFERENCE = ('runs.shipped.throws=["own"]',)  # changes of the quick list where MuJoCo is not installed
+NO_REFERENCE = (
+    'runs.shipped.throws=["own"]',
+)  # changes of the quick list where MuJoCo is not installed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow report                                the page, from the committed records\n"
-        "  visthrow report --quick                        few throws of the shipped policies and the baseline, made now\n"
-        "  visthrow report --results runs/sweep/throws    with throws of your own sweep on top\n"
-        "\nEverything is a unit of work that is kept when it is done: killed at any moment and started again, the command goes\n"
-        "on where it was. Trainings and throws of policies are the matter of 'visthrow sweep run paper' and 'gap'.\n"
+        "examples:\n  visthrow report                                the page, from the committed"
+        " records\n  visthrow report --quick                        few throws of the shipped"
+        " policies and the baseline, made now\n  visthrow report --results runs/sweep/throws   "
+        " with throws of your own sweep on top\n\nEverything is a unit of work that is kept when it"
+        " is done: killed at any moment and started again, the command goes\non where it was."
+        " Trainings and throws of policies are the matter of 'visthrow sweep run paper' and"
+        " 'gap'.\n"
     )
-    parser.add_argument("--quick", action="store_true", help="throw now, few throws, instead of reading records")
     parser.add_argument(
-        "--results", nargs="+", action="extend", default=[], metavar="FOLDER", help="folders with further results of throws"
+        "--quick", action="store_true", help="throw now, few throws, instead of reading records"
     )
-    parser.add_argument("--records", metavar="FOLDER", help="folder of records (default: those of the package)")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: one a core)")
+    parser.add_argument(
+        "--results",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FOLDER",
+        help="folders with further results of throws",
+    )
+    parser.add_argument(
+        "--records", metavar="FOLDER", help="folder of records (default: those of the package)"
+    )
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="processes at once (default: one a core)"
+    )
     add_out(parser, "out/report", "for page, tables and pictures")
 
 
@@ -52,24 +70,35 @@ def run(args: argparse.Namespace) -> int:
     writable(out)
     if args.quick:
         quick(out, jobs)
-        found = result_set.read((), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals")
+        found = result_set.read(
+            (), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals"
+        )
     else:
         found = result_set.read([records], folders)
     paths = page.write(out, TITLE, lead(found), sections(found))
     print(summary(found))
     for path in paths[:2]:
         print(path)
-    print(f"{len(found.results)} sets of throws, {len(found.runs)} trainings, {time.perf_counter() - begin:.0f} s")
+    print(
+        f"{len(found.results)} sets of throws, {len(found.runs)} trainings,"
+        f" {time.perf_counter() - begin:.0f} s"
+    )
     return 0
 
 
 def _records(name: str) -> Path:
-    """Folder of records, as ``visthrow sweep collect`` makes one. Raises StorageError: there is none."""
+    """Folder of records, as ``visthrow sweep collect`` makes one.
+
+    Raises StorageError: there is none.
+    """
     from visthrow.evidence.report.result_set import PARTS
 
     if not any((Path(name) / part).is_dir() for part in PARTS):
         came = "none of these in it" if Path(name).is_dir() else "no such folder"
-        raise StorageError(f"--records {name}: {came}; expected a folder of {', '.join(PARTS)}, as 'visthrow sweep collect' makes it")
+        raise StorageError(
+            f"--records {name}: {came}; expected a folder of {', '.join(PARTS)}, as 'visthrow sweep"
+            " collect' makes it"
+        )
     return Path(name)
 
 
@@ -78,12 +107,15 @@ def _folder(name: str) -> Path:
     path = Path(name)
     if not path.is_file() and not any(path.glob("*.json")):
         came = "no *.json in it" if path.is_dir() else "no such folder"
-        raise StorageError(f"--results {name}: {came}; expected one with results of throws, as runs/sweep/throws")
+        raise StorageError(
+            f"--results {name}: {came}; expected one with results of throws, as runs/sweep/throws"
+        )
     return path
 
 
 def quick(out: Path, jobs: int) -> None:
-    """Make the few throws of ``configs/sweep/quick.toml`` and of the baseline, as far as they are not there.
+    """Make the few throws of ``configs/sweep/quick.toml`` and of the baseline, as far as they are
+    not there.
 
     Raises VisthrowError: throws that failed; the message names them.
     """
@@ -101,7 +133,9 @@ def quick(out: Path, jobs: int) -> None:
     outcome = Pool(load_list(QUICK_LIST, changes), folder, local, _say).run(None)
     if outcome.failed:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
-        raise VisthrowError(f"throws failed: {reasons}; all that was printed is in {folder / 'logs'}")
+        raise VisthrowError(
+            f"throws failed: {reasons}; all that was printed is in {folder / 'logs'}"
+        )
     if outcome.stopped:
         raise KeyboardInterrupt
     if find_spec("piqp") is None:
@@ -109,7 +143,9 @@ def quick(out: Path, jobs: int) -> None:
         return
     from visthrow.baseline.thrower import fly_unit
 
-    results.work(quick_units(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}"))
+    results.work(
+        quick_units(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}")
+    )
 
 
 def quick_units() -> list[dict]:
@@ -119,7 +155,9 @@ def quick_units() -> list[dict]:
     from visthrow.task.measurement import TARGETS
 
     own = [unit(OWN, "none", target, 5) for target in TARGETS]
-    return own + [unit("hybrid", compensation, FRONT_TARGET, 10) for compensation in ("both", "delay")]
+    return own + [
+        unit("hybrid", compensation, FRONT_TARGET, 10) for compensation in ("both", "delay")
+    ]
 
 
 def _say(text: str) -> None:
@@ -130,9 +168,10 @@ def lead(found) -> str:
     """What this page is, and what it is not."""
     note = f" **{found.note[0].upper() + found.note[1:]}.**" if found.note else ""
     return (
-        "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no vehicle was flown for this "
-        "project**, and the reference plants (MuJoCo, own code of every block, effects that the training lacks) stand in for "
-        f"one. Every row says on which plant it was measured. Brackets are 95 % bootstrap intervals.{note}"
+        "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no"
+        " vehicle was flown for this project**, and the reference plants (MuJoCo, own code of"
+        " every block, effects that the training lacks) stand in for one. Every row says on which"
+        f" plant it was measured. Brackets are 95 % bootstrap intervals.{note}"
     )
 
 
@@ -144,11 +183,26 @@ def sections(found) -> list:
     from visthrow.view.parts import Text
 
     made = [
-        throws.throws_section(found), throws.vision_section(found), ablations.section(found), trade.baseline_section(found),
-        trade.front_section(found), gap.section(found), beyond.section(found), beyond.training_section(found),
+        throws.throws_section(found),
+        throws.vision_section(found),
+        ablations.section(found),
+        trade.baseline_section(found),
+        trade.front_section(found),
+        gap.section(found),
+        beyond.section(found),
+        beyond.training_section(found),
         beyond.origin_section(found),
-    ]  # fmt: skip
-    return [replace(s, parts=(*s.parts, *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p))) for s in made]
+    ]
+    return [
+        replace(
+            s,
+            parts=(
+                *s.parts,
+                *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p),
+            ),
+        )
+        for s in made
+    ]
 
 
 def summary(found) -> str:
@@ -157,4 +211,8 @@ def summary(found) -> str:
     from visthrow.view.parts import Grid
 
     grids = [part for part in throws_section(found).parts if isinstance(part, Grid)]
-    return grids[0].markdown() + "\n" if grids else "no throws of the shipped policies are recorded; see --quick\n"
+    return (
+        grids[0].markdown() + "\n"
+        if grids
+        else "no throws of the shipped policies are recorded; see --quick\n"
+    )

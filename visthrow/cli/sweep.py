@@ -1,4 +1,6 @@
-"""``visthrow sweep``: work lists of training runs and throws in resumable pieces, on several GPUs or a cluster."""
+"""``visthrow sweep``: work lists of training runs and throws in resumable pieces, on several GPUs
+or a cluster.
+"""
 
 import argparse
 import os
@@ -18,32 +20,62 @@ ACTIONS = ("run", "status", "collect", "work")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow sweep run paper --devices cuda:0,cuda:1 --jobs 30    all runs of configs/sweep/paper.toml\n"
-        "  visthrow sweep run paper --minutes 9                          stop after 9 minutes; the same command goes on\n"
-        "  visthrow sweep run paper --slurm partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n"
-        "  visthrow sweep status paper                                   a line a run\n"
-        "  visthrow sweep collect paper --records out/records            what is committed of it\n"
-        "\nWhat is done is not done again: a training run is known by its resolved config and seed, throws by the policy's\n"
-        "content and everything else they depend on. Ctrl-C, a kill or a power cut lose what was not yet in a checkpoint.\n"
+        "examples:\n  visthrow sweep run paper --devices cuda:0,cuda:1 --jobs 30    all runs of"
+        " configs/sweep/paper.toml\n  visthrow sweep run paper --minutes 9                         "
+        " stop after 9 minutes; the same command goes on\n  visthrow sweep run paper --slurm"
+        " partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n  visthrow sweep status"
+        " paper                                   a line a run\n  visthrow sweep collect paper"
+        " --records out/records            what is committed of it\n\nWhat is done is not done"
+        " again: a training run is known by its resolved config and seed, throws by the"
+        " policy's\ncontent and everything else they depend on. Ctrl-C, a kill or a power cut lose"
+        " what was not yet in a checkpoint.\n"
     )
     add = parser.add_argument
     add("action", choices=ACTIONS, help="work is what run starts processes with")
     add("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
-    add("--out", metavar="FOLDER", default=DEFAULT_OUT, help=f"of all results (default: {DEFAULT_OUT})")
+    add(
+        "--out",
+        metavar="FOLDER",
+        default=DEFAULT_OUT,
+        help=f"of all results (default: {DEFAULT_OUT})",
+    )
     devices = "one training at once on each: cuda:0,cuda:1; with a cluster how many (default: auto)"
     add("--devices", metavar="NAMES", default="auto", help=devices)
-    add("--jobs", type=int, metavar="N", help="throws on the reference plant at once (default: one a core)")
-    add("--minutes", type=NUMBER, help="end after so long with checkpoints; on a cluster the length of a job")
-    add("--slurm", metavar="KEY=VALUE", action="append", help="submit jobs, with this option of sbatch; may be repeated")
-    add("--records", metavar="FOLDER", help="collect: where to (default: records beside the results)")
+    add(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="throws on the reference plant at once (default: one a core)",
+    )
+    add(
+        "--minutes",
+        type=NUMBER,
+        help="end after so long with checkpoints; on a cluster the length of a job",
+    )
+    add(
+        "--slurm",
+        metavar="KEY=VALUE",
+        action="append",
+        help="submit jobs, with this option of sbatch; may be repeated",
+    )
+    add(
+        "--records",
+        metavar="FOLDER",
+        help="collect: where to (default: records beside the results)",
+    )
     add("--units", metavar="NAMES", help="work: which, with commas between")
     add("--device", default="auto", help="work: where")
     add("--parent", type=int, metavar="ID", help="work: process with which this one is to end")
     add(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
-        help="change one value of the list, for instance --set runs.full.seeds=[1]; may be repeated",
-    )  # fmt: skip
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help=(
+            "change one value of the list, for instance --set runs.full.seeds=[1]; may be repeated"
+        ),
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,12 +108,20 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     def say(text: str) -> None:
         print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)
 
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that a batch system's signal also ends in checkpoints
+    before = signal.signal(
+        signal.SIGTERM, signal.default_int_handler
+    )  # so that a batch system's signal also ends in checkpoints
     try:
         if args.slurm is not None:
             outcome = Pool(work, out, _cluster(args, out, jobs, changes), say).run()
         else:
-            starter = Local(args.list, out, [device.resolve(name) for name in args.devices.split(",")], jobs, changes)
+            starter = Local(
+                args.list,
+                out,
+                [device.resolve(name) for name in args.devices.split(",")],
+                jobs,
+                changes,
+            )
             outcome = Pool(work, out, starter, say).run(args.minutes)
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -101,8 +141,8 @@ def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str,
     wrong = [item for item in args.slurm if "=" not in item]
     if wrong or not args.devices.isdigit() or args.minutes is None:
         raise ConfigError(
-            f"--slurm {' '.join(args.slurm)} --devices {args.devices} --minutes {args.minutes}; expected KEY=VALUE, the number "
-            "of GPUs to use at once, and the length of a job"
+            f"--slurm {' '.join(args.slurm)} --devices {args.devices} --minutes {args.minutes};"
+            " expected KEY=VALUE, the number of GPUs to use at once, and the length of a job"
         )
     options = {f"slurm_{key}": value for key, value in (item.split("=", 1) for item in args.slurm)}
     return Cluster(args.list, out, "slurm", int(args.devices), jobs, args.minutes, changes, options)

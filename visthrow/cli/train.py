@@ -1,4 +1,6 @@
-"""``visthrow train``: train a policy, from scratch or from another, with progress, evaluation, checkpoints, resume."""
+"""``visthrow train``: train a policy, from scratch or from another, with progress, evaluation,
+checkpoints, resume.
+"""
 
 import argparse
 import contextlib
@@ -12,33 +14,69 @@ from visthrow.common.arguments import NUMBER, WHOLE, add_common
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow train laptop                          a state policy on the cores of a laptop\n"
-        "  visthrow train laptop --until 0.04             stop once throws at 2.0 m land within 4 cm on average\n"
-        "  visthrow train mine.toml --from state          adapt the shipped policy to a vehicle of your own\n"
-        "  visthrow train vision --seed 2 --out runs/v2   another seed, in a folder of its own\n"
-        "  visthrow train --resume --out runs/v2          go on where an interrupted run stopped\n"
-        "  torchrun --nproc-per-node 2 -m visthrow.cli train state   on two GPUs\n"
+        "examples:\n  visthrow train laptop                          a state policy on the cores of"
+        " a laptop\n  visthrow train laptop --until 0.04             stop once throws at 2.0 m land"
+        " within 4 cm on average\n  visthrow train mine.toml --from state          adapt the"
+        " shipped policy to a vehicle of your own\n  visthrow train vision --seed 2 --out runs/v2  "
+        " another seed, in a folder of its own\n  visthrow train --resume --out runs/v2          go"
+        " on where an interrupted run stopped\n  torchrun --nproc-per-node 2 -m visthrow.cli train"
+        " state   on two GPUs\n"
     )
-    names = "a name of configs/train (state, vision, laptop, laptop_vision, paper, ...) or a TOML file of your own"
-    parser.add_argument("config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder")
-    parser.add_argument("--seed", type=WHOLE, help="of everything random (default: 1, or that of the resumed run)")
-    parser.add_argument("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")
+    names = (
+        "a name of configs/train (state, vision, laptop, laptop_vision, paper, ...) or a TOML file"
+        " of your own"
+    )
     parser.add_argument(
-        "--from", dest="start", metavar="POLICY",
-        help="start from this policy, a shipped name or a file, with the short schedule of configs/ppo/adapt.toml",
-    )  # fmt: skip
-    parser.add_argument("--iterations", type=int, metavar="N", help="stop after iteration N (default: the configuration's last)")
+        "config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder"
+    )
+    parser.add_argument(
+        "--seed", type=WHOLE, help="of everything random (default: 1, or that of the resumed run)"
+    )
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)"
+    )
+    parser.add_argument(
+        "--from",
+        dest="start",
+        metavar="POLICY",
+        help=(
+            "start from this policy, a shipped name or a file, with the short schedule of"
+            " configs/ppo/adapt.toml"
+        ),
+    )
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="stop after iteration N (default: the configuration's last)",
+    )
     parser.add_argument("--minutes", type=NUMBER, metavar="T", help="stop after this time")
-    parser.add_argument("--until", type=NUMBER, metavar="ERROR", help="stop once throws at 2.0 m land so near on average [m]")
     parser.add_argument(
-        "--evaluate-every", type=int, metavar="N",
-        help="throw 200 times every N iterations (default: a twentieth of the time on a terminal, with --until and --view)",
-    )  # fmt: skip
+        "--until",
+        type=NUMBER,
+        metavar="ERROR",
+        help="stop once throws at 2.0 m land so near on average [m]",
+    )
     parser.add_argument(
-        "--checkpoint-every", type=int, metavar="N", help="iterations between checkpoints (default: a hundredth of the time)",
-    )  # fmt: skip
-    parser.add_argument("--view", action="store_true", help="show a throw of each evaluation in this machine's browser")
+        "--evaluate-every",
+        type=int,
+        metavar="N",
+        help=(
+            "throw 200 times every N iterations (default: a twentieth of the time on a terminal,"
+            " with --until and --view)"
+        ),
+    )
+    parser.add_argument(
+        "--checkpoint-every",
+        type=int,
+        metavar="N",
+        help="iterations between checkpoints (default: a hundredth of the time)",
+    )
+    parser.add_argument(
+        "--view",
+        action="store_true",
+        help="show a throw of each evaluation in this machine's browser",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
     add_common(parser)
 
@@ -47,7 +85,9 @@ def run(args: argparse.Namespace) -> int:
     """Train."""
     from visthrow.training import session
 
-    options = session.Options(**{item.name: getattr(args, item.name) for item in fields(session.Options)})
+    options = session.Options(
+        **{item.name: getattr(args, item.name) for item in fields(session.Options)}
+    )
     return session.run(options, viewer if args.view else None)
 
 
@@ -67,8 +107,16 @@ def viewer(trainer: Any) -> Iterator[Callable[[Any], None]]:
         def show(throws) -> None:
             policy = trainer.algorithm.export(contract_of(trainer.experiment), {})
             with torch.random.fork_rng(devices=[]):
-                log = fly(Loaded("training", policy, trainer.experiment), np.array([throws.target, 0.0, 0.0]))
-            name = f"iteration {trainer.iteration}: {throws.summary().get('error_mean', float('nan')):.3f} m"
-            rerun_view.show(address, name, log, trainer.experiment, throws.landing_w[throws.success])
+                log = fly(
+                    Loaded("training", policy, trainer.experiment),
+                    np.array([throws.target, 0.0, 0.0]),
+                )
+            name = (
+                f"iteration {trainer.iteration}:"
+                f" {throws.summary().get('error_mean', float('nan')):.3f} m"
+            )
+            rerun_view.show(
+                address, name, log, trainer.experiment, throws.landing_w[throws.success]
+            )
 
         yield show

@@ -1,4 +1,6 @@
-"""Commands and the options that they share, the exit status of a process, and how it is asked to stop."""
+"""Commands and the options that they share, the exit status of a process, and how it is asked to
+stop.
+"""
 
 import argparse
 import contextlib
@@ -13,7 +15,10 @@ from typing import Any
 from visthrow.common.errors import suggest
 
 Commands = Mapping[str, tuple[str, str]]
-"""Name -> (help, module). The module has ``add_arguments(parser)`` and ``run(args) -> int``; it is imported only when chosen."""
+"""Name -> (help, module).
+
+The module has ``add_arguments(parser)`` and ``run(args) -> int``; it is imported only when chosen.
+"""
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -38,35 +43,66 @@ PORT = checked(int, lambda x: 0 < x < 65536, "a port, 1 to 65535")
 
 
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
-    """Add the options that commands share: ``--set``, ``--device`` (see ``visthrow.training.device.resolve``) and ``--json``."""
+    """Add the options that commands share:
+
+    ``--set``, ``--device`` (see ``visthrow.training.device.resolve``) and ``--json``.
+    """
     parser.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE",
-        help="change one value of the configuration, for instance --set vehicle.body.mass=0.25; may be repeated",
-    )  # fmt: skip
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help=(
+            "change one value of the configuration, for instance --set vehicle.body.mass=0.25; may"
+            " be repeated"
+        ),
+    )
     if device:
-        parser.add_argument("--device", default="auto", metavar="NAME", help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)")
+        parser.add_argument(
+            "--device",
+            default="auto",
+            metavar="NAME",
+            help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)",
+        )
     if json:
-        parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
+        parser.add_argument(
+            "--json", metavar="FILE", help="write the printed figures to this file as well"
+        )
 
 
 def add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
     """Add ``--out``: the folder of what a command writes."""
-    parser.add_argument("--out", default=default, metavar="FOLDER", help=f"{what} (default: {default})")
+    parser.add_argument(
+        "--out", default=default, metavar="FOLDER", help=f"{what} (default: {default})"
+    )
 
 
 def add_conditions(parser: argparse.ArgumentParser, whose: str) -> None:
     """Add what throws are flown under: ``--plant``, ``--seed``, ``--config``, ``--allow``."""
     add = parser.add_argument
-    add("--plant", default="hybrid", metavar="NAME", help="hybrid (the training simulator, the default), reference, or reference-realistic")
+    add(
+        "--plant",
+        default="hybrid",
+        metavar="NAME",
+        help="hybrid (the training simulator, the default), reference, or reference-realistic",
+    )
     add("--seed", type=WHOLE, default=0, help="of starts, noise and plant (default: 0)")
     add("--config", metavar="NAME", help=f"fly in this train config instead of {whose} own")
-    allow = "part of a policy's contract that --config and --set may break (vehicle, rope.length), which is told; may be repeated"
+    allow = (
+        "part of a policy's contract that --config and --set may break (vehicle, rope.length),"
+        " which is told; may be repeated"
+    )
     add("--allow", action="append", default=[], metavar="KEY", help=allow)
 
 
-def add_commands(parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any) -> None:
+def add_commands(
+    parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any
+) -> None:
     """Add commands, of which one must be chosen; its name goes to ``args.<dest>``."""
-    choices = parser.add_subparsers(dest=dest, metavar=dest.upper(), required=True, parser_class=_Lazy, **group)
+    choices = parser.add_subparsers(
+        dest=dest, metavar=dest.upper(), required=True, parser_class=_Lazy, **group
+    )
     form = argparse.RawDescriptionHelpFormatter
     for name, (text, module) in commands.items():
         about = text[0].upper() + text[1:] + "."
@@ -74,7 +110,10 @@ def add_commands(parser: argparse.ArgumentParser, commands: Commands, dest: str,
 
 
 def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
-    """Run the chosen command; returns its exit status. Raises StorageError where ``--json`` could not be written, before the work."""
+    """Run the chosen command; returns its exit status.
+
+    Raises StorageError where ``--json`` could not be written, before the work.
+    """
     if getattr(args, "json", None):
         from visthrow.common.storage import check_place
 
@@ -94,19 +133,25 @@ class _Lazy(argparse.ArgumentParser):
             module, self._module = self._module, None
             importlib.import_module(module).add_arguments(self)
         found, unknown = super().parse_known_args(args, namespace)
-        if unknown and self._subparsers is None:  # else the command's own parser would say it, without its options
+        if (
+            unknown and self._subparsers is None
+        ):  # else the command's own parser would say it, without its options
             options = [option for option in self._option_string_actions if option.startswith("--")]
-            near = f"; {suggest(unknown[0].split('=')[0], options)}" if unknown[0].startswith("-") else ""
+            near = (
+                f"; {suggest(unknown[0].split('=')[0], options)}"
+                if unknown[0].startswith("-")
+                else ""
+            )
             self.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
         return found, unknown
 
 
 class StopRequest:
-    """Signals taken down, ``asked``, while it is entered, so that no piece of work is cut in two; a second one interrupts.
+    """Signals taken down, ``asked``, while it is entered, so that no piece of work is cut in two; a
+    second one interrupts.
 
-    An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and goes on. Threads beside the main one hear
-    no signals.
-    """
+    An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and
+    goes on. Threads beside the main one hear no signals."""
 
     def __init__(self, signals: Sequence[int], said: str = "") -> None:
         """Begin; ``said``: what the first one is answered on the terminal."""

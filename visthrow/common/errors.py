@@ -1,14 +1,16 @@
 """Errors that a user can cause and mend: one base class, one child a kind of mistake.
 
-Every message says what came, what was expected and what exists. The command line prints the message alone.
-"""
+Every message says what came, what was expected and what exists. The command line prints the message
+alone."""
 
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 
 
 class VisthrowError(Exception):
-    """Base of all errors that name a user's mistake or a state of the machine that the user can change."""
+    """Base of all errors that name a user's mistake or a state of the machine that the user can
+    change.
+    """
 
 
 class ConfigError(VisthrowError):
@@ -20,7 +22,9 @@ class PolicyError(VisthrowError):
 
 
 class MismatchError(PolicyError):
-    """A policy was trained under other conditions than those it is to be used in: dotted ``keys`` of its contract differ."""
+    """A policy was trained under other conditions than those it is to be used in: dotted ``keys``
+    of its contract differ.
+    """
 
     def __init__(self, message: str, keys: tuple[str, ...] = ()) -> None:
         super().__init__(message)
@@ -60,7 +64,10 @@ MANY = 30
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Say what exists, and which of it is closest to a name that does not: ``"did you mean 'mass'? Known: inertia, mass"``."""
+    """Say what exists, and which of it is closest to a name that does not:
+
+    ``"did you mean 'mass'? Known: inertia, mass"``.
+    """
     names = sorted(known)
     if not names:
         return "nothing is known here"
@@ -69,11 +76,19 @@ def suggest(name: str, known: Iterable[str]) -> str:
     if len(names) > MANY:
         near = get_close_matches(name, names, n=5, cutoff=0.0)
         listed, known = f"{', '.join(near)}; {len(names) - len(near)} more exist", "near it"
-    return f"did you mean '{close[0]}'? {known.capitalize()}: {listed}" if close else f"{known}: {listed}"
+    return (
+        f"did you mean '{close[0]}'? {known.capitalize()}: {listed}"
+        if close
+        else f"{known}: {listed}"
+    )
 
 
-def expect_known(names: Iterable[str], known: Collection[str], said: str, error: type[VisthrowError]) -> None:
-    """Raise ``error`` for the first name that is not known; its message is ``said`` with the name in braces, and what exists."""
+def expect_known(
+    names: Iterable[str], known: Collection[str], said: str, error: type[VisthrowError]
+) -> None:
+    """Raise ``error`` for the first name that is not known; its message is ``said`` with the name
+    in braces, and what exists.
+    """
     for name in names:
         if name not in known:
             raise error(f"{said.format(name)}; {suggest(name, known)}")

@@ -15,4 +15,7 @@ def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -
         return importlib.import_module(module)
     except ModuleNotFoundError:
         package = module.partition(".")[0]
-        raise error(f"{what} needs the package '{package}'; install it with: pip install 'visthrow[{extra}]'") from None
+        raise error(
+            f"{what} needs the package '{package}'; install it with: pip install"
+            f" 'visthrow[{extra}]'"
+        ) from None

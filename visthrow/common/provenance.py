@@ -1,4 +1,7 @@
-"""Where a result comes from: commit, package versions, command line, processor. Never host names, users or paths."""
+"""Where a result comes from: commit, package versions, command line, processor.
+
+Never host names, users or paths.
+"""
 
 import os
 import platform
@@ -16,30 +19,48 @@ from visthrow import __version__
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write, write_json
 
-PACKAGES = ("numpy", "torch", "warp-lang", "rsl-rl-lib", "tensordict", "kornia", "opencv-python-headless", "rerun-sdk",
-            "scipy", "mujoco-core")  # fmt: skip
+PACKAGES = (
+    "numpy",
+    "torch",
+    "warp-lang",
+    "rsl-rl-lib",
+    "tensordict",
+    "kornia",
+    "opencv-python-headless",
+    "rerun-sdk",
+    "scipy",
+    "mujoco-core",
+)
 """Distributions whose version can change a figure."""
 
-COMMIT_VARIABLE = "VISTHROW_COMMIT"  # names the commit where a copy of the tree runs without its history (a cluster node, a container)
+# names the commit where a copy of the tree runs without its history (a cluster node, a container)
+COMMIT_VARIABLE = "VISTHROW_COMMIT"
 
 _FOLDERS = re.compile(r"(?<![\w.~-])(?:~|[A-Za-z]:)?[/\\](?:[^\s/\\=,;:]+[/\\])*")
 
 
 def commit() -> str:
-    """Return the commit of the checkout that runs, with ``-dirty`` where tracked files were changed, else "unknown"."""
+    """Return the commit of the checkout that runs, with ``-dirty`` where tracked files were
+    changed, else "unknown".
+    """
     root = Path(__file__).resolve().parents[2]
     told = os.environ.get(COMMIT_VARIABLE, "unknown")
     if not (root / ".git").exists():  # installed, or inside somebody else's repository
         return told
     try:
         head = _git(root, "rev-parse", "HEAD")
-        return f"{head}-dirty" if _git(root, "status", "--porcelain", "--untracked-files=no") else head
+        return (
+            f"{head}-dirty" if _git(root, "status", "--porcelain", "--untracked-files=no") else head
+        )
     except (OSError, subprocess.SubprocessError):
         return told
 
 
 def command() -> str:
-    """Return the command line as a shell takes it, with absolute folders left out: ``visthrow train``, ``python -m tests.bench.train``."""
+    """Return the command line as a shell takes it, with absolute folders left out:
+
+    ``visthrow train``, ``python -m tests.bench.train``.
+    """
     program, *words = (_FOLDERS.sub("", argument) for argument in sys.argv)
     module = getattr(sys.modules["__main__"], "__spec__", None)
     if program.endswith(".py"):
@@ -55,7 +76,9 @@ def versions() -> dict[str, str]:
 
 @cache
 def _versions() -> dict[str, str]:
-    """They are looked for once: a process that records many runs has the same packages in all of them."""
+    """They are looked for once: a process that records many runs has the same packages in all of
+    them.
+    """
     found = {"visthrow": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -82,15 +105,24 @@ def processors() -> dict[str, Any]:
 def collect() -> dict[str, Any]:
     """Return all of it, with the time [UTC]."""
     time = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"commit": commit(), "command": command(), "time": time, "versions": versions(), "processors": processors()}
+    return {
+        "commit": commit(),
+        "command": command(),
+        "time": time,
+        "versions": versions(),
+        "processors": processors(),
+    }
 
 
-def write_run_folder(folder: str | Path, config_text: str, *, resume: bool = False, **extra: Any) -> dict[str, Any]:
-    """Write the resolved config, TOML, and the provenance with ``extra`` beside the results of a run; returns that.
+def write_run_folder(
+    folder: str | Path, config_text: str, *, resume: bool = False, **extra: Any
+) -> dict[str, Any]:
+    """Write the resolved config, TOML, and the provenance with ``extra`` beside the results of a
+    run; returns that.
 
-    Where a folder holds a run that is resumed, its config is left, and the provenance goes to the next free ``provenance_<n>.json``. Raises
-    StorageError if the folder holds a run already and ``resume`` is not set, or cannot be written.
-    """
+    Where a folder holds a run that is resumed, its config is left, and the provenance goes to the
+    next free ``provenance_<n>.json``. Raises StorageError if the folder holds a run already and
+    ``resume`` is not set, or cannot be written."""
     folder = Path(folder)
     record = {**collect(), **extra}
     if not resume:
@@ -112,4 +144,6 @@ def check_free(folder: str | Path) -> None:
 
 def _git(root: Path, *arguments: str) -> str:
     words = ["git", "-C", str(root), *arguments]
-    return subprocess.run(words, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    return subprocess.run(
+        words, capture_output=True, text=True, check=True, timeout=10
+    ).stdout.strip()

@@ -1,8 +1,10 @@
-"""Rotations on the host: quaternions are xyzw, from body to world where nothing else is said. Onboard-safe.
+"""Rotations on the host: quaternions are xyzw, from body to world where nothing else is said.
 
-First arrays over any leading axes; then single quaternions and vectors in plain floats, which NumPy would handle ten times slower
-and which give the same bits for the same input. Conversions that neither needs in a loop are scipy's ``Rotation``.
-"""
+Onboard-safe.
+
+First arrays over any leading axes; then single quaternions and vectors in plain floats, which NumPy
+would handle ten times slower and which give the same bits for the same input. Conversions that
+neither needs in a loop are scipy's ``Rotation``."""
 
 import math
 
@@ -15,12 +17,16 @@ _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few vectors."""
+    """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
+    vectors.
+    """
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
 def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
-    """Return rotation matrices ``rot_wb``, shape (..., 3, 3), of quaternions of any length, shape (..., 4)."""
+    """Return rotation matrices ``rot_wb``, shape (..., 3, 3), of quaternions of any length, shape
+    (..., 4).
+    """
     unit = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
     x, y, z, w = (unit[..., i] for i in range(4))
     rows = (
@@ -28,7 +34,9 @@ def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
         (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
-    out = np.empty((*unit.shape[:-1], 3, 3), unit.dtype)  # np.stack takes twice as long on a single quaternion
+    out = np.empty(
+        (*unit.shape[:-1], 3, 3), unit.dtype
+    )  # np.stack takes twice as long on a single quaternion
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
             out[..., i, j] = entry
@@ -36,7 +44,10 @@ def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
 
 
 def rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Turn vectors, shape (..., 3), by unit quaternions, shape (..., 4): ``v + 2 w q x v + q x (2 q x v)``."""
+    """Turn vectors, shape (..., 3), by unit quaternions, shape (..., 4):
+
+    ``v + 2 w q x v + q x (2 q x v)``.
+    """
     axis, w = quat[..., :3], quat[..., 3:]
     twice = 2.0 * cross(axis, vector)
     return vector + w * twice + cross(axis, twice)
@@ -48,15 +59,21 @@ def rotate_back(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def continuous(quat: np.ndarray) -> np.ndarray:
-    """Return a series of quaternions, shape (T, 4), with signs under which neighbours differ least."""
+    """Return a series of quaternions, shape (T, 4), with signs under which neighbours
+    differ least.
+    """
     signs = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0.0, -1.0, 1.0)
     return quat * np.cumprod(np.append(1.0, signs))[:, None]
 
 
 def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape (N, 3)."""
+    """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape
+    (N, 3).
+    """
     x, w, half = quat[:, :3], quat[:, 3:], 0.5 * angle
-    found = np.hstack((x + w * half + np.cross(x, half), w - np.sum(x * half, axis=1, keepdims=True)))
+    found = np.hstack(
+        (x + w * half + np.cross(x, half), w - np.sum(x * half, axis=1, keepdims=True))
+    )
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
@@ -83,7 +100,11 @@ def rotate_one(quat: Quaternion, vector: Vector) -> Vector:
     x, y, z, w = quat
     vx, vy, vz = vector
     tx, ty, tz = y * vz - z * vy + w * vx, z * vx - x * vz + w * vy, x * vy - y * vx + w * vz
-    return (vx + 2.0 * (y * tz - z * ty), vy + 2.0 * (z * tx - x * tz), vz + 2.0 * (x * ty - y * tx))
+    return (
+        vx + 2.0 * (y * tz - z * ty),
+        vy + 2.0 * (z * tx - x * tz),
+        vz + 2.0 * (x * ty - y * tx),
+    )
 
 
 def cross_one(a: Vector, b: Vector) -> Vector:
@@ -113,4 +134,9 @@ def quat_of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )

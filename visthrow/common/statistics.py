@@ -1,19 +1,24 @@
-"""Statistics of throws: hierarchical bootstrap, ratios, differences, bias against scatter. NumPy alone.
+"""Statistics of throws: hierarchical bootstrap, ratios, differences, bias against scatter.
 
-Throws of one training run are not independent evidence about the recipe that trained it: another seed may throw otherwise.
-Where several runs are given, a bootstrap sample draws runs first and then throws within each (two levels); with one run the
-interval speaks of that run's throws alone, and :class:`Interval` says so in ``levels``.
+NumPy alone.
 
-Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13 (percentile) and 14 (BCa); Davison and
-Hinkley, "Bootstrap Methods and their Application", 1997, sec. 3.8 (hierarchical data).
-"""
+Throws of one training run are not independent evidence about the recipe that trained it: another
+seed may throw otherwise. Where several runs are given, a bootstrap sample draws runs first and then
+throws within each (two levels); with one run the interval speaks of that run's throws alone, and
+:class:`Interval` says so in ``levels``.
+
+Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13 (percentile) and 14
+(BCa); Davison and Hinkley, "Bootstrap Methods and their Application", 1997, sec. 3.8 (hierarchical
+data)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-DRAWS = 4000  # bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
+DRAWS = (
+    4000  # bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
+)
 
 LEVEL = 0.95
 
@@ -42,13 +47,16 @@ class Interval:
 def _resampled(groups: list[np.ndarray], rng: np.random.Generator, draws: int) -> np.ndarray:
     """Means of bootstrap samples, shape (draws, ...): runs drawn first, then throws within each."""
     count = len(groups)
-    by_run = []  # means of resampled throws, for each run as many independent ones as it can be drawn
+    # means of resampled throws, for each run as many independent ones as it can be drawn
+    by_run = []
     for group in groups:
         index = rng.integers(len(group), size=(draws * count, len(group)), dtype=np.int32)
         columns = group.reshape(len(group), -1).T
         means = np.stack([column[index].mean(1) for column in columns], axis=-1)
         by_run.append(means.reshape(draws, count, *group.shape[1:]))
-    chosen = rng.integers(count, size=(draws, count)) if count > 1 else np.zeros((draws, 1), dtype=int)
+    chosen = (
+        rng.integers(count, size=(draws, count)) if count > 1 else np.zeros((draws, 1), dtype=int)
+    )
     stacked = np.stack(by_run, axis=1)  # (draws, run, copy, ...)
     index = np.arange(draws)[:, None]
     return stacked[index, chosen, np.arange(count)[None]].mean(1)
@@ -59,14 +67,19 @@ def _checked(groups: Groups | np.ndarray) -> list[np.ndarray]:
     listed = [groups] if isinstance(groups, np.ndarray) else list(groups)
     found = [np.asarray(group, dtype=float) for group in listed if len(group)]
     if not found or any(not np.all(np.isfinite(group)) for group in found):
-        raise ValueError(f"{len(listed)} groups, {len(found)} of them with throws; expected finite numbers in one or more")
+        raise ValueError(
+            f"{len(listed)} groups, {len(found)} of them with throws; expected finite numbers in"
+            " one or more"
+        )
     return found
 
 
 def _interval(value: float, samples: np.ndarray, runs: int) -> Interval:
     tail = 0.5 * (1.0 - LEVEL)
     low, high = np.quantile(samples, (tail, 1.0 - tail))
-    return Interval(float(value), float(low), float(high), "runs and throws" if runs > 1 else "throws")
+    return Interval(
+        float(value), float(low), float(high), "runs and throws" if runs > 1 else "throws"
+    )
 
 
 def _mean(groups: list[np.ndarray]) -> np.ndarray:
@@ -75,7 +88,9 @@ def _mean(groups: list[np.ndarray]) -> np.ndarray:
 
 
 def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
-    """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so many bootstrap samples."""
+    """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so
+    many bootstrap samples.
+    """
     found = _checked(groups)
     samples = _resampled(found, np.random.default_rng(seed), draws)
     return _interval(float(_mean(found)), samples, len(found))
@@ -86,7 +101,9 @@ def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAW
     return _of_both(np.subtract, a, b, draws)
 
 
-def _of_both(function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int) -> Interval:
+def _of_both(
+    function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int
+) -> Interval:
     first, second = _checked(a), _checked(b)
     rng = np.random.default_rng(0)
     samples = function(_resampled(first, rng, draws), _resampled(second, rng, draws))
@@ -94,7 +111,8 @@ def _of_both(function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray,
 
 
 def paired(a: np.ndarray, b: np.ndarray) -> Interval:
-    """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a failed throw are left out.
+    """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a
+    failed throw are left out.
 
     Raises ValueError: arrays of different lengths, or no pair in which both landed.
     """
@@ -116,7 +134,9 @@ def correlation(x: np.ndarray, y: np.ndarray) -> Interval:
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(x) != len(y) or len(x) < 3 or not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
-        raise ValueError(f"{len(x)} and {len(y)} numbers; expected three or more pairs, not all alike")
+        raise ValueError(
+            f"{len(x)} and {len(y)} numbers; expected three or more pairs, not all alike"
+        )
     index = np.random.default_rng(0).integers(len(x), size=(DRAWS, len(x)))
     samples = _pearson(x[index], y[index])
     return _interval(float(_pearson(x[None], y[None])[0]), samples[np.isfinite(samples)], 1)
@@ -141,7 +161,10 @@ class Bias:
 
     @property
     def direction(self) -> str:
-        """What the signs say, where the interval excludes zero: "undershoots, lands left", or "no bias"."""
+        """What the signs say, where the interval excludes zero:
+
+        "undershoots, lands left", or "no bias".
+        """
         found = []
         if 0.0 not in self.along:
             found.append("overshoots" if self.along.value > 0.0 else "undershoots")
@@ -151,7 +174,8 @@ class Bias:
 
 
 def bias(groups: Groups | np.ndarray) -> Bias:
-    """Split misses of each run, shape (N, 2) [m], along the throw and to the left, into a common offset and scatter.
+    """Split misses of each run, shape (N, 2) [m], along the throw and to the left, into a common
+    offset and scatter.
 
     Mean square = offset squared + scatter squared.
     """
@@ -166,7 +190,9 @@ def bias(groups: Groups | np.ndarray) -> Bias:
 
 
 def pareto(points: np.ndarray) -> np.ndarray:
-    """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the first coordinate."""
+    """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the
+    first coordinate.
+    """
     front, best = [], np.inf
     for i in np.lexsort((points[:, 1], points[:, 0])):
         if points[i, 1] < best:

@@ -14,17 +14,20 @@ from visthrow.common.errors import StorageError
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, so that, whatever happens, the path holds the old content or the whole new one.
+    """Write bytes, or text as UTF-8, so that, whatever happens, the path holds the old content or
+    the whole new one.
 
-    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in one step; folders are made. Raises
-    StorageError if the disk is full or the place cannot be written; nothing half-written is left.
-    """
+    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in
+    one step; folders are made. Raises StorageError if the disk is full or the place cannot be
+    written; nothing half-written is left."""
     path = Path(path)
     data = content.encode("utf-8") if isinstance(content, str) else content
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+        handle, temporary = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.name}.", suffix=".tmp"
+        )
         with os.fdopen(handle, "wb") as file:
             file.write(data)
             file.flush()
@@ -34,7 +37,9 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
-        raise StorageError(f"cannot write {path} ({len(data)} bytes): {error.strerror or error}") from error
+        raise StorageError(
+            f"cannot write {path} ({len(data)} bytes): {error.strerror or error}"
+        ) from error
     finally:
         if temporary is not None:
             with suppress(OSError):
@@ -42,7 +47,9 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make the folder of the results now, so that no work is done for results that could not be written; StorageError then."""
+    """Make the folder of the results now, so that no work is done for results that could not be
+    written; StorageError then.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -52,25 +59,36 @@ def writable(folder: Path) -> None:
 
 
 def check_place(path: str | Path) -> None:
-    """Raise StorageError, before the work, for a file that could not be written after it; makes nothing."""
+    """Raise StorageError, before the work, for a file that could not be written after it; makes
+    nothing.
+    """
     path = Path(path)
     if path.is_dir():
         raise StorageError(f"cannot write {path}: it is a folder; expected a file")
     above = next(folder for folder in path.absolute().parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
-        raise StorageError(f"cannot write {path}: {above} is {'a folder that cannot be written' if above.is_dir() else 'no folder'}")
+        raise StorageError(
+            f"cannot write {path}: {above} is"
+            f" {'a folder that cannot be written' if above.is_dir() else 'no folder'}"
+        )
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has neither."""
+    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has
+    neither.
+    """
     atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
 
 
 def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays as a compressed ``.npz``, atomically and without pickle; ValueError if one holds Python objects."""
+    """Write named arrays as a compressed ``.npz``, atomically and without pickle; ValueError if one
+    holds Python objects.
+    """
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
-            raise ValueError(f"array '{name}' holds Python objects; expected numbers, bools or text")
+            raise ValueError(
+                f"array '{name}' holds Python objects; expected numbers, bools or text"
+            )
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     atomic_write(path, buffer.getvalue())
@@ -79,12 +97,19 @@ def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.ndarray]:
     """Read all arrays of an ``.npz`` without pickle.
 
-    Raises Exception: of class ``error``: no such file, cut short, damaged, or not what it should be.
-    """
+    Raises Exception: of class ``error``: no such file, cut short, damaged, or not what it should
+    be."""
     path = Path(path)
     if not path.is_file():
-        near = sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}")) if path.parent.is_dir() else []
-        raise error(f"{path}: no such file; expected {what}. In that folder: {', '.join(near) or 'nothing of the kind'}")
+        near = (
+            sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}"))
+            if path.parent.is_dir()
+            else []
+        )
+        raise error(
+            f"{path}: no such file; expected {what}. In that folder:"
+            f" {', '.join(near) or 'nothing of the kind'}"
+        )
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -92,12 +117,16 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.n
         size = path.stat().st_size
         # For what is no archive at all numpy recommends to unpickle it.
         why = "no .npz archive" if "pickle" in str(cause) else cause
-        raise error(f"{path}: cut short or damaged ({size} bytes: {why}); expected {what}") from cause
+        raise error(
+            f"{path}: cut short or damaged ({size} bytes: {why}); expected {what}"
+        ) from cause
 
 
 def json_array(value: Any) -> np.ndarray:
     """Pack a JSON-able value into an array of bytes, for storage in an ``.npz``."""
-    return np.frombuffer(json.dumps(value, sort_keys=True, allow_nan=False).encode("utf-8"), dtype=np.uint8)
+    return np.frombuffer(
+        json.dumps(value, sort_keys=True, allow_nan=False).encode("utf-8"), dtype=np.uint8
+    )
 
 
 def from_json_array(array: np.ndarray) -> Any:

@@ -17,10 +17,27 @@ def use() -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    matplotlib.rcParams.update({
-        "font.family": "DejaVu Sans", "font.size": 10, "axes.titlesize": 11, "axes.labelsize": 10,
-        "legend.fontsize": 9.5, "legend.frameon": False, "axes.edgecolor": QUIET, "axes.labelcolor": INK,
-        "text.color": INK, "xtick.color": QUIET, "ytick.color": QUIET, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
-        "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.8, "grid.color": FAINT,
-        "grid.linewidth": 0.7, "savefig.dpi": 160, "figure.facecolor": "white",
-    })  # fmt: skip
+    matplotlib.rcParams.update(
+        {
+            "font.family": "DejaVu Sans",
+            "font.size": 10,
+            "axes.titlesize": 11,
+            "axes.labelsize": 10,
+            "legend.fontsize": 9.5,
+            "legend.frameon": False,
+            "axes.edgecolor": QUIET,
+            "axes.labelcolor": INK,
+            "text.color": INK,
+            "xtick.color": QUIET,
+            "ytick.color": QUIET,
+            "xtick.labelcolor": INK,
+            "ytick.labelcolor": INK,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.linewidth": 0.8,
+            "grid.color": FAINT,
+            "grid.linewidth": 0.7,
+            "savefig.dpi": 160,
+            "figure.facecolor": "white",
+        }
+    )

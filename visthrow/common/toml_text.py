@@ -9,7 +9,8 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def dumps(tree: dict[str, Any]) -> str:
-    """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values: plain keys first, then tables.
+    """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values:
+    plain keys first, then tables.
 
     Raises ValueError if a value has no TOML form (NaN, infinity, None, other types).
     """
@@ -49,5 +50,12 @@ def _value(value: Any, path: tuple[str, ...]) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_value(item, path) for item in value) + "]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(key)} = {_value(item, path)}" for key, item in value.items()) + "}"
-    raise ValueError(f"{'.'.join(path)}: {value!r} has no TOML form: no string, bool, finite number, list or table")
+        return (
+            "{"
+            + ", ".join(f"{_key(key)} = {_value(item, path)}" for key, item in value.items())
+            + "}"
+        )
+    raise ValueError(
+        f"{'.'.join(path)}: {value!r} has no TOML form: no string, bool, finite number, list or"
+        " table"
+    )

@@ -1,8 +1,7 @@
 """Work done side by side: computations in processes of their own.
 
-Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To go on with what was interrupted, a caller
-keeps each result as it comes and leaves out what is there.
-"""
+Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To go on with
+what was interrupted, a caller keeps each result as it comes and leaves out what is there."""
 
 import multiprocessing as mp
 import pickle
@@ -20,31 +19,41 @@ LOOK = 0.5  # between two looks at the progress [s]
 
 
 def status(text: str) -> None:
-    """Show a text on the terminal's last line in place of the one before; nothing clears it, or where there is no terminal."""
+    """Show a text on the terminal's last line in place of the one before; nothing clears it, or
+    where there is no terminal.
+    """
     if sys.stderr.isatty():
         print(f"\r{text:<78}", end="" if text else "\r", file=sys.stderr, flush=True)
 
 
 class Workers:
-    """Processes that begin their tasks at once, in order; a context manager that ends them when left.
+    """Processes that begin their tasks at once, in order; a context manager that ends them when
+    left.
 
     Iterating yields each task's place in the order and its result, as they are done.
     """
 
-    def __init__(self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = "") -> None:
+    def __init__(
+        self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = ""
+    ) -> None:
         """Start at most so many processes.
 
         Args:
-            function, tasks: importable by its name; it may call :func:`progress`; what it is called with.
+            function, tasks: importable by its name; it may call :func:`progress`; what it is called
+                with.
             processes, label: of a line of progress on the terminal; empty for none.
         """
         tasks, context = list(tasks), mp.get_context("spawn")
         self.label, self._running, self._taken = label, {}, context.Value("i", 0)
         self._shares = context.Array("d", len(tasks), lock=False)
-        work = pickle.dumps((function, tasks))  # here: multiprocessing's own pickler would send tensors as shared memory
+        work = pickle.dumps(
+            (function, tasks)
+        )  # here: multiprocessing's own pickler would send tensors as shared memory
         for _ in range(min(processes, len(tasks))):
             ours, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=_serve, args=(theirs, work, self._taken, self._shares), daemon=True)
+            process = context.Process(
+                target=_serve, args=(theirs, work, self._taken, self._shares), daemon=True
+            )
             process.start()
             theirs.close()
             self._running[ours] = process
@@ -62,7 +71,11 @@ class Workers:
         busy, begin = list(self._running), time.monotonic()
         while busy:
             share = sum(self._shares) / len(self._shares)
-            left = f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left" if share > 0.02 else ""
+            left = (
+                f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left"
+                if share > 0.02
+                else ""
+            )
             if self.label:
                 status(f"{self.label}: {100 * share:3.0f} %{left}")
             for end in wait(busy, LOOK):
@@ -70,7 +83,9 @@ class Workers:
                     index, result = end.recv()
                 except EOFError:
                     self._running[end].join()
-                    raise VisthrowError(f"a worker process ended with status {self._running[end].exitcode}") from None
+                    raise VisthrowError(
+                        f"a worker process ended with status {self._running[end].exitcode}"
+                    ) from None
                 if isinstance(index, int):
                     yield index, result
                 elif result is None:
@@ -81,8 +96,12 @@ class Workers:
             status("")
 
 
-def done(function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1, label: str = "") -> Iterator[tuple[int, Any]]:
-    """Yield each task's place in the order and its result as they are done; in this process, without the label, where one will do."""
+def done(
+    function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1, label: str = ""
+) -> Iterator[tuple[int, Any]]:
+    """Yield each task's place in the order and its result as they are done; in this process,
+    without the label, where one will do.
+    """
     tasks = list(tasks)
     if processes <= 1 or len(tasks) <= 1:
         yield from ((index, function(task)) for index, task in enumerate(tasks))

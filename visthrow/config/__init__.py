@@ -5,14 +5,15 @@ A file holds exactly the keys of its schema. Two things reach beyond the file:
 - ``base = "other.toml"`` at its top: the other file's values lie under this file's, table by table.
 - A *string* where the schema wants a table is the path of a file that holds that table.
 
-Both paths are looked up beside the file first, then under the configs folder, then among the shipped configs of the same kind: a copy
-of ``configs/train/vision.toml`` finds its ``base = "state.toml"`` wherever it lies. Overrides (``"vehicle.body.mass=0.25"``)
-come last. ``"none"`` stands for None where a field is optional; ints pass for floats, bools never for numbers; NaN and
+Both paths are looked up beside the file first, then under the configs folder, then among the
+shipped configs of the same kind: a copy of ``configs/train/vision.toml`` finds its ``base =
+"state.toml"`` wherever it lies. Overrides (``"vehicle.body.mass=0.25"``) come last. ``"none"``
+stands for None where a field is optional; ints pass for floats, bools never for numbers; NaN and
 infinity are refused.
 
-Among like tables (``[effects.wind_x]``, ``[effects.wind_y]``) one may name a sibling: ``base = "wind_x"`` puts the sibling's values
-under the table's own. A field ``name`` of such tables is their heading.
-"""
+Among like tables (``[effects.wind_x]``, ``[effects.wind_y]``) one may name a sibling: ``base =
+"wind_x"`` puts the sibling's values under the table's own. A field ``name`` of such tables is their
+heading."""
 
 import dataclasses
 import tomllib
@@ -32,13 +33,14 @@ T = TypeVar("T")
 def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
     """Load a TOML file into a frozen dataclass.
 
-    Raises ConfigError if a file is missing or no TOML, a key is unknown or missing, or a value has the wrong type; the message names file,
-    key path, what came, what was expected and what exists.
+    Raises ConfigError if a file is missing or no TOML, a key is unknown or missing, or a value has
+    the wrong type; the message names file, key path, what came, what was expected and what exists.
 
     Args:
         schema: Dataclass that the file must fill.
         path: The file.
-        overrides: ``"a.b=3"``: key path and TOML value (a bare word is a string), applied in order after includes.
+        overrides: ``"a.b=3"``: key path and TOML value (a bare word is a string), applied in order
+            after includes.
 
     Returns:
         The filled dataclass.
@@ -47,7 +49,9 @@ def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
 
 
 def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str = "(text)") -> T:
-    """Load TOML text, which messages call by a name, as :func:`load` does a file; includes are looked up under the root."""
+    """Load TOML text, which messages call by a name, as :func:`load` does a file; includes are
+    looked up under the root.
+    """
     return _built(schema, _parse(schema, text, name, configs_root(), ()), overrides)
 
 
@@ -59,20 +63,24 @@ def _built(schema: type[T], tree: Table, overrides: Iterable[str]) -> T:
 
 
 def configs_root() -> Path:
-    """Return the folder of shipped configs: inside the installed package, else beside it in a checkout; ConfigError without either."""
+    """Return the folder of shipped configs: inside the installed package, else beside it in a
+    checkout; ConfigError without either.
+    """
     here = Path(__file__).resolve().parents[1]
     for root in (here / "configs", here.parent / "configs"):
         if root.is_dir():
             return root
-    raise ConfigError(f"no configs folder; expected {here / 'configs'} (installed) or {here.parent / 'configs'} (in a checkout)")
+    raise ConfigError(
+        f"no configs folder; expected {here / 'configs'} (installed) or {here.parent / 'configs'}"
+        " (in a checkout)"
+    )
 
 
 def find(kind: str, name: str | Path) -> Path:
     """Find a config by name (``find("vehicle", "paper")``) or by an explicit path.
 
-    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ... Raises ConfigError if there is none; the message lists what
-    exists.
-    """
+    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ... Raises ConfigError
+    if there is none; the message lists what exists."""
     root = configs_root()
     text = str(name)
     if text.endswith(".toml") or "/" in text or "\\" in text:
@@ -84,7 +92,10 @@ def find(kind: str, name: str | Path) -> Path:
     if not (root / kind).is_dir():
         kinds = (folder.name for folder in root.iterdir() if folder.is_dir())
         raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, kinds)}")
-    raise ConfigError(f"no {kind} config '{text}' (neither a shipped name nor a file); {suggest(text, available(kind))}")
+    raise ConfigError(
+        f"no {kind} config '{text}' (neither a shipped name nor a file);"
+        f" {suggest(text, available(kind))}"
+    )
 
 
 def available(kind: str) -> list[str]:
@@ -93,14 +104,19 @@ def available(kind: str) -> list[str]:
 
 
 def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
-    """Turn a config into nested dictionaries of plain values (tuples become lists), for JSON, TOML or a comparison.
+    """Turn a config into nested dictionaries of plain values (tuples become lists), for JSON, TOML
+    or a comparison.
 
-    ``defaults``: whether fields that hold their default are written too. TypeError if ``config`` is no dataclass instance.
-    """
+    ``defaults``: whether fields that hold their default are written too. TypeError if ``config`` is
+    no dataclass instance."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         raise TypeError(f"got {config!r}; expected an instance of a dataclass")
     values = {f: getattr(config, f.name) for f in dataclasses.fields(config) if f.init}
-    return {f.name: _plain(value, defaults) for f, value in values.items() if defaults or not _is_default(f, value)}
+    return {
+        f.name: _plain(value, defaults)
+        for f, value in values.items()
+        if defaults or not _is_default(f, value)
+    }
 
 
 def dumps(config: Any) -> str:
@@ -180,18 +196,30 @@ def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], p
         if isinstance(node, Table):
             _include(wanted, node, folder, stack, here)
         elif _names_file(node, annotation):
-            tree.items[key] = _read(wanted, _lookup(wanted, node.value, folder, node.source, here), stack)
+            tree.items[key] = _read(
+                wanted, _lookup(wanted, node.value, folder, node.source, here), stack
+            )
 
 
 def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Path:
     root, kinds = configs_root(), kinds_of(schema)
-    for candidate in dict.fromkeys((folder / name, root / name, *(root / kind / name for kind in kinds))):
+    for candidate in dict.fromkeys(
+        (folder / name, root / name, *(root / kind / name for kind in kinds))
+    ):
         if candidate.is_file():
             return candidate
-    shipped = {path.relative_to(root).as_posix() for kind in kinds or ("**",) for path in root.glob(f"{kind}/*.toml")}
-    short = [other for other in sorted(shipped) if Path(other).stem == name]  # a name as the command line takes it
+    shipped = {
+        path.relative_to(root).as_posix()
+        for kind in kinds or ("**",)
+        for path in root.glob(f"{kind}/*.toml")
+    }
+    short = [
+        other for other in sorted(shipped) if Path(other).stem == name
+    ]  # a name as the command line takes it
     meant = f"did you mean '{short[0]}'?" if short else suggest(name, shipped)
-    _schema.fail(source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {meant}")
+    _schema.fail(
+        source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {meant}"
+    )
 
 
 def _override(schema: type, tree: Table, override: str) -> None:
@@ -212,7 +240,11 @@ def _override(schema: type, tree: Table, override: str) -> None:
         elif (values := _schema.dict_values(current)) is not None:
             current = values
         else:
-            _schema.fail(source, here, f"has no keys, so '{key}' cannot be set; expected {_schema.describe(current)}")
+            _schema.fail(
+                source,
+                here,
+                f"has no keys, so '{key}' cannot be set; expected {_schema.describe(current)}",
+            )
         if depth < len(keys) - 1:
             child = tree.items.get(key)
             if not isinstance(child, Table):
@@ -221,11 +253,15 @@ def _override(schema: type, tree: Table, override: str) -> None:
     node = _schema.as_node(_toml_value(text.strip()), source)
     tree.items[keys[-1]] = node
     if (wanted := dataclass_of(current)) is not None and _names_file(node, current):
-        tree.items[keys[-1]] = _read(wanted, _lookup(wanted, node.value, Path.cwd(), source, ".".join(keys)), ())
+        tree.items[keys[-1]] = _read(
+            wanted, _lookup(wanted, node.value, Path.cwd(), source, ".".join(keys)), ()
+        )
 
 
 def _names_file(node: Leaf | Table, annotation: Any) -> TypeGuard[Leaf]:
-    """Whether a string stands where a table is wanted, which is then the path of a file, unless it is the word for None."""
+    """Whether a string stands where a table is wanted, which is then the path of a file, unless it
+    is the word for None.
+    """
     none = isinstance(node, Leaf) and node.value == NONE_WORD and _schema.is_union(annotation)
     return isinstance(node, Leaf) and isinstance(node.value, str) and not none
 

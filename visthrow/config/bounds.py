@@ -1,4 +1,7 @@
-"""Bounds of numbers, declared where the field is: ``lag: NotNegative``, ``share: Annotated[float, Bound(0.0, 1.0)]``. Onboard-safe."""
+"""Bounds of numbers, declared where the field is:
+
+``lag: NotNegative``, ``share: Annotated[float, Bound(0.0, 1.0)]``. Onboard-safe.
+"""
 
 import math
 import typing
@@ -27,7 +30,9 @@ class Bound:
             return f"{self.low:g} to {self.high:g}"
         low = f"above {self.low:g}" if self.ends[0] == "(" else f"{self.low:g} or more"
         high = f"below {self.high:g}" if self.ends[1] == ")" else f"at most {self.high:g}"
-        return " and ".join(text for text, end in ((low, self.low), (high, self.high)) if math.isfinite(end))
+        return " and ".join(
+            text for text, end in ((low, self.low), (high, self.high)) if math.isfinite(end)
+        )
 
 
 Positive = Annotated[float, Bound(0.0, ends="(]")]
@@ -35,7 +40,9 @@ NotNegative = Annotated[float, Bound(0.0)]
 
 
 class Bounded:
-    """Base of dataclasses whose annotations state bounds; raises `ConfigError` for a number outside of its own."""
+    """Base of dataclasses whose annotations state bounds; raises `ConfigError` for a number outside
+    of its own.
+    """
 
     def __post_init__(self) -> None:
         for name, bound in _bounds(type(self)).items():
@@ -47,7 +54,10 @@ class Bounded:
 
 @cache
 def _bounds(schema: type) -> dict[str, Bound]:
-    found = {name: _bound(hint) for name, hint in typing.get_type_hints(schema, include_extras=True).items()}
+    found = {
+        name: _bound(hint)
+        for name, hint in typing.get_type_hints(schema, include_extras=True).items()
+    }
     return {name: bound for name, bound in found.items() if bound is not None}
 
 

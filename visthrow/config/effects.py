@@ -1,9 +1,9 @@
-"""The catalogue of effects: the files of ``configs/effects``, read once. Training and diagnosis both apply it, training to plants
-drawn from what a diagnosis left uncertain.
+"""The catalogue of effects: the files of ``configs/effects``, read once.
 
-Its classes are those of :mod:`sim.effects.effect`, which is imported when the catalogue is asked for: configurations are read on
-board too, where no simulator is installed.
-"""
+Training and diagnosis both apply it, training to plants drawn from what a diagnosis left uncertain.
+
+Its classes are those of :mod:`sim.effects.effect`, which is imported when the catalogue is asked
+for: configurations are read on board too, where no simulator is installed."""
 
 from collections.abc import Iterable
 from functools import cache
@@ -14,7 +14,9 @@ from visthrow.common.errors import ConfigError, expect_known
 from visthrow.config import kinds
 
 FILES = ("thrust", "body", "air", "rope", "sensing", "camera", "numerics", "structure", "random")
-"""Files of ``configs/effects`` in the order of the catalogue, which is that of a diagnosis' columns."""
+"""Files of ``configs/effects`` in the order of the catalogue, which is that of a diagnosis'
+columns.
+"""
 
 
 @cache

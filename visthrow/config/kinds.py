@@ -27,14 +27,25 @@ SCHEMAS = {
 
 
 def schema_of(kind: str, name: str = "") -> type:
-    """Return the schema of a config, whose module is imported only now; ConfigError for a kind of which none is known."""
+    """Return the schema of a config, whose module is imported only now; ConfigError for a kind of
+    which none is known.
+    """
     target = SCHEMAS.get(f"{kind}/{name}") or SCHEMAS.get(kind)
     if target is None:
-        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, (key for key in SCHEMAS if '/' not in key))}")
+        raise ConfigError(
+            f"no kind of config '{kind}';"
+            f" {suggest(kind, (key for key in SCHEMAS if '/' not in key))}"
+        )
     module, attribute = target.split(":")
     return getattr(importlib.import_module(module), attribute)
 
 
 def kinds_of(schema: type) -> list[str]:
-    """Return the folders of configs whose files fill a schema: none for one that no shipped config has."""
-    return [key for key, target in SCHEMAS.items() if target == f"{schema.__module__}:{schema.__name__}" and "/" not in key]
+    """Return the folders of configs whose files fill a schema: none for one that no shipped config
+    has.
+    """
+    return [
+        key
+        for key, target in SCHEMAS.items()
+        if target == f"{schema.__module__}:{schema.__name__}" and "/" not in key
+    ]

@@ -1,4 +1,6 @@
-"""Strict conversion of parsed TOML into frozen dataclasses, with the source of every value at hand for messages."""
+"""Strict conversion of parsed TOML into frozen dataclasses, with the source of every value at hand
+for messages.
+"""
 
 import dataclasses
 import sys
@@ -11,7 +13,8 @@ from typing import Any, Literal, Union
 from visthrow.common.errors import ConfigError, suggest
 
 NONE_WORD = "none"  # TOML has no null: this string stands for None wherever a field is optional
-BASE_KEY = "base"  # names what lies under a file (another file) or under a table among like ones (a sibling)
+# names what lies under a file (another file) or under a table among like ones (a sibling)
+BASE_KEY = "base"
 
 
 @dataclass
@@ -76,7 +79,10 @@ def describe(annotation: Any) -> str:
     if origin is dict:
         return f"a table of {describe(args[1])}"
     if dataclass_of(annotation) is not None:
-        return f"a table with the keys {', '.join(hints(annotation))}, or the path of a file that holds them"
+        return (
+            f"a table with the keys {', '.join(hints(annotation))}, or the path of a file that"
+            " holds them"
+        )
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
     return names.get(annotation, str(annotation))
 
@@ -87,7 +93,8 @@ def fail(source: str, path: str, problem: str) -> typing.NoReturn:
 
 
 def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
-    """Convert one node of the parsed tree, at a dotted path, into the type that the schema asks for.
+    """Convert one node of the parsed tree, at a dotted path, into the type that the schema asks
+    for.
 
     Raises ConfigError if anything is unknown, missing or of another type.
     """
@@ -100,7 +107,10 @@ def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
     if origin is dict:
         if not isinstance(node, Table):
             _wrong_type(annotation, node, path)
-        return {key: build(args[1], item, _join(path, key)) for key, item in _rows(args[1], node, path).items()}
+        return {
+            key: build(args[1], item, _join(path, key))
+            for key, item in _rows(args[1], node, path).items()
+        }
     if isinstance(node, Table):
         _wrong_type(annotation, node, path)
     if origin is tuple:
@@ -135,7 +145,11 @@ def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
     for key, item in node.items.items():
         if key not in types_of:
             fail(item.source, _join(path, key), f"unknown key; {suggest(key, types_of)}")
-    required = [f.name for f in dataclasses.fields(schema) if f.init and f.default is unset and f.default_factory is unset]
+    required = [
+        f.name
+        for f in dataclasses.fields(schema)
+        if f.init and f.default is unset and f.default_factory is unset
+    ]
     if missing := [name for name in required if name not in node.items]:
         given = ", ".join(node.items) or "nothing"
         wanted = ", ".join(f"{name} ({describe(types_of[name])})" for name in missing)
@@ -148,7 +162,9 @@ def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
 
 
 def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
-    """Return like tables of one table, each on top of the sibling that it names as its base; a field ``name`` is the heading."""
+    """Return like tables of one table, each on top of the sibling that it names as its base; a
+    field ``name`` is the heading.
+    """
     schema = dataclass_of(annotation)
     if schema is None or BASE_KEY in hints(schema):
         return node.items
@@ -161,7 +177,11 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
         if "name" in hints(schema):
             given = own.items.get("name")
             if given is not None and not (isinstance(given, Leaf) and given.value == key):
-                fail(item.source, _join(_join(path, key), "name"), f"got {_shown(given)}; expected the heading, {key!r}")
+                fail(
+                    item.source,
+                    _join(_join(path, key), "name"),
+                    f"got {_shown(given)}; expected the heading, {key!r}",
+                )
             own.items["name"] = Leaf(key, item.source)
         base = item.items.get(BASE_KEY)
         if base is None:
@@ -184,7 +204,9 @@ def merged(under: Table, over: Table) -> Table:
     both = Table(over.source, dict(under.items))
     for key, item in over.items.items():
         below = both.items.get(key)
-        both.items[key] = merged(below, item) if isinstance(item, Table) and isinstance(below, Table) else item
+        both.items[key] = (
+            merged(below, item) if isinstance(item, Table) and isinstance(below, Table) else item
+        )
     return both
 
 
@@ -195,7 +217,11 @@ def _build_tuple(annotation: Any, node: Leaf, path: str) -> tuple:
     if len(args) == 2 and args[1] is Ellipsis:
         args = (args[0],) * len(node.value)
     if len(args) != len(node.value):
-        fail(node.source, path, f"got a list of {len(node.value)}: {node.value!r}; expected {describe(annotation)}")
+        fail(
+            node.source,
+            path,
+            f"got a list of {len(node.value)}: {node.value!r}; expected {describe(annotation)}",
+        )
     items = (as_node(value, node.source) for value in node.value)
     return tuple(build(arg, item, f"{path}[{i}]") for i, (arg, item) in enumerate(zip(args, items)))
 
@@ -223,7 +249,11 @@ def as_table(values: dict[str, Any], source: str) -> Table:
 
 def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:
     table = isinstance(node, Table)
-    came = f"a table with the keys {', '.join(node.items) or '(none)'}" if table else f"{node.value!r} ({type(node.value).__name__})"
+    came = (
+        f"a table with the keys {', '.join(node.items) or '(none)'}"
+        if table
+        else f"{node.value!r} ({type(node.value).__name__})"
+    )
     fail(node.source, path, f"got {came}; expected {describe(annotation)}")
 
 

@@ -1,1 +1,3 @@
-"""From measured flights to what the simulation gets wrong: the named cause, the extended model, the measured gain."""
+"""From measured flights to what the simulation gets wrong: the named cause, the extended model, the
+measured gain.
+"""

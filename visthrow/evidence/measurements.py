@@ -1,4 +1,6 @@
-"""Recorded measurements of speed, each with its command, commit and machine: read, and put in Markdown."""
+"""Recorded measurements of speed, each with its command, commit and machine: read, and put in
+Markdown.
+"""
 
 import json
 from pathlib import Path
@@ -9,13 +11,21 @@ from visthrow.view.parts import aligned
 
 FOLDER = Path(__file__).with_name("records") / "bench"
 KEYS = {"bench", "title", "provenance", "tables", "notes", "figures"}
-"""Of every record. One that another version measured has the command of today besides, ``today``."""
+"""Of every record.
+
+One that another version measured has the command of today besides, ``today``.
+"""
 
 
 def body(record: dict[str, Any]) -> str:
     """Title, tables and notes of a record as Markdown."""
-    tables = [f"**{table['title']}**\n\n{aligned(table['header'], table['rows'])}" for table in record["tables"]]
-    return "\n\n".join([f"### {record['title']}", *tables, "\n".join(f"- {note}" for note in record["notes"])]).rstrip()
+    tables = [
+        f"**{table['title']}**\n\n{aligned(table['header'], table['rows'])}"
+        for table in record["tables"]
+    ]
+    return "\n\n".join(
+        [f"### {record['title']}", *tables, "\n".join(f"- {note}" for note in record["notes"])]
+    ).rstrip()
 
 
 def origin(record: dict[str, Any]) -> str:
@@ -30,7 +40,9 @@ def origin(record: dict[str, Any]) -> str:
 
 
 def made_by(record: dict[str, Any]) -> str:
-    """Command, time and commit of a record, and the command that measures it today where that is another."""
+    """Command, time and commit of a record, and the command that measures it today where that is
+    another.
+    """
     came = record["provenance"]
     text = f"`{came['command']}`, {came['time']}, commit {came['commit'][:12]}"
     return f"{text}; today, from a clone: `{record['today']}`" if record.get("today") else text

@@ -26,8 +26,9 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     Raises LogError: it cannot be read, or a table needs a mapping.
 
     Args:
-        path: A file of one of the endings above or ``.npz``, or a folder that holds a ``flight.npz``. ``stand.csv:a1_*`` takes of the
-            logs in a file those whose part fits the pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
+        path: A file of one of the endings above or ``.npz``, or a folder that holds a
+            ``flight.npz``. ``stand.csv:a1_*`` takes of the logs in a file those whose part fits the
+            pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
     """
     path, ending = Path(path), Path(path).suffix.lower()
@@ -56,14 +57,18 @@ def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> li
 
 
 def takes_mapping(path: str | Path) -> bool:
-    """Whether a mapping of columns is used where :func:`read` reads this: a table, or logs with one among them."""
+    """Whether a mapping of columns is used where :func:`read` reads this: a table, or logs with one
+    among them.
+    """
     parts = [str(path)] if Path(path).exists() else str(path).split("+")
     files = [Path(part if Path(part).exists() else part.rpartition(":")[0]) for part in parts]
     return any(not file.is_dir() and file.suffix.lower() not in SELF_DESCRIBING for file in files)
 
 
 def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
-    """Read what names no file, but logs of one flight joined by ``+``, or parts of a file behind a colon."""
+    """Read what names no file, but logs of one flight joined by ``+``, or parts of a file behind a
+    colon.
+    """
     file, _, pattern = str(path).rpartition(":")
     first, *others = str(path).split("+")
     if others and Path(first).exists():
@@ -72,14 +77,18 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
         found = [read(of, mapping) for of in (first, *others)]
         for of, logs in zip((first, *others), found):
             if len(logs) != 1:
-                raise LogError(f"{of}: {len(logs)} logs in it; joining needs one of each, named as FILE:PART")
+                raise LogError(
+                    f"{of}: {len(logs)} logs in it; joining needs one of each, named as FILE:PART"
+                )
         return [join([log for logs in found for log in logs])]
     if Path(file).is_file():
         logs = read(file, mapping)
         names = [str(log.meta.get("part", "")) for log in logs]
         chosen = [log for log, name in zip(logs, names) if fnmatchcase(name, pattern)]
         if not chosen:
-            raise LogError(f"{file}: no part '{pattern}' among {len(names)}; {suggest(pattern, names)}")
+            raise LogError(
+                f"{file}: no part '{pattern}' among {len(names)}; {suggest(pattern, names)}"
+            )
         return chosen
     raise _missing(path)
 
@@ -96,12 +105,17 @@ def _of_folder(path: Path) -> list[FlightLog]:
         return read(path / RUN_LOG)
     logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
     if not logs:
-        raise LogError(f"{path}: a folder without {RUN_LOG} or other .npz logs; name the files themselves")
+        raise LogError(
+            f"{path}: a folder without {RUN_LOG} or other .npz logs; name the files themselves"
+        )
     return read_all(logs)
 
 
 def table_of(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the columns of a table, by name. Raises LogError: it cannot be read, or its format needs no mapping."""
+    """Return the columns of a table, by name.
+
+    Raises LogError: it cannot be read, or its format needs no mapping.
+    """
     from visthrow.logs.readers import recordings, table
 
     path, ending = Path(path), Path(path).suffix.lower()
@@ -112,7 +126,10 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
     if ending in recordings.READERS or (ending not in SELF_DESCRIBING and recordings.is_card(path)):
         return recordings.read_recording(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS))
-    raise LogError(f"{path}: ending '{path.suffix}'; a mapping is for {of_tables}; {', '.join(SELF_DESCRIBING)} say what they hold")
+    raise LogError(
+        f"{path}: ending '{path.suffix}'; a mapping is for {of_tables};"
+        f" {', '.join(SELF_DESCRIBING)} say what they hold"
+    )
 
 
 def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
@@ -127,5 +144,7 @@ def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
     if table.is_export(columns):
         return [table.log_of_export(columns, path)]
     names = ", ".join(list(columns)[:12])
-    raise LogError(f"{path}: a table with the columns {names}, ...: it needs a mapping; give --config NAME (configs/diagnose), or "
-                   "let `visthrow diagnose map FILE --out mine.toml` propose one")
+    raise LogError(
+        f"{path}: a table with the columns {names}, ...: it needs a mapping; give --config NAME"
+        " (configs/diagnose), or let `visthrow diagnose map FILE --out mine.toml` propose one"
+    )

@@ -1,4 +1,6 @@
-"""Exchanges of axes, written as text: ``"x,-y,-z"`` says that our x, y, z are the source's x, its -y and its -z. Onboard-safe.
+"""Exchanges of axes, written as text:
+
+``"x,-y,-z"`` says that our x, y, z are the source's x, its -y and its -z. Onboard-safe.
 
 Of the 48 such sets 24 are turns; the others are mirror images.
 """
@@ -13,12 +15,18 @@ _AXIS = re.compile(r"[+-]?[xyz]")
 
 
 def matrix_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes, mirror images too: ``v_ours = matrix @ v_source``, shape (3, 3).
+    """Return the matrix of a set of axes, mirror images too:
+
+    ``v_ours = matrix @ v_source``, shape (3, 3).
 
     Raises ValueError: not three signed letters, or one of them twice.
     """
     words = [word.strip() for word in axes.split(",")]
-    if len(words) != 3 or not all(map(_AXIS.fullmatch, words)) or len({word[-1] for word in words}) != 3:
+    if (
+        len(words) != 3
+        or not all(map(_AXIS.fullmatch, words))
+        or len({word[-1] for word in words}) != 3
+    ):
         raise ValueError(f"axes '{axes}'; expected x, y and z once each, signed, such as 'x,-y,-z'")
     matrix = np.zeros((3, 3))
     for row, word in enumerate(words):
@@ -27,12 +35,21 @@ def matrix_of(axes: str) -> np.ndarray:
 
 
 def turn_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes that is a turn, shape (3, 3). Raises ValueError as :func:`matrix_of`, or a mirror image."""
+    """Return the matrix of a set of axes that is a turn, shape (3, 3).
+
+    Raises ValueError as :func:`matrix_of`, or a mirror image.
+    """
     matrix = matrix_of(axes)
     if is_mirror(axes):
         signs = [np.where(np.arange(3) == row, -1.0, 1.0)[:, None] * matrix for row in range(3)]
-        near = " ".join(next(name for name, known in zip(EVERY, MATRICES) if np.array_equal(known, one)) for one in signs)
-        raise ValueError(f"axes '{axes}' mirror the world: no rotation turns them into ours; expected one sign less or more: {near}")
+        near = " ".join(
+            next(name for name, known in zip(EVERY, MATRICES) if np.array_equal(known, one))
+            for one in signs
+        )
+        raise ValueError(
+            f"axes '{axes}' mirror the world: no rotation turns them into ours; expected one sign"
+            f" less or more: {near}"
+        )
     return matrix
 
 
@@ -43,8 +60,11 @@ def is_mirror(axes: str) -> bool:
 
 EVERY = tuple(
     ",".join(sign + letter for sign, letter in zip(signs, order))
-    for order in permutations("xyz") for signs in product(("", "-"), repeat=3)
-)  # fmt: skip
+    for order in permutations("xyz")
+    for signs in product(("", "-"), repeat=3)
+)
 """All 48 sets."""
 TURNS = tuple(axes for axes in EVERY if not is_mirror(axes))  # the 24 that are turns
-MATRICES = np.array([matrix_of(axes) for axes in EVERY])  # matrix of each of :data:`EVERY`, shape (48, 3, 3)
+MATRICES = np.array(
+    [matrix_of(axes) for axes in EVERY]
+)  # matrix of each of :data:`EVERY`, shape (48, 3, 3)

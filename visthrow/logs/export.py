@@ -1,8 +1,7 @@
 """Export of a flight log to tables that other programs read: CSV and parquet.
 
-One row a time stamp of any channel, one column a component; a cell is empty where the channel has no valid sample at
-that time. Column names carry unit and frame: ``pos_w[0] [m, world]``.
-"""
+One row a time stamp of any channel, one column a component; a cell is empty where the channel has
+no valid sample at that time. Column names carry unit and frame: ``pos_w[0] [m, world]``."""
 
 import csv
 import io
@@ -19,7 +18,8 @@ FORMATS = (".csv", ".parquet")
 
 
 def export(log: FlightLog, path: str | Path) -> None:
-    """Write a flight log as ``.csv`` or ``.parquet``, by the ending of the path; parquet carries the metadata along.
+    """Write a flight log as ``.csv`` or ``.parquet``, by the ending of the path; parquet carries
+    the metadata along.
 
     Raises LogError if the ending is neither; StorageError if the place cannot be written.
     """
@@ -35,8 +35,8 @@ def export(log: FlightLog, path: str | Path) -> None:
 def columns(log: FlightLog) -> dict[str, np.ma.MaskedArray]:
     """Lay all channels on the union of their time stamps.
 
-    Returns column name -> values, shape (N,), masked where there is no valid sample; ``time [s]`` first.
-    """
+    Returns column name -> values, shape (N,), masked where there is no valid sample; ``time [s]``
+    first."""
     stamps = [channel.time for channel in log.channels.values()]
     time = np.unique(np.concatenate(stamps)) if stamps else np.empty(0)
     table = {"time [s]": np.ma.array(time)}
@@ -57,7 +57,9 @@ def _csv(log: FlightLog) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table)
-    cells = [["" if value is None else value for value in column.tolist()] for column in table.values()]
+    cells = [
+        ["" if value is None else value for value in column.tolist()] for column in table.values()
+    ]
     writer.writerows(zip(*cells))
     return text.getvalue()
 
@@ -67,7 +69,10 @@ def _parquet(log: FlightLog) -> bytes:
     import pyarrow.parquet as pq
 
     table = columns(log)
-    arrays = {name: pa.array(column.data, mask=np.ma.getmaskarray(column)) for name, column in table.items()}
+    arrays = {
+        name: pa.array(column.data, mask=np.ma.getmaskarray(column))
+        for name, column in table.items()
+    }
     metadata = {"visthrow": json.dumps(log.meta)}
     buffer = io.BytesIO()
     pq.write_table(pa.table(arrays).replace_schema_metadata(metadata), buffer)

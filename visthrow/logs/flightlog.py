@@ -1,9 +1,8 @@
-"""The record of one flight: channels, each with its own time stamps, and what is known about the flight as a whole.
-`STANDARD_CHANNELS` lists the channels.
+"""The record of one flight: channels, each with its own time stamps, and what is known about the
+flight as a whole. `STANDARD_CHANNELS` lists the channels.
 
-Onboard-safe (numpy only). The same record serves simulated throws, throws of the reference plant and flights of a real
-vehicle, so that whatever reads one reads them all.
-"""
+Onboard-safe (numpy only). The same record serves simulated throws, throws of the reference plant
+and flights of a real vehicle, so that whatever reads one reads them all."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -37,26 +36,37 @@ STANDARD_CHANNELS = {
     "payload_pos_w": ChannelSpec("m", "world", (3,), "position of the payload's centre"),
     "payload_vel_w": ChannelSpec("m/s", "world", (3,), "velocity of the payload's centre"),
     "cable_points_w": ChannelSpec("m", "world", (None, 3), "joints of the rope, mount first"),
-    "motor_speed": ChannelSpec("rad/s", "none", (4,), "rotor speeds: front left, front right, rear left, rear right"),
+    "motor_speed": ChannelSpec(
+        "rad/s", "none", (4,), "rotor speeds: front left, front right, rear left, rear right"
+    ),
     "battery_voltage": ChannelSpec("V", "none", (), "terminal voltage"),
     "command": ChannelSpec("N, rad/s", "body", (4,), "collective thrust and body rates, as sent"),
     "release_command": ChannelSpec("1", "none", (), "release command, as sent"),
     "action": ChannelSpec("1", "none", (None,), "normalised output of the policy"),
     "observation": ChannelSpec("mixed", "none", (None,), "input of the policy"),
-    "keypoints": ChannelSpec("1", "image", (None, 2), "normalised image points: goal corners, then payload"),
+    "keypoints": ChannelSpec(
+        "1", "image", (None, 2), "normalised image points: goal corners, then payload"
+    ),
     "keypoints_valid": ChannelSpec("bool", "none", (None,), "which of them the camera sees"),
     "goal_w": ChannelSpec("m", "world", (3,), "target of the throw"),
     "attached": ChannelSpec("bool", "none", (), "whether the payload still hangs on the vehicle"),
     "mode": ChannelSpec("1", "none", (), "who commands: 0 hover controller, 1 policy"),
-    "separation": ChannelSpec("m", "world", (3,), "payload's centre as the rope let go; one sample at that time"),
-    "landing": ChannelSpec("m", "world", (3,), "payload's centre at impact; one sample at that time"),
+    "separation": ChannelSpec(
+        "m", "world", (3,), "payload's centre as the rope let go; one sample at that time"
+    ),
+    "landing": ChannelSpec(
+        "m", "world", (3,), "payload's centre at impact; one sample at that time"
+    ),
 }
 """Channels of these names hold this, in this unit and frame; other names are free."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """Samples of one quantity. Raises LogError if lengths differ, time does not increase, or a valid sample is not finite."""
+    """Samples of one quantity.
+
+    Raises LogError if lengths differ, time does not increase, or a valid sample is not finite.
+    """
 
     time: np.ndarray  # strictly increasing [s], shape (T,), float64
     values: np.ndarray  # shape (T, ...)
@@ -67,15 +77,30 @@ class Channel:
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
         values = np.asarray(self.values)
-        valid = np.ones(len(time), dtype=bool) if self.valid is None else np.asarray(self.valid, dtype=bool)
-        if time.ndim != 1 or values.ndim < 1 or valid.shape != time.shape or len(values) != len(time):
-            raise LogError(f"got time {time.shape}, values {values.shape}, validity {valid.shape}; expected (T,), (T, ...), (T,)")
+        valid = (
+            np.ones(len(time), dtype=bool)
+            if self.valid is None
+            else np.asarray(self.valid, dtype=bool)
+        )
+        if (
+            time.ndim != 1
+            or values.ndim < 1
+            or valid.shape != time.shape
+            or len(values) != len(time)
+        ):
+            raise LogError(
+                f"got time {time.shape}, values {values.shape}, validity {valid.shape}; expected"
+                " (T,), (T, ...), (T,)"
+            )
         if not np.all(np.isfinite(time)):
             raise LogError(f"time stamp {int(np.argmin(np.isfinite(time)))} is not finite")
         late = np.flatnonzero(np.diff(time) <= 0.0)
         if len(late):
             i = int(late[0])
-            raise LogError(f"time must increase; sample {i} is at {time[i]} s, sample {i + 1} at {time[i + 1]} s")
+            raise LogError(
+                f"time must increase; sample {i} is at {time[i]} s, sample {i + 1} at"
+                f" {time[i + 1]} s"
+            )
         if values.dtype.kind not in "bif":
             raise LogError(f"values are of type {values.dtype}; expected numbers or bools")
         if values.dtype.kind == "f" and not np.all(np.isfinite(values[valid])):
@@ -87,20 +112,29 @@ class Channel:
 
     def only(self, keep: np.ndarray) -> "Channel":
         """Return some of the samples; ``keep``: shape (T,), bool."""
-        return replace(self, time=self.time[keep], values=self.values[keep], valid=np.asarray(self.valid)[keep])
+        return replace(
+            self, time=self.time[keep], values=self.values[keep], valid=np.asarray(self.valid)[keep]
+        )
 
     def at(self, time: float) -> np.ndarray:
         """Return the value at a time [s], linear between samples."""
         columns = self.values.reshape(len(self.time), -1).T
-        return np.array([np.interp(time, self.time, column) for column in columns]).reshape(self.values.shape[1:])
+        return np.array([np.interp(time, self.time, column) for column in columns]).reshape(
+            self.values.shape[1:]
+        )
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return times [s] and values of the valid samples, float64, shapes (N,) and (N, components)."""
+        """Return times [s] and values of the valid samples, float64, shapes (N,) and (N,
+        components).
+        """
         values = self.values[np.asarray(self.valid)].astype(float)
-        return self.time[np.asarray(self.valid)], values.reshape(len(values), int(np.prod(values.shape[1:])))
+        return self.time[np.asarray(self.valid)], values.reshape(
+            len(values), int(np.prod(values.shape[1:]))
+        )
 
     def hold(self, time: np.ndarray) -> np.ndarray:
-        """Return the last valid sample at or before each time (the first one where there is none yet).
+        """Return the last valid sample at or before each time (the first one where there is none
+        yet).
 
         Raises LogError if no sample is valid.
 
@@ -121,8 +155,8 @@ class Channel:
 class FlightLog:
     """All channels of a flight, and metadata: goal, plant, policy, config, provenance.
 
-    Raises LogError if a channel of a standard name has another unit, frame or shape than the standard says.
-    """
+    Raises LogError if a channel of a standard name has another unit, frame or shape than the
+    standard says."""
 
     channels: dict[str, Channel]
     meta: dict[str, Any] = field(default_factory=dict)
@@ -134,14 +168,24 @@ class FlightLog:
                 continue
             came, wanted = (channel.unit, channel.frame), (spec.unit, spec.frame)
             if came != wanted:
-                raise LogError(f"channel '{name}' is in unit and frame {came}; its name stands for {wanted}")
+                raise LogError(
+                    f"channel '{name}' is in unit and frame {came}; its name stands for {wanted}"
+                )
             shape = channel.values.shape[1:]
-            fits = len(shape) == len(spec.shape) and all(b in (None, a) for a, b in zip(shape, spec.shape))
+            fits = len(shape) == len(spec.shape) and all(
+                b in (None, a) for a, b in zip(shape, spec.shape)
+            )
             if not fits:
-                raise LogError(f"channel '{name}' has samples of shape {shape}; its name stands for {spec.shape}")
+                raise LogError(
+                    f"channel '{name}' has samples of shape {shape}; its name stands for"
+                    f" {spec.shape}"
+                )
 
     def __getitem__(self, name: str) -> Channel:
-        """Return a channel. Raises LogError if there is none of that name; the message lists what exists."""
+        """Return a channel.
+
+        Raises LogError if there is none of that name; the message lists what exists.
+        """
         if name not in self.channels:
             raise LogError(f"no channel '{name}'; {suggest(name, self.channels)}")
         return self.channels[name]
@@ -150,35 +194,64 @@ class FlightLog:
         return name in self.channels
 
     def measured(self) -> "FlightLog":
-        """Return the log without the channels that were worked out of others: ``estimated`` of the metadata names them."""
+        """Return the log without the channels that were worked out of others:
+
+        ``estimated`` of the metadata names them.
+        """
         left_out = self.meta.get("estimated", ())
-        return FlightLog({name: channel for name, channel in self.channels.items() if name not in left_out}, self.meta)
+        return FlightLog(
+            {name: channel for name, channel in self.channels.items() if name not in left_out},
+            self.meta,
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the log as an ``.npz`` without pickle, whole or not at all.
 
-        Raises LogError if the metadata cannot be written as JSON; StorageError if the place cannot be written.
-        """
-        units = {name: {"unit": channel.unit, "frame": channel.frame} for name, channel in self.channels.items()}
+        Raises LogError if the metadata cannot be written as JSON; StorageError if the place cannot
+        be written."""
+        units = {
+            name: {"unit": channel.unit, "frame": channel.frame}
+            for name, channel in self.channels.items()
+        }
         try:
-            arrays = {"header": json_array({"format_version": FORMAT_VERSION, "channels": units, "meta": self.meta})}
+            arrays = {
+                "header": json_array(
+                    {"format_version": FORMAT_VERSION, "channels": units, "meta": self.meta}
+                )
+            }
         except (TypeError, ValueError) as error:
             raise LogError(f"the metadata holds what JSON cannot: {error}") from error
         for name, channel in self.channels.items():
-            arrays |= {f"{name}/time": channel.time, f"{name}/values": channel.values, f"{name}/valid": np.asarray(channel.valid)}
+            arrays |= {
+                f"{name}/time": channel.time,
+                f"{name}/values": channel.values,
+                f"{name}/valid": np.asarray(channel.valid),
+            }
         savez(path, arrays)
 
     @staticmethod
     def load(path: str | Path) -> "FlightLog":
-        """Read a log. Raises LogError if the file is missing, cut short, of another version, incomplete, or contradicts itself."""
+        """Read a log.
+
+        Raises LogError if the file is missing, cut short, of another version, incomplete, or
+        contradicts itself.
+        """
         arrays = loadz(path, LogError, "a flight log")
         try:
             header = from_json_array(arrays["header"])
             version, units, meta = header["format_version"], header["channels"], header["meta"]
             if version != FORMAT_VERSION:
-                raise LogError(f"format version {version}; this program reads version {FORMAT_VERSION}")
+                raise LogError(
+                    f"format version {version}; this program reads version {FORMAT_VERSION}"
+                )
             channels = {
-                name: Channel(arrays[f"{name}/time"], arrays[f"{name}/values"], of["unit"], of["frame"], arrays[f"{name}/valid"])
+                name: Channel(
+                    arrays[f"{name}/time"],
+                    arrays[f"{name}/values"],
+                    of["unit"],
+                    of["frame"],
+                    arrays[f"{name}/valid"],
+                )
                 for name, of in units.items()
             }
             return FlightLog(channels, meta)
@@ -186,7 +259,10 @@ class FlightLog:
             raise LogError(f"{path}: {error}") from error
         except (KeyError, TypeError, ValueError) as error:
             came = f"no entry {error}" if isinstance(error, KeyError) else str(error)
-            raise LogError(f"{path}: incomplete: {came}; expected a flight log, it holds {', '.join(sorted(arrays))}") from error
+            raise LogError(
+                f"{path}: incomplete: {came}; expected a flight log, it holds"
+                f" {', '.join(sorted(arrays))}"
+            ) from error
 
 
 class FlightRecorder:
@@ -203,7 +279,9 @@ class FlightRecorder:
         self._units[name] = (unit, frame)
 
     def add(self, time: float, valid: bool = True, **values: Any) -> None:
-        """Add one sample to each named channel. Raises LogError if a channel has neither a standard name nor been declared.
+        """Add one sample to each named channel.
+
+        Raises LogError if a channel has neither a standard name nor been declared.
 
         Args:
             time: [s].
@@ -213,18 +291,26 @@ class FlightRecorder:
         for name, value in values.items():
             if name not in self._units:
                 if name not in STANDARD_CHANNELS:
-                    raise LogError(f"channel '{name}' was not declared; {suggest(name, STANDARD_CHANNELS)}")
+                    raise LogError(
+                        f"channel '{name}' was not declared; {suggest(name, STANDARD_CHANNELS)}"
+                    )
                 self._units[name] = (STANDARD_CHANNELS[name].unit, STANDARD_CHANNELS[name].frame)
             self._samples.setdefault(name, []).append((time, np.array(value), valid))
 
     def log(self) -> FlightLog:
-        """Return what was recorded so far. Raises LogError if samples of one channel do not fit together; the message names the channel."""
+        """Return what was recorded so far.
+
+        Raises LogError if samples of one channel do not fit together; the message names the
+        channel.
+        """
         channels = {}
         for name, samples in self._samples.items():
             time, values, valid = zip(*samples)
             unit, frame = self._units[name]
             try:
-                channels[name] = Channel(np.array(time), np.stack(values), unit, frame, np.array(valid))
+                channels[name] = Channel(
+                    np.array(time), np.stack(values), unit, frame, np.array(valid)
+                )
             except (LogError, ValueError) as error:
                 raise LogError(f"channel '{name}': {error}") from error
         return FlightLog(channels, dict(self.meta))

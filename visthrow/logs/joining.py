@@ -1,8 +1,9 @@
-"""Several logs of one flight, each on a clock of its own, as one flight log: what was measured twice tells how they lie.
+"""Several logs of one flight, each on a clock of its own, as one flight log: what was measured
+twice tells how they lie.
 
-``LOG00001.BFL+mocap.csv`` names such a flight. Body rates by gyro and by attitude, positions, or accelerations are compared;
-the first log's clock counts. What a log worked out of its other channels (``estimated`` of its metadata) is not compared.
-"""
+``LOG00001.BFL+mocap.csv`` names such a flight. Body rates by gyro and by attitude, positions, or
+accelerations are compared; the first log's clock counts. What a log worked out of its other
+channels (``estimated`` of its metadata) is not compared."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,38 +17,58 @@ from visthrow.logs.check import relations
 from visthrow.logs.flightlog import FlightLog
 
 RATE = 50.0  # rate of the grid on which logs are first laid over one another [Hz]
-LEAST = 0.6  # correlation of what was measured twice, below which two logs are not taken for one flight
+LEAST = (
+    0.6  # correlation of what was measured twice, below which two logs are not taken for one flight
+)
 _FINE = 0.1  # around the coarse answer [s]
 _SPAN = 0.1  # of turns: rates of attitudes with 0.2 deg of noise are good to 0.05 rad/s then [s]
-_STEP, _FINE_RATE = 0.001, 200.0  # of lags there, through whose best three a parabola is laid [s]; of samples compared there [Hz]
+_STEP, _FINE_RATE = (
+    0.001,
+    200.0,
+)  # of lags there, through whose best three a parabola is laid [s]; of samples compared there [Hz]
 
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s], shape (T,), and values, shape (T, 1 or 3)."""
 
 
 def join(logs: Sequence[FlightLog]) -> FlightLog:
-    """Put logs of one flight together; of a channel that several measured, the first log's stays, and an estimated one where none did.
+    """Put logs of one flight together; of a channel that several measured, the first log's stays,
+    and an estimated one where none did.
 
     Raises LogError: nothing was measured in both, or it does not go together.
     """
     whole, *others = logs
-    channels, meta, estimated = dict(whole.channels), dict(whole.meta), set(whole.meta.get("estimated", ()))
+    channels, meta, estimated = (
+        dict(whole.channels),
+        dict(whole.meta),
+        set(whole.meta.get("estimated", ())),
+    )
     meta["joined"] = []
     for log in others:
         offset, correlation, by = offset_of(FlightLog(channels, {"estimated": estimated}), log)
         own = set(log.meta.get("estimated", ()))
-        new = {name for name in log.channels if name not in channels or (name in estimated and name not in own)}
+        new = {
+            name
+            for name in log.channels
+            if name not in channels or (name in estimated and name not in own)
+        }
         channels |= {name: replace(log[name], time=log[name].time + offset) for name in new}
         estimated = estimated - new | own & new
         source = str(log.meta.get("source", ""))
-        meta["joined"].append({"source": source, "offset_s": offset, "correlation": correlation, "by": by})
+        meta["joined"].append(
+            {"source": source, "offset_s": offset, "correlation": correlation, "by": by}
+        )
         notes = log.meta.get("ingest", {})
-        meta["ingest"] = {**meta.get("ingest", {}), **{name: {**notes[name], "clock": source} for name in notes if name in new}}
+        meta["ingest"] = {
+            **meta.get("ingest", {}),
+            **{name: {**notes[name], "clock": source} for name in notes if name in new},
+        }
     return FlightLog(channels, meta | {"estimated": sorted(estimated)} if estimated else meta)
 
 
 def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
-    """Return what to add to the second log's times [s], the correlation then, and by which quantity.
+    """Return what to add to the second log's times [s], the correlation then, and by which
+    quantity.
 
     Raises LogError: nothing was measured in both, or it does not go together.
     """
@@ -58,12 +79,16 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
             tried.append((by, *_lag(a, b)))
     if not tried:
         raise LogError(
-            f"{second.meta.get('source', 'a log')}: nothing in it that the others measured too; joining needs body rates or attitude, "
-            f"positions, or accelerations in both; it has {', '.join(second.channels)}"
+            f"{second.meta.get('source', 'a log')}: nothing in it that the others measured too;"
+            " joining needs body rates or attitude, positions, or accelerations in both; it has"
+            f" {', '.join(second.channels)}"
         )
     by, offset, correlation = max(tried, key=lambda of: of[2])
     if correlation < LEAST:
-        raise LogError(f"{second.meta.get('source', 'a log')}: its {by} go with the others' by {correlation:.2f} at best: not one flight")
+        raise LogError(
+            f"{second.meta.get('source', 'a log')}: its {by} go with the others' by"
+            f" {correlation:.2f} at best: not one flight"
+        )
     return offset, correlation, by
 
 
@@ -72,7 +97,11 @@ def _turning(log: FlightLog) -> Signal | None:
     if "rate_b" not in log:
         return relations.rates_of(*log["quat_wb"].samples(), _SPAN) if "quat_wb" in log else None
     time, rate = log["rate_b"].samples()
-    inside = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)] if len(time) else time
+    inside = (
+        time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
+        if len(time)
+        else time
+    )
     return (inside, relations.mean_over(time, rate, inside, _SPAN)) if len(inside) else None
 
 
@@ -99,11 +128,14 @@ def _sized(time: np.ndarray, values: np.ndarray) -> Signal:
 def _lag(a: Signal, b: Signal) -> tuple[float, float]:
     """Offset of the second [s] and the correlation of sizes, which no axes change.
 
-    All lags at once by Fourier transform of the sizes; about the best one by one, the components in the axes that fit best.
-    """
+    All lags at once by Fourier transform of the sizes; about the best one by one, the components in
+    the axes that fit best."""
     sizes = _sized(*a), _sized(*b)
     grids = [np.arange(time[0], time[-1], 1.0 / RATE) for time, _ in sizes]
-    x, y = (np.interp(grid, time, size[:, 0]) - np.mean(size) for grid, (time, size) in zip(grids, sizes))
+    x, y = (
+        np.interp(grid, time, size[:, 0]) - np.mean(size)
+        for grid, (time, size) in zip(grids, sizes)
+    )
     lags = correlation_lags(len(x), len(y))
     coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(correlate(x, y, method="fft"))]) / RATE
     near = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
@@ -115,15 +147,22 @@ def _lag(a: Signal, b: Signal) -> tuple[float, float]:
 
 
 def _both(a: Signal, b: Signal, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values of both on a grid of the first's clock, the same for any offset, where there are both."""
+    """Values of both on a grid of the first's clock, the same for any offset, where
+    there are both.
+    """
     grid = np.arange(a[0][0], a[0][-1], 1.0 / _FINE_RATE)
     grid = grid[(grid > b[0][0] + offset) & (grid < b[0][-1] + offset)]
     return relations.on_grid(*a, grid), relations.on_grid(*b, grid - offset)
 
 
 def _alignment(x: np.ndarray, y: np.ndarray) -> float:
-    """Correlation of components once one is turned, or mirrored, to fit the other best: the sum of the covariance's singular values."""
+    """Correlation of components once one is turned, or mirrored, to fit the other best: the sum of
+    the covariance's singular values.
+    """
     if len(x) < RATE:
         return -1.0
     x, y = x - np.mean(x, axis=0), y - np.mean(y, axis=0)
-    return float(np.sum(np.linalg.svd(x.T @ y, compute_uv=False)) / max(np.sqrt(np.sum(x**2) * np.sum(y**2)), 1e-12))
+    return float(
+        np.sum(np.linalg.svd(x.T @ y, compute_uv=False))
+        / max(np.sqrt(np.sum(x**2) * np.sum(y**2)), 1e-12)
+    )

@@ -1,4 +1,6 @@
-"""The mapping file: which columns of a table become which channels, in which unit, about which axes, on which clock."""
+"""The mapping file: which columns of a table become which channels, in which unit, about which
+axes, on which clock.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,12 +16,17 @@ _WIDTH = {"quaternion": (4,), "euler": (3,), "vector": None}
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """A clock: a column of stamps, or rows that are evenly spaced. Raises ConfigError: neither or both of them, or no unit of time."""
+    """A clock: a column of stamps, or rows that are evenly spaced.
+
+    Raises ConfigError: neither or both of them, or no unit of time.
+    """
 
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
     row_period: float = 0.0  # between two rows [s], where there is no column
-    offset: float = 0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
+    offset: float = (
+        0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
+    )
 
     def __post_init__(self) -> None:
         if bool(self.column) == (self.row_period > 0.0):
@@ -30,19 +37,30 @@ class TimeColumn:
 
 @dataclass(frozen=True)
 class ChannelMap:
-    """Columns of one channel. Raises ConfigError: a unit, frame, number of columns or order of axes that the channel cannot have."""
+    """Columns of one channel.
 
-    name: str  # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are free
+    Raises ConfigError: a unit, frame, number of columns or order of axes that the channel cannot
+    have.
+    """
+
+    # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are
+    # free
+    name: str
     columns: tuple[str, ...]
     unit: str  # of the columns
-    kind: Literal["vector", "quaternion", "euler"] = "vector"  # euler: roll, pitch, yaw; yaw is turned first
+    kind: Literal["vector", "quaternion", "euler"] = (
+        "vector"  # euler: roll, pitch, yaw; yaw is turned first
+    )
     order: str = "xyzw"  # of a quaternion's columns
-    axes: str = ""  # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": as they come
+    # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": as they come
+    axes: str = ""
     body_axes: str = ""  # of an attitude: our body's x, y, z in the source's body axes
     frame: str = ""  # of a free channel; "": none
     scale: float = 1.0  # the column is multiplied by it, before its unit
     offset: float = 0.0  # and this is added then, in the column's unit
-    held: bool = False  # between measurements the table repeats the last one; repetitions are left out
+    held: bool = (
+        False  # between measurements the table repeats the last one; repetitions are left out
+    )
     clock: str = ""  # of the setup's further clocks; "": the main one
 
     def __post_init__(self) -> None:
@@ -52,7 +70,9 @@ class ChannelMap:
             raise ConfigError(f"{where}: no columns")
         wanted = _WIDTH[self.kind]
         if wanted and len(self.columns) not in wanted:
-            raise ConfigError(f"{where}: {self.kind} of {len(self.columns)} columns; expected {wanted[0]}")
+            raise ConfigError(
+                f"{where}: {self.kind} of {len(self.columns)} columns; expected {wanted[0]}"
+            )
         if self.order not in _ORDERS:
             raise ConfigError(f"{where}: order '{self.order}'; {suggest(self.order, _ORDERS)}")
         if self.frame and self.frame not in FRAMES:
@@ -68,7 +88,10 @@ class ChannelMap:
             return
         ours = "1" if self.kind != "vector" else to_si(self.unit, where)[0]
         if ours not in spec.unit.split(", "):
-            raise ConfigError(f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in '{spec.unit}'")
+            raise ConfigError(
+                f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in"
+                f" '{spec.unit}'"
+            )
 
 
 @dataclass(frozen=True)
@@ -82,7 +105,10 @@ class Split:
 
 @dataclass(frozen=True)
 class TableMap:
-    """Mapping of a table's columns. Raises ConfigError: two channels of one name, or a clock that is not defined."""
+    """Mapping of a table's columns.
+
+    Raises ConfigError: two channels of one name, or a clock that is not defined.
+    """
 
     time: TimeColumn
     channels: tuple[ChannelMap, ...]

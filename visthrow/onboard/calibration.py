@@ -1,15 +1,18 @@
-"""Hover calibration: the camera's tilt, scale and latency and the thrust, from seconds of hover that end in a small sway. Onboard-safe.
+"""Hover calibration: the camera's tilt, scale and latency and the thrust, from seconds of hover
+that end in a small sway. Onboard-safe.
 
-A hanging ball shows where down is; a sway turns the camera against it. One least-squares problem holds it all: the vehicle's path,
-its attitude and the swing as unknowns at every step, tied by the momentum of both bodies, the pendulum and the gyro, and what
-calibration asks for as constants: the maximum a posteriori, as a Kalman smoother would find it, with the constants' covariance.
-What a run cannot tell (a lens out of place, biases of motion capture and keypoints) are constants too, each with its own spread,
-so that the answer's uncertainty has them in it.
+A hanging ball shows where down is; a sway turns the camera against it. One least-squares problem
+holds it all: the vehicle's path, its attitude and the swing as unknowns at every step, tied by the
+momentum of both bodies, the pendulum and the gyro, and what calibration asks for as constants: the
+maximum a posteriori, as a Kalman smoother would find it, with the constants' covariance. What a run
+cannot tell (a lens out of place, biases of motion capture and keypoints) are constants too, each
+with its own spread, so that the answer's uncertainty has them in it.
 
-Source: Gauss-Newton on a Markov chain, Bell, "The iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optim. 4(3), 1994.
-Convention: the latency is the keypoints' age beyond that of the poses that come with them. The camera's turn is a rotation vector
-in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as in `camera.keypoints.KeypointCamera.extrinsics`.
-"""
+Source: Gauss-Newton on a Markov chain, Bell, "The iterated Kalman smoother as a Gauss-Newton
+method", SIAM J. Optim. 4(3), 1994.
+Convention: the latency is the keypoints' age beyond that of the poses that come with them. The
+camera's turn is a rotation vector in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as in
+`camera.keypoints.KeypointCamera.extrinsics`."""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +22,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, ball_extremes_c, box_midpoints, goal_corners_w
+from camera.keypoints import (
+    GOAL_KEYPOINTS,
+    KeypointCamera,
+    ball_extremes_c,
+    box_midpoints,
+    goal_corners_w,
+)
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams
 from visthrow.common.constants import GRAVITY
@@ -27,27 +36,51 @@ from visthrow.common.errors import VisthrowError
 from visthrow.onboard.observations import rotation_from_quat
 
 STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
-"""Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of the rope's direction and its rate."""
+"""Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of
+the rope's direction and its rate.
+"""
 
 CONSTANTS = {
-    "camera": 3, "scale": 1, "latency": 1, "thrust": 1, "length": 1, "drag": 1, "attitude": 3, "gyro": 3, "wind": 2, "ball": 3,
-    "corners": 2, "lens": 3, "goal": 2,
-}  # fmt: skip
+    "camera": 3,
+    "scale": 1,
+    "latency": 1,
+    "thrust": 1,
+    "length": 1,
+    "drag": 1,
+    "attitude": 3,
+    "gyro": 3,
+    "wind": 2,
+    "ball": 3,
+    "corners": 2,
+    "lens": 3,
+    "goal": 2,
+}
 """Unknowns that stay the same; see `Spreads`."""
 
-LEAST_STEPS, LEAST_SEEN = 75, 0.5  # steps of a calibration, and share of them in which the ball is seen
-ROUNDS, SETTLED = 12, 1e-3  # of Gauss-Newton at most, and the step of a constant in its spreads below which it has settled
+LEAST_STEPS, LEAST_SEEN = (
+    75,
+    0.5,
+)  # steps of a calibration, and share of them in which the ball is seen
+ROUNDS, SETTLED = (
+    12,
+    1e-3,
+)  # of Gauss-Newton at most, and the step of a constant in its spreads below which it has settled
 OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
 
 
 @dataclass(frozen=True)
 class Spreads:
-    """Standard deviations. Of what is measured, each axis and step; of constants that are not asked for; of the model."""
+    """Standard deviations.
+
+    Of what is measured, each axis and step; of constants that are not asked for; of the model.
+    """
 
     pos: float = 0.01  # [m]
     vel: float = 0.01  # [m/s]
     attitude: float = 0.01  # [rad]
-    heading: float = 0.7071  # of attitude about the body's z over that about x and y, bias too [-]: two columns of the rotation tell it
+    # of attitude about the body's z over that about x and y, bias too [-]: two columns of the
+    # rotation tell it
+    heading: float = 0.7071
     rate: float = 0.01  # [rad/s]
     keypoint: float = 0.01  # normalised [-]
     pose_bias: float = 0.001  # of attitude and gyro [rad, rad/s]
@@ -79,14 +112,18 @@ class Hovered:
     keypoints: np.ndarray  # normalised [-], shape (N, 8, 2)
     valid: np.ndarray  # shape (N, 8), bool
     goal_w: np.ndarray  # [m], shape (3,)
-    age: np.ndarray | None = None  # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
+    age: np.ndarray | None = (
+        None  # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
+    )
 
 
 @dataclass(frozen=True)
 class Calibration:
     """What a hover showed, each with its standard deviation."""
 
-    turn_b: tuple[float, float, float]  # of the camera from its nominal pose: roll, pitch, yaw [rad]
+    turn_b: tuple[
+        float, float, float
+    ]  # of the camera from its nominal pose: roll, pitch, yaw [rad]
     turn_sigma: tuple[float, float, float]  # [rad]
     latency: float  # of the keypoints beyond the poses' and beyond what is stated [s]
     latency_sigma: float  # [s]
@@ -99,17 +136,29 @@ class Calibration:
 
     def values(self) -> dict[str, Any]:
         """As JSON has it."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(self).items()
+        }
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> "Calibration":
         """The inverse of `values`."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+        return cls(
+            **{
+                name: tuple(value) if isinstance(value, list) else value
+                for name, value in values.items()
+            }
+        )
 
     def __str__(self) -> str:
         """For the pilot."""
         turns = [
-            f"{name} {np.degrees(x):+.2f} +- {np.degrees(sigma):.2f} deg" if name != "yaw" or sigma < UNKNOWN_YAW else "yaw unknown"
+            (
+                f"{name} {np.degrees(x):+.2f} +- {np.degrees(sigma):.2f} deg"
+                if name != "yaw" or sigma < UNKNOWN_YAW
+                else "yaw unknown"
+            )
             for name, x, sigma in zip(("roll", "pitch", "yaw"), self.turn_b, self.turn_sigma)
         ]
         return (
@@ -119,35 +168,48 @@ class Calibration:
         )
 
 
-UNKNOWN_YAW = math.radians(2.0)  # standard deviation of the camera's yaw above which it is said to be unknown [rad]
+UNKNOWN_YAW = math.radians(
+    2.0
+)  # standard deviation of the camera's yaw above which it is said to be unknown [rad]
 
 
 class CalibrationError(VisthrowError):
     """A hover shows too little to calibrate by."""
+
 
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
 
 STILL, SWAY = 1.5, 1.5  # of a hover before the sway, and of the sway [s]
 
 SWAY_RATE, SWAY_FREQUENCY = 1.0, 4.0 / 3.0
-"""Amplitude of roll and pitch rate, 7 deg of tilt about either axis [rad/s]; above the swing's frequency: the rope does not follow [Hz]."""
+"""Amplitude of roll and pitch rate, 7 deg of tilt about either axis [rad/s]; above the swing's
+frequency: the rope does not follow [Hz].
+"""
 
 
-def sway(since: float, rate: float = SWAY_RATE, frequency: float = SWAY_FREQUENCY) -> tuple[float, float]:
-    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: once to and fro along a diagonal, then along the other one.
+def sway(
+    since: float, rate: float = SWAY_RATE, frequency: float = SWAY_FREQUENCY
+) -> tuple[float, float]:
+    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: once to and fro along a
+    diagonal, then along the other one.
 
-    A camera's yaw turns the path that the ball takes in the image, latency puts it off along itself. On a circle the two are the same; the
-    sum of their products is the area that a path encloses, and lines enclose none.
-    """
+    A camera's yaw turns the path that the ball takes in the image, latency puts it off along
+    itself. On a circle the two are the same; the sum of their products is the area that a path
+    encloses, and lines enclose none."""
     swung = rate * math.cos(2.0 * math.pi * frequency * since)
     return swung, swung if int(frequency * since + 1e-9) % 2 == 0 else -swung
 
 
 class Problem:
-    """Residuals of a hover, over their spreads; all arguments carry a batch axis B in front, for differences."""
+    """Residuals of a hover, over their spreads; all arguments carry a batch axis B in front, for
+    differences.
+    """
 
-    def __init__(self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads) -> None:
-        """Take the measurements, the nominal camera, float64, and of the policy's contract masses and rope.
+    def __init__(
+        self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads
+    ) -> None:
+        """Take the measurements, the nominal camera, float64, and of the policy's contract masses
+        and rope.
 
         Raises CalibrationError: too few steps, or too few that show the ball.
         """
@@ -155,8 +217,8 @@ class Problem:
         seen = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
         if count < LEAST_STEPS or seen.mean() < LEAST_SEEN:
             raise CalibrationError(
-                f"calibration from {count} steps, the ball seen in {100 * seen.mean():.0f} % of them; expected {LEAST_STEPS} or more, and "
-                f"{100 * LEAST_SEEN:.0f} %"
+                f"calibration from {count} steps, the ball seen in {100 * seen.mean():.0f} % of"
+                f" them; expected {LEAST_STEPS} or more, and {100 * LEAST_SEEN:.0f} %"
             )
         tensor = lambda value: torch.tensor(np.asarray(value), dtype=torch.float64)  # noqa: E731
         rope, body = contract["rope"], contract["vehicle"]["body"]
@@ -164,44 +226,79 @@ class Problem:
         self.vehicle, self.load = body["mass"], rope["payload_mass"] + 0.5 * rope["rope_mass"]
         self.length, self.mount = rope["length"] + rope["payload_offset"], tensor(rope["mount"])
         moment = rope["payload_mass"] * self.length + 0.5 * rope["rope_mass"] * rope["length"]
-        inertia = rope["payload_mass"] * self.length**2 + rope["payload_inertia"] + rope["rope_mass"] * rope["length"] ** 2 / 3.0
+        inertia = (
+            rope["payload_mass"] * self.length**2
+            + rope["payload_inertia"]
+            + rope["rope_mass"] * rope["length"] ** 2 / 3.0
+        )
         self.swung = inertia / moment  # to the centre of oscillation [m]
         self.time, self.goal = tensor(hovered.time), tensor(hovered.goal_w)
         self.dt = self.time.diff()
         self.age = tensor(np.zeros(count) if hovered.age is None else hovered.age)
-        self.pos, self.vel, self.rate, self.thrust = (tensor(getattr(hovered, n)) for n in ("pos_w", "vel_w", "rate_b", "thrust"))
+        self.pos, self.vel, self.rate, self.thrust = (
+            tensor(getattr(hovered, n)) for n in ("pos_w", "vel_w", "rate_b", "thrust")
+        )
         self.base, self.mean_rate = rotation_from_quat(tensor(hovered.quat_wb)), _means(self.rate)
         points = tensor(hovered.keypoints)
-        self.ball, self.corners = _box(points[:, GOAL_KEYPOINTS:]), points[:, :GOAL_KEYPOINTS].mean(1)
+        self.ball, self.corners = (
+            _box(points[:, GOAL_KEYPOINTS:]),
+            points[:, :GOAL_KEYPOINTS].mean(1),
+        )
         self.ball_seen = torch.from_numpy(seen)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         s = spreads
-        spread = {"camera": s.tilt, "scale": s.scale, "latency": s.latency, "thrust": s.thrust, "length": s.length, "drag": s.drag,
-                  "attitude": s.pose_bias, "gyro": s.pose_bias, "wind": s.wind, "ball": 0.5 * s.keypoint_bias,
-                  "corners": 0.5 * s.keypoint_bias, "lens": s.lens, "goal": s.goal}  # fmt: skip
-        self.prior = torch.cat([torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64) for name, n in CONSTANTS.items()])
+        spread = {
+            "camera": s.tilt,
+            "scale": s.scale,
+            "latency": s.latency,
+            "thrust": s.thrust,
+            "length": s.length,
+            "drag": s.drag,
+            "attitude": s.pose_bias,
+            "gyro": s.pose_bias,
+            "wind": s.wind,
+            "ball": 0.5 * s.keypoint_bias,
+            "corners": 0.5 * s.keypoint_bias,
+            "lens": s.lens,
+            "goal": s.goal,
+        }
+        self.prior = torch.cat(
+            [
+                torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64)
+                for name, n in CONSTANTS.items()
+            ]
+        )
         self.push = tensor([s.push, s.push, s.lift])
         self.attitude = tensor([s.attitude, s.attitude, s.heading * s.attitude])
         self.split(self.prior[None])["attitude"][0, 2] *= s.heading
 
     def start(self) -> tuple[Tensor, Tensor]:
-        """Unknowns to begin from: what was measured and a rope at rest, shape (N, 13); constants, shape (C,)."""
+        """Unknowns to begin from: what was measured and a rope at rest, shape (N, 13); constants,
+        shape (C,).
+        """
         zeros = torch.zeros(len(self.time), 7, dtype=torch.float64)
-        return torch.cat([self.pos, self.vel, zeros], -1), torch.zeros(len(self.prior), dtype=torch.float64)
+        return torch.cat([self.pos, self.vel, zeros], -1), torch.zeros(
+            len(self.prior), dtype=torch.float64
+        )
 
     def split(self, constants: Tensor) -> dict[str, Tensor]:
         """Constants by name, each (B, n)."""
         return dict(zip(CONSTANTS, constants.split(list(CONSTANTS.values()), -1)))
 
     def steps(self, x: Tensor, constants: Tensor) -> Tensor:
-        """Residuals of steps k to k + 1 and of what was measured at k, (B, N - 1, 20), of unknowns, (B, N, 13), and constants, (B, C)."""
+        """Residuals of steps k to k + 1 and of what was measured at k, (B, N - 1, 20), of unknowns,
+        (B, N, 13), and constants, (B, C).
+        """
         c, s, dt = self.split(constants), self.spreads, self.dt[:, None]
         pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
         rot = self.base @ rotation_from_vector(turn)
         rate = self.rate - c["gyro"][:, None]
         rope, rope_rate = _rope(swing, swing_rate)
         hung = vel + _turned(rot, torch.linalg.cross(rate, self.mount.expand_as(rate)))
-        ball, swung = (hung + length * (1.0 + c["length"][:, None]) * rope_rate for length in (self.length, self.swung))
+        ball, swung = (
+            hung + length * (1.0 + c["length"][:, None]) * rope_rate
+            for length in (self.length, self.swung)
+        )
         mean = lambda value: 0.5 * (value[:, :-1] + value[:, 1:])  # noqa: E731
         jump = lambda value: value[:, 1:] - value[:, :-1]  # noqa: E731
         total = self.vehicle + self.load
@@ -209,17 +306,32 @@ class Problem:
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         wind = torch.nn.functional.pad(c["wind"], (0, 1))[:, None]
         pushed = wind - c["drag"][:, None] * mean(vel)
-        momentum = (self.vehicle * jump(vel) + self.load * jump(ball)) / (total * dt) - lift * mean(rot[..., 2]) + GRAVITY * up - pushed
+        momentum = (
+            (self.vehicle * jump(vel) + self.load * jump(ball)) / (total * dt)
+            - lift * mean(rot[..., 2])
+            + GRAVITY * up
+            - pushed
+        )
         falling, along = jump(swung) / dt + GRAVITY * up, mean(rope)
         across = falling - along * (falling * along).sum(-1, keepdim=True)
-        coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0  # Magnus: of a rate that is linear in a step
-        turned = _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
+        coning = (
+            torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
+        )  # Magnus: of a rate that is linear in a step
+        turned = (
+            _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:])
+            - (self.mean_rate - c["gyro"][:, None]) * dt
+            - coning
+        )
         off = (
-            _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push, across[..., :2] / s.pendulum,
-            (jump(pos) - mean(vel) * dt) / 1e-4, (jump(swing) - mean(swing_rate) * dt) / 2e-4, turned / (s.rate * dt + 1e-4),
-            (pos - self.pos)[:, :-1] / s.pos, (vel - self.vel)[:, :-1] / s.vel,
+            _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push,
+            across[..., :2] / s.pendulum,
+            (jump(pos) - mean(vel) * dt) / 1e-4,
+            (jump(swing) - mean(swing_rate) * dt) / 2e-4,
+            turned / (s.rate * dt + 1e-4),
+            (pos - self.pos)[:, :-1] / s.pos,
+            (vel - self.vel)[:, :-1] / s.vel,
             (turn + c["attitude"][:, None])[:, :-1] / self.attitude,
-        )  # fmt: skip
+        )
         return torch.cat(off, -1)
 
     def places(self, latency: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,8 +341,10 @@ class Problem:
         return j, (when - self.time[j]) / self.dt[j]
 
     def sightings(self, x: Tensor, constants: Tensor, j: Tensor) -> Tensor:
-        """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5); zero where not seen. Arguments as of
-        `steps`; j: steps that the sightings fall behind, shape (N,), held while differences are taken."""
+        """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5);
+        zero where not seen. Arguments as of `steps`; j: steps that the sightings fall behind, shape
+        (N,), held while differences are taken.
+        """
         c, s = self.split(constants), self.spreads
         dt = self.dt[j][:, None]
         u = ((self.time - self.age - self.time[j]) - c["latency"])[..., None] / dt
@@ -238,41 +352,59 @@ class Problem:
         rate = self.rate - c["gyro"][:, None]
         rot = self.base @ rotation_from_vector(turn)
         chord = _vector(rot[:, j].transpose(-1, -2) @ rot[:, j + 1])
-        bend = u * (1 - u) * ((1 - u) * (rate[:, j] * dt - chord) - u * (rate[:, j + 1] * dt - chord))
+        bend = (
+            u * (1 - u) * ((1 - u) * (rate[:, j] * dt - chord) - u * (rate[:, j + 1] * dt - chord))
+        )
         here = rot[:, j] @ rotation_from_vector(u * chord + bend)
         at, leaning = _cubic(pos, vel, j, u, dt), _cubic(swing, swing_rate, j, u, dt)
         rope, _ = _rope(leaning, torch.zeros_like(leaning))
         length = self.length * (1.0 + c["length"][:, None])
         ball_w = at + _turned(here, self.mount.expand_as(at)) + length * rope
         goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
-        corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)[:, None].expand(-1, at.shape[1], -1, -1)
+        corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)[:, None].expand(
+            -1, at.shape[1], -1, -1
+        )
         seen = torch.cat([corners_w, ball_w[:, :, None]], 2) - at[:, :, None]
         lens = self.camera.position_b + c["lens"]
         in_body = torch.einsum("bnji,bnkj->bnki", here, seen) - lens[:, None, None]
         rot_bc = rotation_from_vector(c["camera"]) @ self.camera.rot_cb.T
         in_camera = torch.einsum("bji,bnkj->bnki", rot_bc, in_body)
-        rays = ball_extremes_c(self.camera.fisheye, in_camera[:, :, 4].flatten(0, 1), self.camera.params.payload_radius)
+        rays = ball_extremes_c(
+            self.camera.fisheye, in_camera[:, :, 4].flatten(0, 1), self.camera.params.payload_radius
+        )
         points, _ = self.camera.fisheye.project_normalized(
             torch.cat([in_camera[:, :, :4].flatten(0, 1), rays], -2), clip=True
         )
         size = 1.0 + c["scale"][:, None]
         corners = size * points[:, :4].mean(1).unflatten(0, at.shape[:2]) + c["corners"][:, None]
-        ball = size * _box(box_midpoints(points[:, 4:])).unflatten(0, at.shape[:2]) + c["ball"][:, None]
-        off = torch.cat([(ball - self.ball) * self.ball_seen[:, None], (corners - self.corners) * self.corners_seen[:, None]], -1)
+        ball = (
+            size * _box(box_midpoints(points[:, 4:])).unflatten(0, at.shape[:2])
+            + c["ball"][:, None]
+        )
+        off = torch.cat(
+            [
+                (ball - self.ball) * self.ball_seen[:, None],
+                (corners - self.corners) * self.corners_seen[:, None],
+            ],
+            -1,
+        )
         return off / (0.5 * s.keypoint + 1e-4)
 
 
 def _box(points: Tensor) -> Tensor:
-    """Middle and mean half side of boxes by their edges' midpoints, shape (N, 4, 2): shape (N, 3)."""
+    """Middle and mean half side of boxes by their edges' midpoints, shape (N, 4, 2):
+    shape (N, 3).
+    """
     left, top, right, bottom = points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]
     return torch.cat([points.mean(1), 0.25 * (right - left + bottom - top)[:, None]], -1)
 
 
 def _means(values: Tensor) -> Tensor:
-    """Mean over each step between values that are evenly apart, shape (N, 3): by the cubic through four of them, at the ends by the chord.
+    """Mean over each step between values that are evenly apart, shape (N, 3): by the cubic through
+    four of them, at the ends by the chord.
 
-    A chord is short by (frequency dt)^2 / 12 of a swing, 0.2 % of the sway, which would pass for another focal length.
-    """
+    A chord is short by (frequency dt)^2 / 12 of a swing, 0.2 % of the sway, which would pass for
+    another focal length."""
     chord = 0.5 * (values[1:] + values[:-1])
     inner = (13.0 * (values[1:-2] + values[2:-1]) - values[:-3] - values[3:]) / 24.0
     return torch.cat([chord[:1], inner, chord[-1:]])
@@ -286,12 +418,21 @@ def _turned(rot: Tensor, vector: Tensor) -> Tensor:
 def _rope(swing: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
     """Direction of a hanging rope and its rate, from their horizontal parts."""
     down = (1.0 - (swing * swing).sum(-1, keepdim=True)).clamp(min=1e-2).sqrt()
-    return torch.cat([swing, -down], -1), torch.cat([rate, (swing * rate).sum(-1, keepdim=True) / down], -1)
+    return torch.cat([swing, -down], -1), torch.cat(
+        [rate, (swing * rate).sum(-1, keepdim=True) / down], -1
+    )
 
 
 def _vector(rot: Tensor) -> Tensor:
     """Rotation vectors of small rotations."""
-    skew = 0.5 * torch.stack([rot[..., 2, 1] - rot[..., 1, 2], rot[..., 0, 2] - rot[..., 2, 0], rot[..., 1, 0] - rot[..., 0, 1]], -1)
+    skew = 0.5 * torch.stack(
+        [
+            rot[..., 2, 1] - rot[..., 1, 2],
+            rot[..., 0, 2] - rot[..., 2, 0],
+            rot[..., 1, 0] - rot[..., 0, 1],
+        ],
+        -1,
+    )
     sine2 = (skew * skew).sum(-1, keepdim=True)
     return skew * (1.0 + sine2 / 6.0 + 3.0 * sine2 * sine2 / 40.0)  # arcsin(s) / s
 
@@ -303,8 +444,14 @@ def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Te
     return value[:, j] + u * chord + u * (1 - u) * bend
 
 
-def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration:
-    """Find the camera's turn and latency and the thrust, with the policy's nominal camera, float64, and contract.
+def calibrate(
+    hovered: Hovered,
+    camera: KeypointCamera,
+    contract: dict[str, Any],
+    spreads: Spreads | None = None,
+) -> Calibration:
+    """Find the camera's turn and latency and the thrust, with the policy's nominal camera, float64,
+    and contract.
 
     Raises CalibrationError: it shows too little, or nothing fits.
 
@@ -329,7 +476,10 @@ def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any]
         if float((moved / problem.prior).abs().max()) < SETTLED:
             break
     else:
-        raise CalibrationError(f"calibration did not settle in {ROUNDS} rounds; expected a hover that ends in a sway, its ball in view")
+        raise CalibrationError(
+            f"calibration did not settle in {ROUNDS} rounds; expected a hover that ends in a sway,"
+            " its ball in view"
+        )
     unit = np.zeros((width + len(c), len(c)))
     unit[width:] = np.eye(len(c))
     covariance = np.column_stack([solve(column)[width:] for column in unit.T])
@@ -337,13 +487,25 @@ def calibrate(hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any]
     found = problem.split(c[None])
     of = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
     return Calibration(
-        of(found, "camera"), of(sigma, "camera"), found["latency"].item(), sigma["latency"].item(),
-        1.0 + found["thrust"].item(), sigma["thrust"].item(), misfit, len(problem.time), found["scale"].item(), sigma["scale"].item(),
-    )  # fmt: skip
+        of(found, "camera"),
+        of(sigma, "camera"),
+        found["latency"].item(),
+        sigma["latency"].item(),
+        1.0 + found["thrust"].item(),
+        sigma["thrust"].item(),
+        misfit,
+        len(problem.time),
+        found["scale"].item(),
+        sigma["scale"].item(),
+    )
 
 
-def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads | None = None) -> Calibration | str:
-    """Return the calibration of a hover, as :func:`calibrate` finds it, or why there is none: a task for another process."""
+def solved(
+    hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads | None = None
+) -> Calibration | str:
+    """Return the calibration of a hover, as :func:`calibrate` finds it, or why there is none: a
+    task for another process.
+    """
     try:
         return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)
     except CalibrationError as error:
@@ -351,10 +513,11 @@ def solved(hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spr
 
 
 def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray, float]:
-    """Solver of the normal equations about unknowns, the gradient there, and the misfit of the sightings.
+    """Solver of the normal equations about unknowns, the gradient there, and the misfit of the
+    sightings.
 
-    A residual hangs on two neighbouring steps at most, so two perturbations give a derivative for all of them.
-    """
+    A residual hangs on two neighbouring steps at most, so two perturbations give a derivative for
+    all of them."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
@@ -367,12 +530,17 @@ def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray
     cs[1 + 2 * width :] += h * torch.eye(len(c), dtype=c.dtype)
     parts, rows, first = [], [], 0
     residuals = []
-    for values, step in ((problem.steps(xs, cs), torch.arange(count - 1)), (problem.sightings(xs, cs, j), j)):
+    for values, step in (
+        (problem.steps(xs, cs), torch.arange(count - 1)),
+        (problem.sightings(xs, cs, j), j),
+    ):
         base, off = values[0], (values[1:] - values[:1]) / h
         if step is j:
             misfit = float(base.square().sum().sqrt() / max(int((base != 0.0).sum()), 1) ** 0.5)
             parts_of = base.split((3, 2), -1)  # ball and goal
-            sizes = torch.cat([one.norm(dim=-1, keepdim=True).expand_as(one) for one in parts_of], -1).clamp(min=1e-9)
+            sizes = torch.cat(
+                [one.norm(dim=-1, keepdim=True).expand_as(one) for one in parts_of], -1
+            ).clamp(min=1e-9)
             weight = (OUTLIER / sizes).clamp(max=1.0).sqrt()
             base, off = base * weight, off * weight
         n, m = base.shape
@@ -392,5 +560,7 @@ def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray
     jacobian = sparse.csr_matrix((torch.cat(parts).numpy(), index), shape=size)
     prior = np.concatenate([np.zeros(count * width), 1.0 / problem.prior.numpy() ** 2])
     normal = (jacobian.T @ jacobian + sparse.diags(prior + 1e-9)).tocsc()
-    gradient = jacobian.T @ torch.cat(residuals).numpy() + prior * np.concatenate([np.zeros(count * width), c.numpy()])
+    gradient = jacobian.T @ torch.cat(residuals).numpy() + prior * np.concatenate(
+        [np.zeros(count * width), c.numpy()]
+    )
     return splu(normal).solve, gradient, misfit

@@ -1,4 +1,6 @@
-"""A recurrent estimate of what a policy looks at, from observations that tell it only in part. Onboard-safe.
+"""A recurrent estimate of what a policy looks at, from observations that tell it only in part.
+
+Onboard-safe.
 
 One step takes an observation o and the memory h of the steps before:
 
@@ -6,9 +8,8 @@ One step takes an observation o and the memory h of the steps before:
     h = GRU(x, h)                                Cho et al., EMNLP 2014, as in torch.nn.GRUCell
     s = o[kept] + C h + c                        estimate; 0 in place of o where nothing is kept
 
-so that what is measured directly passes, corrected, and what is not (a goal behind a turned lens, a pose of now rather than
-of 30 ms ago) is inferred from all that was seen.
-"""
+so that what is measured directly passes, corrected, and what is not (a goal behind a turned lens, a
+pose of now rather than of 30 ms ago) is inferred from all that was seen."""
 
 from dataclasses import dataclass, fields
 
@@ -21,8 +22,10 @@ from visthrow.common.errors import PolicyError
 
 @dataclass(frozen=True)
 class Estimator:
-    """Weights of the estimate, with D the observation's numbers, N the encoder's, H the memory's and S the estimate's; raises `PolicyError`
-    for shapes that do not fit each other, or a number that is not finite."""
+    """Weights of the estimate, with D the observation's numbers, N the encoder's, H the memory's
+    and S the estimate's; raises `PolicyError` for shapes that do not fit each other, or a number
+    that is not finite.
+    """
 
     mean: Tensor  # (D,), of the observation
     std: Tensor  # (D,), what the observation is divided by
@@ -40,10 +43,16 @@ class Estimator:
         hidden, width = self.encoder_weight.shape[0], self.encoder_weight.shape[1]
         memory, count = self.output_weight.shape[1], self.output_weight.shape[0]
         expected = {
-            "mean": (width,), "std": (width,), "encoder_bias": (hidden,), "input_weight": (3 * memory, hidden),
-            "input_bias": (3 * memory,), "memory_weight": (3 * memory, memory), "memory_bias": (3 * memory,),
-            "output_bias": (count,), "kept": (count,),
-        }  # fmt: skip
+            "mean": (width,),
+            "std": (width,),
+            "encoder_bias": (hidden,),
+            "input_weight": (3 * memory, hidden),
+            "input_bias": (3 * memory,),
+            "memory_weight": (3 * memory, memory),
+            "memory_bias": (3 * memory,),
+            "output_bias": (count,),
+            "kept": (count,),
+        }
         for name, shape in expected.items():
             came = tuple(getattr(self, name).shape)
             if came != shape:
@@ -51,8 +60,12 @@ class Estimator:
         for field in fields(self):
             if not bool(torch.isfinite(getattr(self, field.name)).all()):
                 raise PolicyError(f"estimator: {field.name} holds numbers that are not finite")
-        if not bool(((self.kept >= 0) & (self.kept <= width)).all()) or not bool((self.std > 0.0).all()):
-            raise PolicyError(f"estimator; expected entries of 0 to {width} in kept and numbers above 0 in std")
+        if not bool(((self.kept >= 0) & (self.kept <= width)).all()) or not bool(
+            (self.std > 0.0).all()
+        ):
+            raise PolicyError(
+                f"estimator; expected entries of 0 to {width} in kept and numbers above 0 in std"
+            )
 
     @property
     def obs_dim(self) -> int:
@@ -65,11 +78,21 @@ class Estimator:
         return self.output_weight.shape[1]
 
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimate, shape (E, S), and new memory, shape (E, H), from an observation, shape (E, D), and the memory."""
+        """Estimate, shape (E, S), and new memory, shape (E, H), from an observation, shape (E, D),
+        and the memory.
+        """
         x = F.elu(F.linear((obs - self.mean) / self.std, self.encoder_weight, self.encoder_bias))
-        memory = torch.gru_cell(x, memory, self.input_weight, self.memory_weight, self.input_bias, self.memory_bias)
-        return F.pad(obs, (0, 1))[:, self.kept] + F.linear(memory, self.output_weight, self.output_bias), memory
+        memory = torch.gru_cell(
+            x, memory, self.input_weight, self.memory_weight, self.input_bias, self.memory_bias
+        )
+        return (
+            F.pad(obs, (0, 1))[:, self.kept]
+            + F.linear(memory, self.output_weight, self.output_bias),
+            memory,
+        )
 
     def to(self, device: str | torch.device) -> "Estimator":
         """The estimator with its tensors on another device."""
-        return Estimator(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
+        return Estimator(
+            **{field.name: getattr(self, field.name).to(device) for field in fields(self)}
+        )

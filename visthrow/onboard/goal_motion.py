@@ -1,17 +1,23 @@
-"""Fit of the goal's place, and of its velocity where it moves, from what the actor measures anyway. Onboard-safe.
+"""Fit of the goal's place, and of its velocity where it moves, from what the actor measures anyway.
 
-A history of a few goal measurements cannot serve: with the paper's noise (0.01 m a step) the slope through four of them,
-20 ms apart, is known to 0.2 m/s, which is 0.15 m at the landing. So every control step yields one measured goal position in
-the world, and the actor is given the slope of the weighted least-squares line through all of them since the throw began,
-drawn to zero by a prior that matters for the first few steps. The state layout adds up its measured positions; the vision
-layout sends each seen corner's ray to the ground, a corner counting by the accuracy that its distance leaves.
+Onboard-safe.
 
-Where a layout is ``located`` the actor is given too where keypoints lie by the camera as it is configured: the network need then not
-learn the lens, but what is wrong with it. The goal is the mean of all steps of the throw, each weighted by what its distance leaves:
-noise averages out, and it is known while it is out of view. A corner that is not seen then reads where the fitted goal would be seen.
+A history of a few goal measurements cannot serve: with the paper's noise (0.01 m a step) the slope
+through four of them, 20 ms apart, is known to 0.2 m/s, which is 0.15 m at the landing. So every
+control step yields one measured goal position in the world, and the actor is given the slope of the
+weighted least-squares line through all of them since the throw began, drawn to zero by a prior that
+matters for the first few steps. The state layout adds up its measured positions; the vision layout
+sends each seen corner's ray to the ground, a corner counting by the accuracy that its distance
+leaves.
 
-Source: weighted linear regression with a Gaussian prior on the slope (ridge), in sums that are carried from step to step.
-"""
+Where a layout is ``located`` the actor is given too where keypoints lie by the camera as it is
+configured: the network need then not learn the lens, but what is wrong with it. The goal is the
+mean of all steps of the throw, each weighted by what its distance leaves: noise averages out, and
+it is known while it is out of view. A corner that is not seen then reads where the fitted goal
+would be seen.
+
+Source: weighted linear regression with a Gaussian prior on the slope (ridge), in sums that are
+carried from step to step."""
 
 from typing import NamedTuple
 
@@ -23,9 +29,15 @@ from camera.mount import points_c_from_w, rotate
 from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
 
 SUMS = 7  # width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y
-POSITION_SIGMA = 0.017  # deviation of one measured goal position of the state layout [m]: three measurements of 0.01 m each are added up
-ANGLE_SIGMA = 0.02  # deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of 110 degrees
-SPEED_SIGMA = 0.4  # prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have
+# deviation of one measured goal position of the state layout [m]: three measurements of 0.01 m each
+# are added up
+POSITION_SIGMA = 0.017
+# deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of
+# 110 degrees
+ANGLE_SIGMA = 0.02
+SPEED_SIGMA = (
+    0.4  # prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have
+)
 GRAZING = 0.1  # sine of the least angle below the horizon at which a ray is followed to the ground
 
 
@@ -34,7 +46,9 @@ def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:
     return torch.zeros(count, SUMS, device=device)
 
 
-def fit(sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
+def fit(
+    sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tensor
+) -> tuple[Tensor, Tensor]:
     """Take in one step's goal and give the velocity so far.
 
     Args:
@@ -51,14 +65,22 @@ def fit(sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tens
     wt = w * t
     new = torch.cat([w, wt, wt * t, w * goal_xy, wt * goal_xy], dim=-1)
     sums = torch.where(fresh[:, None], 0.0, sums) + new
-    total, first, second, place, moved = sums[:, :1], sums[:, 1:2], sums[:, 2:3], sums[:, 3:5], sums[:, 5:7]
+    total, first, second, place, moved = (
+        sums[:, :1],
+        sums[:, 1:2],
+        sums[:, 2:3],
+        sums[:, 3:5],
+        sums[:, 5:7],
+    )
     mean = first / total.clamp(min=1e-9)
     velocity = (moved - mean * place) / ((second - mean * first).clamp(min=0.0) + SPEED_SIGMA**-2)
     return sums, velocity
 
 
 def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
-    """Goal by all steps so far [m], shape (E, 2), world frame, by its velocity where it moves [m/s]; 0 where none has seen it."""
+    """Goal by all steps so far [m], shape (E, 2), world frame, by its velocity where it moves
+    [m/s]; 0 where none has seen it.
+    """
     total = sums[:, :1].clamp(min=1e-9)
     mean = sums[:, 3:5] / total
     if velocity is None:
@@ -66,7 +88,9 @@ def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
     return mean + velocity * (time[:, None] - sums[:, 1:2] / total) * (sums[:, :1] > 0.0)
 
 
-def measured_goal(layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None) -> tuple[Tensor, Tensor]:
+def measured_goal(
+    layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None
+) -> tuple[Tensor, Tensor]:
     """Goal in the world as one frame shows it.
 
     Args:
@@ -81,7 +105,9 @@ def measured_goal(layout: Layout, frame: Tensor, valid: Tensor | None, camera: K
         goal_xy = frame[:, :2] + hanging + offset
         return goal_xy, torch.full_like(goal_xy[:, 0], POSITION_SIGMA**-2)
     rot_wb = rotation_in(frame)
-    goals, weight = goal_by_corner(frame, valid, camera, rot_wb, rays_w(camera, rot_wb, _corners(layout, frame)))
+    goals, weight = goal_by_corner(
+        frame, valid, camera, rot_wb, rays_w(camera, rot_wb, _corners(layout, frame))
+    )
     total = weight.sum(-1)
     return (weight[..., None] * goals).sum(1) / total.clamp(min=1e-9)[:, None], total
 
@@ -95,21 +121,26 @@ def rays_w(camera: KeypointCamera, rot_wb: Tensor, points: Tensor) -> Tensor:
     """Directions in which points of the image lie, shape (E, K, 3), world frame.
 
     Args:
-        camera: of the image. rot_wb: attitude, shape (E, 3, 3). points: normalised [-], shape (E, K, 2).
+        camera: of the image. rot_wb: attitude, shape (E, 3, 3). points: normalised [-], shape (E,
+            K, 2).
     """
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(points))
     return rotate(rot_wb, rotate(camera.rot_cb.T, rays_c))
 
 
-def goal_by_corner(frame: Tensor, valid: Tensor, camera: KeypointCamera, rot_wb: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+def goal_by_corner(
+    frame: Tensor, valid: Tensor, camera: KeypointCamera, rot_wb: Tensor, rays: Tensor
+) -> tuple[Tensor, Tensor]:
     """Goal in the world as each corner of one vision frame shows it.
 
     Args:
-        frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame, shape (E, 3, 3).
+        frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame, shape (E,
+            3, 3).
         rays: to the corners, shape (E, 4, 3), world frame.
 
     Returns:
-        Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E, 4); 0 where a corner is not seen.
+        Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E,
+        4); 0 where a corner is not seen.
     """
     lens_w = frame[:, :3] + rotate(rot_wb, camera.position_b.expand(1, -1))[:, 0]
     height, down = lens_w[:, None, 2].clamp(min=0.1), -rays[..., 2]
@@ -131,7 +162,13 @@ class Fitted(NamedTuple):
 
 
 def fitted_goal(
-    layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None, sums: Tensor, time: Tensor, fresh: Tensor
+    layout: Layout,
+    frame: Tensor,
+    valid: Tensor | None,
+    camera: KeypointCamera | None,
+    sums: Tensor,
+    time: Tensor,
+    fresh: Tensor,
 ) -> Fitted:
     """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
     if not layout.located:
@@ -141,34 +178,59 @@ def fitted_goal(
 
 
 def _located(
-    layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, sums: Tensor, time: Tensor, fresh: Tensor
+    layout: Layout,
+    frame: Tensor,
+    valid: Tensor,
+    camera: KeypointCamera,
+    sums: Tensor,
+    time: Tensor,
+    fresh: Tensor,
 ) -> Fitted:
-    """:func:`fitted_goal` where the layout says where keypoints lie: of four points of goal or box a wrong one is outvoted.
+    """:func:`fitted_goal` where the layout says where keypoints lie: of four points of goal or box
+    a wrong one is outvoted.
 
-    The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the goal is known, 1; world frame. What
-    is not known is 0.
-    """
-    box, box_valid = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)), valid[:, GOAL_KEYPOINTS:]
+    The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the
+    goal is known, 1; world frame. What is not known is 0."""
+    box, box_valid = (
+        frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)),
+        valid[:, GOAL_KEYPOINTS:],
+    )
     rot_wb = rotation_in(frame)
-    rays = rays_w(camera, rot_wb, torch.cat([_corners(layout, frame), middle(box, box_valid)[:, None]], dim=1))
+    rays = rays_w(
+        camera, rot_wb, torch.cat([_corners(layout, frame), middle(box, box_valid)[:, None]], dim=1)
+    )
     goals, weight = goal_by_corner(frame, valid, camera, rot_wb, rays[:, :GOAL_KEYPOINTS])
     one, two, three, four = weight.unbind(-1)
     sums, velocity = fit(sums, time, middle(goals, weight > 0.0), one + two + three + four, fresh)
     moves = velocity if layout.motion else None
     goal_xy, known = place(sums, time, moves), sums[:, :1] > 0.0
     hangs = box_valid.any(-1, keepdim=True)
-    places = torch.cat([(goal_xy - frame[:, :2]) * known, rays[:, GOAL_KEYPOINTS] * hangs, known.to(frame.dtype)], dim=-1)
-    return Fitted(sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, known))
+    places = torch.cat(
+        [(goal_xy - frame[:, :2]) * known, rays[:, GOAL_KEYPOINTS] * hangs, known.to(frame.dtype)],
+        dim=-1,
+    )
+    return Fitted(
+        sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, known)
+    )
 
 
 def predicted(
-    layout: Layout, frame: Tensor, valid: Tensor, camera: KeypointCamera, rot_wb: Tensor, goal_xy: Tensor, known: Tensor
+    layout: Layout,
+    frame: Tensor,
+    valid: Tensor,
+    camera: KeypointCamera,
+    rot_wb: Tensor,
+    goal_xy: Tensor,
+    known: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The frame, and its validity, with corners that are not seen where the goal so far would be seen.
+    """The frame, and its validity, with corners that are not seen where the goal so far would be
+    seen.
 
     Args:
-        layout, frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame, shape (E, 3, 3).
-        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has seen it, bool, shape (E, 1).
+        layout, frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame,
+            shape (E, 3, 3).
+        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has
+            seen it, bool, shape (E, 1).
     """
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
@@ -181,7 +243,9 @@ def predicted(
 
 
 def middle(points: Tensor, valid: Tensor) -> Tensor:
-    """Median of four points, shape (E, 4, 2), over those that are valid, shape (E, 4): a wrong one is outvoted; 0 where none is."""
+    """Median of four points, shape (E, 4, 2), over those that are valid, shape (E, 4): a wrong one
+    is outvoted; 0 where none is.
+    """
     count = valid.sum(-1, keepdim=True)
     one, two = torch.where(valid.unsqueeze(-1), points, torch.inf).split(2, 1)
     small, large = torch.minimum(one, two), torch.maximum(one, two)  # of two pairs, each

@@ -1,8 +1,8 @@
 """The hover controller: collective thrust and body rates that hold a position and a heading.
 
-Onboard-safe (numpy only). It serves before a throw, with the payload hanging below, and after the release, without it;
-the policy learns neither. Batched over vehicles; the same code with a batch of one on board.
-"""
+Onboard-safe (numpy only). It serves before a throw, with the payload hanging below, and after the
+release, without it; the policy learns neither. Batched over vehicles; the same code with a batch of
+one on board."""
 
 from dataclasses import dataclass
 
@@ -16,10 +16,11 @@ from visthrow.common.rotations import matrix_of_quat
 class HoverParams:
     """Gains and limits, chosen on the full simulator of the paper's vehicle.
 
-    The swing of a 0.33 m rope under this vehicle (5.9 rad/s with the vehicle free to move) lies above the position
-    loop and is damped by it: the vehicle gives way to the rope's pull. A higher ``attitude_gain`` or
-    ``velocity_gain`` damps it faster but costs margin: from 12 and 3.5 on, 20 ms of further delay make the vehicle
-    without payload ring; at 18 it oscillates at the nominal delay. With these the swing halves every 1.4 s.
+    The swing of a 0.33 m rope under this vehicle (5.9 rad/s with the vehicle free to move) lies
+    above the position loop and is damped by it: the vehicle gives way to the rope's pull. A higher
+    ``attitude_gain`` or ``velocity_gain`` damps it faster but costs margin: from 12 and 3.5 on, 20
+    ms of further delay make the vehicle without payload ring; at 18 it oscillates at the nominal
+    delay. With these the swing halves every 1.4 s.
 
     Raises ValueError if a gain or limit is negative, or the thrust limits are not ordered.
     """
@@ -43,16 +44,24 @@ class HoverParams:
             if np.any(np.asarray(value) < 0.0):
                 raise ValueError(f"{name} is {value}; expected 0 or more")
         if not self.min_thrust < self.max_thrust:
-            raise ValueError(f"min_thrust {self.min_thrust} N is not below max_thrust {self.max_thrust} N")
+            raise ValueError(
+                f"min_thrust {self.min_thrust} N is not below max_thrust {self.max_thrust} N"
+            )
         if not self.max_tilt < np.pi / 2:
-            raise ValueError(f"max_tilt {self.max_tilt} rad; expected less than pi/2, thrust must hold the weight")
+            raise ValueError(
+                f"max_tilt {self.max_tilt} rad; expected less than pi/2, thrust must hold the"
+                " weight"
+            )
 
 
 class HoverController:
     """Position controller with an integral, one for each of E vehicles."""
 
     def __init__(self, params: HoverParams, period: float, count: int = 1) -> None:
-        """Start with empty integrals of E vehicles; the period is between two calls [s]. Raises `ValueError`: either is not positive."""
+        """Start with empty integrals of E vehicles; the period is between two calls [s].
+
+        Raises `ValueError`: either is not positive.
+        """
         if not (period > 0.0 and count >= 1):
             raise ValueError(f"period {period} s and count {count}; expected both above 0")
         self.params = params
@@ -60,13 +69,20 @@ class HoverController:
         self._integral_w = np.zeros((count, 3))
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Empty the integrals of the vehicles where ``mask`` (E,) is true, of all without a mask."""
+        """Empty the integrals of the vehicles where ``mask`` (E,) is true, of all
+        without a mask.
+        """
         self._integral_w[slice(None) if mask is None else np.asarray(mask, dtype=bool)] = 0.0
 
     def step(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, goal_w: np.ndarray, mass: float | np.ndarray,
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        goal_w: np.ndarray,
+        mass: float | np.ndarray,
         yaw: float | np.ndarray = 0.0,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """Return the command that brings the vehicles to their goals.
 
         Args:
@@ -85,7 +101,8 @@ class HoverController:
         thrust_w = self._acceleration(pos_w, vel_w, goal_w)
         thrust_w[:, 2] += GRAVITY
         thrust_w = _tilt_limited(thrust_w, params.max_tilt)
-        # Projected on where the vehicle's thrust points now: while it still turns, none is spent sideways.
+        # Projected on where the vehicle's thrust points now: while it still turns, none is spent
+        # sideways.
         thrust = np.asarray(mass) * np.sum(thrust_w * rot_wb[:, :, 2], axis=1)
         rates_b = _rates(rot_wb, thrust_w, np.asarray(yaw, dtype=float), params)
         command = np.empty((len(rates_b), 4))
@@ -103,29 +120,44 @@ class HoverController:
         # On the way there from far off an integral would only wind up, and overshoot on arrival.
         near = np.linalg.norm(error_w, axis=1, keepdims=True) < params.integral_radius
         growth_w = np.where(near, params.integral_gain * self.period * error_w, 0.0)
-        self._integral_w = np.clip(self._integral_w + growth_w, -params.integral_limit, params.integral_limit)
+        self._integral_w = np.clip(
+            self._integral_w + growth_w, -params.integral_limit, params.integral_limit
+        )
         acceleration_w = params.velocity_gain * (asked_w - vel_w) + self._integral_w
-        acceleration_w[:, 2] = np.clip(acceleration_w[:, 2], -params.max_acceleration, params.max_acceleration)
+        acceleration_w[:, 2] = np.clip(
+            acceleration_w[:, 2], -params.max_acceleration, params.max_acceleration
+        )
         return acceleration_w
 
 
 def _tilt_limited(thrust_w: np.ndarray, max_tilt: float) -> np.ndarray:
-    """Shorten the horizontal part until the thrust (E, 3) leans no more than ``max_tilt`` [rad] from the vertical."""
+    """Shorten the horizontal part until the thrust (E, 3) leans no more than ``max_tilt`` [rad]
+    from the vertical.
+    """
     up = np.maximum(thrust_w[:, 2], 0.1 * GRAVITY)  # falling is no reason to turn over
     flat = np.linalg.norm(thrust_w[:, :2], axis=1)
     scale = np.minimum(1.0, np.tan(max_tilt) * up / np.maximum(flat, 1e-9))
     return np.column_stack((thrust_w[:, :2] * scale[:, None], up))
 
 
-def _rates(rot_wb: np.ndarray, thrust_w: np.ndarray, yaw: np.ndarray, params: HoverParams) -> np.ndarray:
-    """Return body rates (E, 3) [rad/s] that turn body z onto the thrust on the shortest way, and the heading to yaw."""
-    aim_b = np.einsum("eji,ej->ei", rot_wb, thrust_w / np.linalg.norm(thrust_w, axis=1, keepdims=True))
+def _rates(
+    rot_wb: np.ndarray, thrust_w: np.ndarray, yaw: np.ndarray, params: HoverParams
+) -> np.ndarray:
+    """Return body rates (E, 3) [rad/s] that turn body z onto the thrust on the shortest way, and
+    the heading to yaw.
+    """
+    aim_b = np.einsum(
+        "eji,ej->ei", rot_wb, thrust_w / np.linalg.norm(thrust_w, axis=1, keepdims=True)
+    )
     sine = np.linalg.norm(aim_b[:, :2], axis=1)
     angle = np.arctan2(sine, aim_b[:, 2])
     # e_z x aim = (-aim_y, aim_x, 0); upside down exactly, any axis will do.
     axis = np.where(sine[:, None] > 1e-9, np.column_stack((-aim_b[:, 1], aim_b[:, 0])), (1.0, 0.0))
-    tilt_rates = params.attitude_gain * angle[:, None] * axis / np.where(sine > 1e-9, sine, 1.0)[:, None]
+    tilt_rates = (
+        params.attitude_gain * angle[:, None] * axis / np.where(sine > 1e-9, sine, 1.0)[:, None]
+    )
     heading = np.arctan2(rot_wb[:, 1, 0], rot_wb[:, 0, 0])
     error = np.angle(np.exp(1j * (yaw - heading)))
-    # A turn about the world's vertical has this much of body z in it; none where the vehicle lies on its side.
+    # A turn about the world's vertical has this much of body z in it; none where the vehicle lies
+    # on its side.
     return np.column_stack((tilt_rates, params.yaw_gain * error * rot_wb[:, 2, 2]))

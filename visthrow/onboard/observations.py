@@ -1,23 +1,29 @@
-"""The one observation: what the training environment and the HIL runner both show the actor. Onboard-safe.
+"""The one observation: what the training environment and the HIL runner both show the actor.
 
-``frame`` puts one control step's measurement into a row; noise, where there is any, is added to that row; ``observe``
-pushes the payload's part into the history and assembles the actor's input. With E the batch (1 on board), the layouts are
+Onboard-safe.
+
+``frame`` puts one control step's measurement into a row; noise, where there is any, is added to
+that row; ``observe`` pushes the payload's part into the history and assembles the actor's input.
+With E the batch (1 on board), the layouts are
 
 ``state`` (35 with a history of 3; the paper, Sec. III-C), world frame, SI units::
 
-    position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal - payload, horizontal 2
-    | payload - vehicle, now and H steps back 3 (1 + H) | attached 1
+    position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5
+    | goal - payload, horizontal 2 | payload - vehicle, now and H steps back 3 (1 + H) | attached 1
 
 ``vision`` (61, or 69 with validity bits; Sec. IV-C)::
 
     position 3 | velocity 3 | body rates 3 | rotation 6 | previous action 5 | goal corners 8
-    | payload keypoints, now and H steps back 8 (1 + H) | attached 1 | validity of goal and payload keypoints 8
+    | payload keypoints, now and H steps back 8 (1 + H) | attached 1
+    | validity of goal and payload keypoints 8
 
-With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.goal_motion`). Either one, where goals move, has the
-fit of the goal's velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
+With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.goal_motion`).
+Either one, where goals move, has the fit of the goal's velocity 2
+(:mod:`visthrow.onboard.goal_motion`) at its end.
 
-A policy for many vehicles has besides what ``response`` earlier steps were like, velocity 3 | body rates 3 | previous action 4 each,
-newest first, and the vehicle's set-up (:mod:`visthrow.task.fleet`) at its end.
+A policy for many vehicles has besides what ``response`` earlier steps were like, velocity 3 | body
+rates 3 | previous action 4 each, newest first, and the vehicle's set-up
+(:mod:`visthrow.task.fleet`) at its end.
 
 The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column after column.
 """
@@ -61,7 +67,9 @@ class Layout:
 
     @property
     def fits(self) -> bool:
-        """Whether the goal is fitted over the steps of a throw (:mod:`visthrow.onboard.goal_motion`)."""
+        """Whether the goal is fitted over the steps of a throw
+        (:mod:`visthrow.onboard.goal_motion`).
+        """
         return bool(self.motion or self.located)
 
     @property
@@ -83,29 +91,41 @@ def layout_of(params: Any) -> Layout:
     """
     if params.history < 0:
         raise ValueError(f"observation history {params.history}; expected 0 or more")
-    motion = 2 if getattr(params, "goal_velocity", False) else 0  # contracts hold what differs from the default
+    motion = (
+        2 if getattr(params, "goal_velocity", False) else 0
+    )  # contracts hold what differs from the default
     response, setup = getattr(params, "response", 0), SETUPS[getattr(params, "setup", "none")]
     if params.layout == "state":
         return Layout("state", 2, 3, params.history, 0, motion, 0, response, setup)
     if params.layout == "vision":
-        bits, places = (KEYPOINTS if params.validity else 0), (LOCATED if getattr(params, "located", False) else 0)
+        bits, places = (
+            (KEYPOINTS if params.validity else 0),
+            (LOCATED if getattr(params, "located", False) else 0),
+        )
         return Layout("vision", 8, 8, params.history, bits, motion, places, response, setup)
     raise ValueError(f"observation layout {params.layout!r}; expected 'state' or 'vision'")
 
 
 def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float) -> Tensor:
-    """Histories as they would be if a step had come each period before now, by straight lines between those that came.
+    """Histories as they would be if a step had come each period before now, by straight lines
+    between those that came.
 
     Args:
         history: measurements of earlier steps, newest first, shape (E, 1 + H, layout.payload).
         newest: of this step, shape (E, layout.payload).
-        ages: of earlier steps, newest first, ascending [s]; rows of the history beyond them are copies of the oldest.
+        ages: of earlier steps, newest first, ascending [s]; rows of the history beyond them are
+            copies of the oldest.
         period: [s].
 
     Returns:
-        Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than all that came is the oldest.
+        Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than
+        all that came is the oldest.
     """
-    knots, rows, out = [0.0, *ages[: history.shape[1]]], torch.cat([newest[:, None], history], dim=1), []
+    knots, rows, out = (
+        [0.0, *ages[: history.shape[1]]],
+        torch.cat([newest[:, None], history], dim=1),
+        [],
+    )
     for k in range(1, 1 + history.shape[1]):
         after = next((i for i, age in enumerate(knots) if age >= k * period), len(knots) - 1)
         gap = knots[after] - knots[after - 1]
@@ -117,24 +137,47 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
 @lru_cache
 @torch.inference_mode(False)
 def _of_rotation(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """Which products of quaternion entries make the entries of the matrix, two each, their signs, and what they add to."""
-    one, two = [5, 1, 2, 1, 0, 6, 2, 6, 0], [10, 11, 7, 11, 10, 3, 7, 3, 5]  # of xx, xy, xz, xw, yx, ...
+    """Which products of quaternion entries make the entries of the matrix, two each, their signs,
+    and what they add to.
+    """
+    one, two = (
+        [5, 1, 2, 1, 0, 6, 2, 6, 0],
+        [
+            10,
+            11,
+            7,
+            11,
+            10,
+            3,
+            7,
+            3,
+            5,
+        ],
+    )  # of xx, xy, xz, xw, yx, ...
     signs = [-1, 1, 1, 1, -1, 1, 1, 1, -1, -1, -1, 1, 1, -1, -1, -1, 1, -1]
     identity = torch.eye(3, device=device, dtype=dtype).flatten()
-    return torch.tensor([*one, *two], device=device), torch.tensor(signs, device=device, dtype=dtype), identity
+    return (
+        torch.tensor([*one, *two], device=device),
+        torch.tensor(signs, device=device, dtype=dtype),
+        identity,
+    )
 
 
 def rotation_from_quat(quat: Tensor) -> Tensor:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
     chosen, signs, identity = _of_rotation(quat.device, quat.dtype)
     products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
-    one, two = (products.flatten(-2).index_select(-1, chosen) * signs).unflatten(-1, (2, 9)).unbind(-2)
+    one, two = (
+        (products.flatten(-2).index_select(-1, chosen) * signs).unflatten(-1, (2, 9)).unbind(-2)
+    )
     rot_wb: Tensor = (identity + (one + two)).unflatten(-1, (3, 3))
     return rot_wb
 
 
 def rotation_in(frame: Tensor) -> Tensor:
-    """Measured attitude rot_wb, shape (E, 3, 3), of frames, shape (E, F): with noise its columns are not quite a rotation's."""
+    """Measured attitude rot_wb, shape (E, 3, 3), of frames, shape (E, F): with noise its columns
+    are not quite a rotation's.
+    """
     x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
     return torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
 
@@ -145,19 +188,32 @@ def vehicle_part(pos_w: Tensor, vel_w: Tensor, rate_b: Tensor, rot_wb: Tensor) -
 
 
 def state_part(pos_w: Tensor, goal_w: Tensor, payload_w: Tensor) -> Tensor:
-    """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape (E, 5)."""
+    """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape
+    (E, 5).
+    """
     return torch.cat([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w], dim=-1)
 
 
 def answer(frame: Tensor, previous_action: Tensor) -> Tensor:
-    """What one step shows of the vehicle's response, shape (E, 10): velocity, body rates, and the action before it."""
+    """What one step shows of the vehicle's response, shape (E, 10): velocity, body rates, and the
+    action before it.
+    """
     return torch.cat([frame[:, 3:9], previous_action[:, :4]], dim=-1)
 
 
 def observe(
-    layout: Layout, frame: Tensor, valid: Tensor | None, previous_action: Tensor, attached: Tensor, history: Tensor, fresh: Tensor,
-    goal_vel_w: Tensor | None = None, places: Tensor | None = None, answers: Tensor | None = None, setup: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    layout: Layout,
+    frame: Tensor,
+    valid: Tensor | None,
+    previous_action: Tensor,
+    attached: Tensor,
+    history: Tensor,
+    fresh: Tensor,
+    goal_vel_w: Tensor | None = None,
+    places: Tensor | None = None,
+    answers: Tensor | None = None,
+    setup: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
     """Assemble the actor's input and move the history on.
 
     Args:
@@ -167,10 +223,13 @@ def observe(
         previous_action: clipped, shape (E, 5).
         attached: 1 while the payload hangs on the vehicle, shape (E,), float.
         history: measurements now and earlier, newest first, shape (E, 1 + H, layout.payload).
-        fresh: episodes that begin here, bool, shape (E,): their history is filled with the current value.
-        goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout has none.
+        fresh: episodes that begin here, bool, shape (E,): their history is filled with the current
+            value.
+        goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout
+            has none.
         places: where the keypoints lie, shape (E, 6); None where the layout has none.
-        answers: earlier steps, newest first, shape (E, R, 10): of :func:`answer`; None where the layout has none.
+        answers: earlier steps, newest first, shape (E, R, 10): of :func:`answer`; None where the
+            layout has none.
         setup: of the vehicle, shape (E, layout.setup); None where the layout has none.
 
     Returns:
@@ -183,5 +242,11 @@ def observe(
     moving += [answers.flatten(1)] if layout.response and answers is not None else []
     moving += [setup] if layout.setup and setup is not None else []
     history = push(history, frame[:, goal_end:], fresh)
-    parts = [frame[:, :VEHICLE], previous_action, frame[:, VEHICLE:goal_end], history.flatten(1), attached.unsqueeze(-1)]
+    parts = [
+        frame[:, :VEHICLE],
+        previous_action,
+        frame[:, VEHICLE:goal_end],
+        history.flatten(1),
+        attached.unsqueeze(-1),
+    ]
     return torch.cat(parts + bits + moving, dim=-1), history

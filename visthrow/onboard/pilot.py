@@ -1,8 +1,7 @@
 """The policy in flight: from poses of vehicle, payload and goal to a command. Onboard-safe.
 
-The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.onboard.actions` that the training environment calls, with
-a batch of one on board; only the noise is missing.
-"""
+The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.onboard.actions` that
+the training environment calls, with a batch of one on board; only the noise is missing."""
 
 import time
 from collections.abc import Sequence
@@ -27,14 +26,24 @@ from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
 from visthrow.onboard.traced import Traced
 
-VIEWS = {"pos_w": 3, "quat_wb": 4, "vel_w": 3, "rate_b": 3, "payload_w": 3, "goal_w": 3, "attached": 1}
+VIEWS = {
+    "pos_w": 3,
+    "quat_wb": 4,
+    "vel_w": 3,
+    "rate_b": 3,
+    "payload_w": 3,
+    "goal_w": 3,
+    "attached": 1,
+}
 """What one step is shown, and the width of each: the columns of one array."""
 
 SHARED = ("goal_w", "attached")
 """Of these one may serve all."""
 
 JITTER = 2e-3
-"""By which steps may be off their times without being counted as late [s]: the payload moves some millimetres in it."""
+"""By which steps may be off their times without being counted as late [s]: the payload moves some
+millimetres in it.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,12 +54,16 @@ class PilotOutput:
     command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
     release: np.ndarray  # whether the latch is to trip, shape (E,), bool
     observation: np.ndarray  # shape (E, D)
-    keypoints: np.ndarray | None  # normalised image coordinates, shape (E, 8, 2); None without a camera
+    keypoints: (
+        np.ndarray | None
+    )  # normalised image coordinates, shape (E, 8, 2); None without a camera
     valid: np.ndarray | None  # which of them are seen, shape (E, 8), bool
 
 
 def camera_conditions(params: CameraParams) -> dict[str, Any]:
-    """Return what a vision policy's contract says of the camera: lens, mount and sizes, without noise."""
+    """Return what a vision policy's contract says of the camera: lens, mount and sizes, without
+    noise.
+    """
     camera = config.to_dict(params)
     mount = {key: camera["mount"][key] for key in ("position_b", "rpy_deg")}
     same = {key: camera[key] for key in ("fisheye", "goal_side", "payload_radius")}
@@ -58,18 +71,27 @@ def camera_conditions(params: CameraParams) -> dict[str, Any]:
 
 
 def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
-    """Return a camera with the policy's own rule for what is out of view: it is the program's, not the camera's."""
+    """Return a camera with the policy's own rule for what is out of view: it is the program's, not
+    the camera's.
+    """
     rule = policy.contract.get("camera", {}).get("invalid_reads", params.noise.invalid_reads)
     return replace(params, noise=replace(params.noise, invalid_reads=rule))
 
 
-def _resampled(history: np.ndarray, seen: np.ndarray, ages: list[float], period: float) -> np.ndarray:
-    """`visthrow.onboard.observations.resampled`, of arrays; ``seen``: history with this step in it."""
-    return ob.resampled(torch.from_numpy(history), torch.from_numpy(seen)[:, 0], ages, period).numpy()
+def _resampled(
+    history: np.ndarray, seen: np.ndarray, ages: list[float], period: float
+) -> np.ndarray:
+    """`visthrow.onboard.observations.resampled`, of arrays; ``seen``: history with this
+    step in it.
+    """
+    return ob.resampled(
+        torch.from_numpy(history), torch.from_numpy(seen)[:, 0], ages, period
+    ).numpy()
 
 
 class Pilot:
-    """Flies E vehicles with one policy; remembers the previous action, the history and the policy's memory.
+    """Flies E vehicles with one policy; remembers the previous action, the history and the policy's
+    memory.
 
     Attributes:
         policy: the policy. layout: of its observation. period: between two calls [s].
@@ -78,15 +100,19 @@ class Pilot:
         spent: time that the last call took for the observation and for the policy [s].
     """
 
-    def __init__(self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1) -> None:
+    def __init__(
+        self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1
+    ) -> None:
         """Read the conditions of the policy's contract.
 
-        Raises PolicyError: the contract lacks an entry, or a vision policy is given no camera; MismatchError: the camera is not the one
-        that the policy was trained with; ValueError: count below 1.
+        Raises PolicyError: the contract lacks an entry, or a vision policy is given no camera;
+        MismatchError: the camera is not the one that the policy was trained with; ValueError: count
+        below 1.
 
         Args:
             policy: on the CPU.
-            camera_params: a vision policy's camera; with a state policy keypoints are computed for whoever draws them.
+            camera_params: a vision policy's camera; with a state policy keypoints are computed for
+                whoever draws them.
             count: E.
         """
         if count < 1:
@@ -101,9 +127,15 @@ class Pilot:
             self.period = float(contract["control_period"])
             mass = policy.total_mass
         except (KeyError, AttributeError, TypeError) as error:
-            raise PolicyError(f"the policy's contract is incomplete: {error!r}; it was not written by visthrow train") from error
+            raise PolicyError(
+                f"the policy's contract is incomplete: {error!r}; it was not written by visthrow"
+                " train"
+            ) from error
         if self.layout.dimension != policy.obs_dim:
-            raise PolicyError(f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network {policy.obs_dim}")
+            raise PolicyError(
+                f"layout '{self.layout.name}' has {self.layout.dimension} numbers, the network"
+                f" {policy.obs_dim}"
+            )
         if self.layout.name == "vision":
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
@@ -111,23 +143,38 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
         self.policy, self.count = policy, count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
-        self._views, self._time = np.zeros((count, sum(VIEWS.values())), dtype=np.float32), np.zeros(count, dtype=np.float32)
+        self._views, self._time = (
+            np.zeros((count, sum(VIEWS.values())), dtype=np.float32),
+            np.zeros(count, dtype=np.float32),
+        )
         self._observe, self._observe_given = Traced(self._observed), Traced(self._observed)
         self._decide, self._later = Traced(self._decision), np.zeros(count, dtype=bool)
         self.spent = (0.0, 0.0)
-        self._first = np.array([act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=np.float32)
+        self._first = np.array(
+            [act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=np.float32
+        )
         self.start()
 
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
         self._previous = self._first.repeat(self.count, 0)
-        self._history = np.zeros((self.count, 1 + self.layout.history, self.layout.payload), dtype=np.float32)
-        self._answers = np.zeros((self.count, 1 + self.layout.response, ob.RESPONSE), dtype=np.float32)
+        self._history = np.zeros(
+            (self.count, 1 + self.layout.history, self.layout.payload), dtype=np.float32
+        )
+        self._answers = np.zeros(
+            (self.count, 1 + self.layout.response, ob.RESPONSE), dtype=np.float32
+        )
         self._memory = self.policy.begin(self.count).numpy()
         self._fresh = np.ones(self.count, dtype=bool)
         self._goal_fit, self._steps = goal_motion.empty_sums(self.count).numpy(), 0
-        self._times: tuple[float, ...] = ()  # of the rows of history and response, newest first; those beyond are copies of the oldest [s]
-        self._unasked = self._previous[:, 4]  # what the action before the last one said of the release
+        self._times: tuple[
+            float, ...
+            # of the rows of history and response, newest first; those beyond are copies of the
+            # oldest [s]
+        ] = ()
+        self._unasked = self._previous[
+            :, 4
+        ]  # what the action before the last one said of the release
 
     @property
     def previous_action(self) -> np.ndarray:
@@ -136,9 +183,17 @@ class Pilot:
 
     @torch.inference_mode()
     def act(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray, vel_w: np.ndarray, rate_b: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray,
-        attached: np.ndarray | bool = True, keypoints: tuple[np.ndarray, np.ndarray] | None = None, now: float | None = None,
-    ) -> PilotOutput:  # fmt: skip
+        self,
+        pos_w: np.ndarray,
+        quat_wb: np.ndarray,
+        vel_w: np.ndarray,
+        rate_b: np.ndarray,
+        payload_w: np.ndarray,
+        goal_w: np.ndarray,
+        attached: np.ndarray | bool = True,
+        keypoints: tuple[np.ndarray, np.ndarray] | None = None,
+        now: float | None = None,
+    ) -> PilotOutput:
         """Decide one control step. Raises ValueError: an array of another shape.
 
         Args:
@@ -148,9 +203,10 @@ class Pilot:
             payload_w: of the payload's centre [m], shape (E, 3).
             goal_w: [m], shape (E, 3) or (3,).
             attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
-            keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8), in place of what payload
-                and goal project to; only with a camera.
-            now: time of this step on any clock [s], where steps may be late or missing; None: they come a period apart.
+            keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8),
+                in place of what payload and goal project to; only with a camera.
+            now: time of this step on any clock [s], where steps may be late or missing; None: they
+                come a period apart.
         """
         begin = time.perf_counter()
         goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
@@ -173,11 +229,15 @@ class Pilot:
         return PilotOutput(action, command, release, observation, points, valid)
 
     def not_released(self) -> None:
-        """Say that the release which the last call asked for was not done: the next call is told of none, as in training."""
+        """Say that the release which the last call asked for was not done: the next call is told of
+        none, as in training.
+        """
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
     def _seen(self, views: np.ndarray, given: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """What `_observed` makes of a step's measurements and all that was before; ``given``: keypoints of a detector."""
+        """What `_observed` makes of a step's measurements and all that was before; ``given``:
+        keypoints of a detector.
+        """
         carried: tuple[np.ndarray, ...] = (self._previous, self._history, self._fresh)
         if self.layout.response:
             carried += (self._answers,)
@@ -187,15 +247,24 @@ class Pilot:
         return (self._observe_given if given else self._observe)(views, *carried, *given)
 
     def _bridged(self, now: float, seen: Sequence[np.ndarray]) -> bool:
-        """Make history and response those of steps a period apart, as in training; whether steps before this one were late or missing.
+        """Make history and response those of steps a period apart, as in training; whether steps
+        before this one were late or missing.
 
         Args:
             now: of this step [s]. seen: history and response with this step in them, newest first.
         """
-        times, period, rows = self._times, self.period, 1 + max(self.layout.history, self.layout.response)
+        times, period, rows = (
+            self._times,
+            self.period,
+            1 + max(self.layout.history, self.layout.response),
+        )
         ages = [now - time for time in times]
-        due = [now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER]
-        late = len(due) != len(times) or any(abs(time - when) > JITTER for time, when in zip(times, due))
+        due = [
+            now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER
+        ]
+        late = len(due) != len(times) or any(
+            abs(time - when) > JITTER for time, when in zip(times, due)
+        )
         if late:
             self._history = _resampled(self._history, seen[0], ages, period)
             if self.layout.response:
@@ -213,23 +282,31 @@ class Pilot:
         at = 0
         for (name, width), value in zip(VIEWS.items(), views):
             array = np.asarray(value)
-            if array.shape != (self.count, width) and not (name in SHARED and array.shape == (1, width)):
-                raise ValueError(f"{name} has shape {array.shape}; expected ({self.count}, {width})")
+            if array.shape != (self.count, width) and not (
+                name in SHARED and array.shape == (1, width)
+            ):
+                raise ValueError(
+                    f"{name} has shape {array.shape}; expected ({self.count}, {width})"
+                )
             self._views[:, at : at + width] = array
             at += width
         return self._views
 
-    def _observed(self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor) -> tuple[Tensor, ...]:
+    def _observed(
+        self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
+    ) -> tuple[Tensor, ...]:
         """Assemble the observation, shape (E, D).
 
         Args:
-            views: shape (E, 20). previous, history, fresh: see `visthrow.onboard.observations.observe`.
-            further: the vehicle's response, where the layout has it; sums of the goal's fit and time [s], where it fits it; then
-                keypoints and validity that a detector saw, else what the camera sees of goal and payload is computed, where
-                there is one.
+            views: shape (E, 20). previous, history, fresh: see
+                `visthrow.onboard.observations.observe`.
+            further: the vehicle's response, where the layout has it; sums of the goal's fit and
+                time [s], where it fits it; then keypoints and validity that a detector saw, else
+                what the camera sees of goal and payload is computed, where there is one.
 
         Returns:
-            Observation, new history, new response, new sums of the goal's fit, keypoints and validity; where there are any.
+            Observation, new history, new response, new sums of the goal's fit, keypoints and
+            validity; where there are any.
         """
         answers: tuple[Tensor, ...] = ()
         if self.layout.response:
@@ -248,14 +325,29 @@ class Pilot:
         velocity = places = None
         if fitted:
             fit_sums, time = further[:2]
-            new, velocity, places, frame, valid = goal_motion.fitted_goal(self.layout, frame, valid, self.camera, fit_sums, time, fresh)
+            new, velocity, places, frame, valid = goal_motion.fitted_goal(
+                self.layout, frame, valid, self.camera, fit_sums, time, fresh
+            )
             sums = (new,)
         answers = tuple(push(held, ob.answer(frame, previous), fresh) for held in answers)
         earlier = answers[0][:, 1:] if answers else None
-        observation, history = ob.observe(self.layout, frame, valid, previous, attached[:, 0], history, fresh, velocity, places, earlier)
+        observation, history = ob.observe(
+            self.layout,
+            frame,
+            valid,
+            previous,
+            attached[:, 0],
+            history,
+            fresh,
+            velocity,
+            places,
+            earlier,
+        )
         return observation, history, *answers, *sums, *seen
 
-    def _decision(self, observation: Tensor, memory: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _decision(
+        self, observation: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Clipped action, command, whether a release is asked for, and the policy's memory."""
         raw, memory = self.policy.step(observation, memory)
         action = act.clip_action(raw)
@@ -263,15 +355,20 @@ class Pilot:
         return action, command, act.release_asked(raw, self._threshold), memory
 
     @torch.inference_mode()
-    def see(self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity, shape (E, 8).
+    def see(
+        self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity,
+        shape (E, 8).
 
         Raises PolicyError: there is no camera; ValueError: an array of another shape.
         """
         if self.camera is None:
             raise PolicyError("this pilot has no camera")
         still, goal_w = np.zeros((self.count, 3)), np.asarray(goal_w).reshape(-1, 3)
-        views = torch.from_numpy(self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1))))
+        views = torch.from_numpy(
+            self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1)))
+        )
         pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
         points, valid = seen_keypoints(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()

@@ -1,14 +1,16 @@
-"""The exported policy: a small network, the conditions that it was trained under, and how it was made.
+"""The exported policy: a small network, the conditions that it was trained under, and how it was
+made.
 
-Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle: ``layer<i>_weight`` and
-``layer<i>_bias`` (float32), optionally ``normalizer_mean``, ``normalizer_std``, ``normalizer_eps``, and ``header``,
-JSON text with ``format_version``, ``activation``, ``contract`` and ``made_by``. A policy with a memory has its estimator
-too, ``estimator_<field>``, and format version 2.
+Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle:
+``layer<i>_weight`` and ``layer<i>_bias`` (float32), optionally ``normalizer_mean``,
+``normalizer_std``, ``normalizer_eps``, and ``header``, JSON text with ``format_version``,
+``activation``, ``contract`` and ``made_by``. A policy with a memory has its estimator too,
+``estimator_<field>``, and format version 2.
 
-``contract`` is a nested dictionary of everything that whoever flies the policy must share with its training: camera,
-mount, action limits, release lag, vehicle, observation layout. ``contract["observation"]["dimension"]`` and
-``contract["action"]["dimension"]``, where given, must fit the network. ``made_by`` tells config, commit, command, seed
-and figures; nothing depends on it.
+``contract`` is a nested dictionary of everything that whoever flies the policy must share with its
+training: camera, mount, action limits, release lag, vehicle, observation layout.
+``contract["observation"]["dimension"]`` and ``contract["action"]["dimension"]``, where given, must
+fit the network. ``made_by`` tells config, commit, command, seed and figures; nothing depends on it.
 """
 
 import json
@@ -33,25 +35,39 @@ FORMAT_VERSIONS = (1, 2)
 """Without and with an estimator."""
 
 RELATIVE_TOLERANCE = 1e-9
-"""Two numbers of a contract are the same up to this: what a round trip through text or a unit conversion may cost."""
+"""Two numbers of a contract are the same up to this: what a round trip through text or a unit
+conversion may cost.
+"""
 
 RSL_RL_EPS = 1e-2
-"""What rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part of its state."""
+"""What rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part of its
+state.
+"""
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "elu": F.elu, "selu": F.selu, "relu": F.relu, "lrelu": F.leaky_relu, "tanh": torch.tanh, "sigmoid": torch.sigmoid,
-    "softplus": F.softplus, "gelu": F.gelu, "swish": F.silu, "mish": F.mish,
-}  # fmt: skip
-"""By rsl_rl's names; its "crelu" is missing, as it stands for another function than the name says."""
+    "elu": F.elu,
+    "selu": F.selu,
+    "relu": F.relu,
+    "lrelu": F.leaky_relu,
+    "tanh": torch.tanh,
+    "sigmoid": torch.sigmoid,
+    "softplus": F.softplus,
+    "gelu": F.gelu,
+    "swish": F.silu,
+    "mish": F.mish,
+}
+"""By rsl_rl's names; its "crelu" is missing, as it stands for another function than the name says.
+"""
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A multi-layer perceptron ``obs (E, D) -> action (E, A)`` with an optional fixed normaliser before it.
+    """A multi-layer perceptron ``obs (E, D) -> action (E, A)`` with an optional fixed normaliser
+    before it.
 
-    With an estimator the perceptron looks at the estimate (E, S) in place of the observation, and the policy has a memory. Raises
-    PolicyError if shapes do not fit each other or the contract, a number is not finite, or the activation is unknown.
-    """
+    With an estimator the perceptron looks at the estimate (E, S) in place of the observation, and
+    the policy has a memory. Raises PolicyError if shapes do not fit each other or the contract, a
+    number is not finite, or the activation is unknown."""
 
     weights: tuple[Tensor, ...]  # (out, in) each
     biases: tuple[Tensor, ...]  # (out,) each
@@ -65,13 +81,17 @@ class Policy:
 
     def __post_init__(self) -> None:
         if self.activation not in _ACTIVATIONS:
-            raise PolicyError(f"activation '{self.activation}'; {suggest(self.activation, _ACTIVATIONS)}")
+            raise PolicyError(
+                f"activation '{self.activation}'; {suggest(self.activation, _ACTIVATIONS)}"
+            )
         _check_shapes(self)
         for part, declared in (("observation", self.obs_dim), ("action", self.action_dim)):
             section = self.contract.get(part)
             told = section.get("dimension", declared) if isinstance(section, Mapping) else declared
             if told != declared:
-                raise PolicyError(f"the contract says {part} dimension {told}, the network has {declared}")
+                raise PolicyError(
+                    f"the contract says {part} dimension {told}, the network has {declared}"
+                )
 
     @property
     def obs_dim(self) -> int:
@@ -87,7 +107,9 @@ class Policy:
     def total_mass(self) -> float:
         """Mass of the vehicle with all that hangs on it, by the contract [kg]."""
         rope = self.contract["rope"]
-        return float(self.contract["vehicle"]["body"]["mass"] + (rope["rope_mass"] + rope["payload_mass"]))
+        return float(
+            self.contract["vehicle"]["body"]["mass"] + (rope["rope_mass"] + rope["payload_mass"])
+        )
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -100,7 +122,9 @@ class Policy:
             Normalised actions, unclipped, shape (E, A).
         """
         if self.estimator is not None:
-            raise PolicyError("this policy has a memory; expected a call of step or actor rather than act")
+            raise PolicyError(
+                "this policy has a memory; expected a call of step or actor rather than act"
+            )
         return self.decide(self._fitting(obs))
 
     def begin(self, count: int) -> Tensor:
@@ -120,7 +144,9 @@ class Policy:
         return self.decide(seen), memory
 
     def actor(self, count: int) -> Callable[[Tensor], Tensor]:
-        """Function of the observations of one throw after the other step, shape (E, D); it carries the memory, where there is one."""
+        """Function of the observations of one throw after the other step, shape (E, D); it carries
+        the memory, where there is one.
+        """
         if self.estimator is None:
             return self.act
         memory = self.begin(count)
@@ -134,11 +160,16 @@ class Policy:
 
     def _fitting(self, obs: Tensor) -> Tensor:
         if obs.shape[-1] != self.obs_dim:
-            raise PolicyError(f"got observations of shape {tuple(obs.shape)}; this policy expects (E, {self.obs_dim})")
+            raise PolicyError(
+                f"got observations of shape {tuple(obs.shape)}; this policy expects (E,"
+                f" {self.obs_dim})"
+            )
         return obs.to(self.weights[0].dtype)
 
     def decide(self, x: Tensor) -> Tensor:
-        """Action of the perceptron alone, shape (E, A), for what it looks at, shape (E, S); differentiable."""
+        """Action of the perceptron alone, shape (E, A), for what it looks at, shape (E, S);
+        differentiable.
+        """
         if self.mean is not None and self.std is not None:
             x = (x - self.mean) / (self.std + self.eps)
         activation = _ACTIVATIONS[self.activation]
@@ -148,12 +179,22 @@ class Policy:
 
     def to(self, device: str | torch.device) -> "Policy":
         """Return the policy with its tensors on another device."""
-        moved: dict[str, Any] = {name: tuple(tensor.to(device) for tensor in getattr(self, name)) for name in ("weights", "biases")}
+        moved: dict[str, Any] = {
+            name: tuple(tensor.to(device) for tensor in getattr(self, name))
+            for name in ("weights", "biases")
+        }
         parts = {name: getattr(self, name) for name in ("mean", "std", "estimator")}
-        return replace(self, **moved, **{name: part.to(device) for name, part in parts.items() if part is not None})
+        return replace(
+            self,
+            **moved,
+            **{name: part.to(device) for name, part in parts.items() if part is not None},
+        )
 
     def require(
-        self, contract_now: Mapping[str, Any], sections: Collection[str] | None = None, allow: Collection[str] = ()
+        self,
+        contract_now: Mapping[str, Any],
+        sections: Collection[str] | None = None,
+        allow: Collection[str] = (),
     ) -> dict[str, Any]:
         """Refuse to serve under other conditions than those of the training.
 
@@ -162,47 +203,70 @@ class Policy:
         Args:
             contract_now: The conditions here, as the training wrote them.
             sections: Top-level keys to compare; all if None.
-            allow: Keys of tables or values that may differ, ``("vehicle", "observation.latency")``: an experiment's
-                stated departures from the training.
+            allow: Keys of tables or values that may differ, ``("vehicle", "observation.latency")``:
+                an experiment's stated departures from the training.
 
         Returns:
             What differs by allowance: dotted key -> the value here, None where there is nothing.
         """
         trained, now = flattened(self.contract, sections), flattened(contract_now, sections)
         known = sorted(trained.keys() | now.keys())
-        differing = [key for key in known if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))]
-        allowed = [key for key in differing if any(re.match(rf"{re.escape(name)}(?![^.\[])", key) for name in allow)]
+        differing = [
+            key for key in known if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))
+        ]
+        allowed = [
+            key
+            for key in differing
+            if any(re.match(rf"{re.escape(name)}(?![^.\[])", key) for name in allow)
+        ]
         if refused := tuple(key for key in differing if key not in allowed):
-            lines = (f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}" for key in refused)
-            raise MismatchError("the policy was trained under other conditions:\n" + "\n".join(lines), refused)
+            lines = (
+                f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}"
+                for key in refused
+            )
+            raise MismatchError(
+                "the policy was trained under other conditions:\n" + "\n".join(lines), refused
+            )
         return {key: now.get(key) for key in allowed}
 
     def save(self, path: str | Path) -> None:
         """Write the policy file, whole or not at all.
 
-        Raises PolicyError if contract or made_by cannot be written as JSON; StorageError if the place cannot be written.
-        """
-        header = {"format_version": FORMAT_VERSIONS[self.estimator is not None], "activation": self.activation}
+        Raises PolicyError if contract or made_by cannot be written as JSON; StorageError if the
+        place cannot be written."""
+        header = {
+            "format_version": FORMAT_VERSIONS[self.estimator is not None],
+            "activation": self.activation,
+        }
         header |= {"contract": self.contract, "made_by": self.made_by}
         try:
             arrays = {"header": json_array(header)}
         except (TypeError, ValueError) as error:
             raise PolicyError(f"contract or made_by holds what JSON cannot: {error}") from error
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
-            arrays[f"layer{i}_weight"], arrays[f"layer{i}_bias"] = weight.cpu().numpy(), bias.cpu().numpy()
+            arrays[f"layer{i}_weight"], arrays[f"layer{i}_bias"] = (
+                weight.cpu().numpy(),
+                bias.cpu().numpy(),
+            )
         if self.mean is not None and self.std is not None:
-            arrays["normalizer_mean"], arrays["normalizer_std"] = self.mean.cpu().numpy(), self.std.cpu().numpy()
+            arrays["normalizer_mean"], arrays["normalizer_std"] = (
+                self.mean.cpu().numpy(),
+                self.std.cpu().numpy(),
+            )
             arrays["normalizer_eps"] = np.array(self.eps)
         if self.estimator is not None:
-            arrays |= {f"estimator_{field.name}": getattr(self.estimator, field.name).cpu().numpy() for field in fields(Estimator)}
+            arrays |= {
+                f"estimator_{field.name}": getattr(self.estimator, field.name).cpu().numpy()
+                for field in fields(Estimator)
+            }
         savez(path, arrays)
 
     @staticmethod
     def load(path: str | Path, device: str | torch.device = "cpu") -> "Policy":
         """Read a policy file.
 
-        Raises PolicyError if the file is missing, cut short, of another version or incomplete, or contradicts itself.
-        """
+        Raises PolicyError if the file is missing, cut short, of another version or incomplete, or
+        contradicts itself."""
         arrays = loadz(path, PolicyError, "a policy file written by `visthrow train`")
 
         def take(name: str) -> Tensor:
@@ -216,33 +280,53 @@ class Policy:
         try:
             estimator = None
             if header["format_version"] == FORMAT_VERSIONS[1]:
-                estimator = Estimator(**{field.name: take(f"estimator_{field.name}") for field in fields(Estimator)})
+                estimator = Estimator(
+                    **{field.name: take(f"estimator_{field.name}") for field in fields(Estimator)}
+                )
             return Policy(
-                tuple(take(f"layer{i}_weight") for i in range(count)), tuple(take(f"layer{i}_bias") for i in range(count)),
-                header["activation"], header["contract"], header["made_by"], take("normalizer_mean") if normalized else None,
-                take("normalizer_std") if normalized else None, float(take("normalizer_eps")) if normalized else 0.0, estimator,
-            )  # fmt: skip
+                tuple(take(f"layer{i}_weight") for i in range(count)),
+                tuple(take(f"layer{i}_bias") for i in range(count)),
+                header["activation"],
+                header["contract"],
+                header["made_by"],
+                take("normalizer_mean") if normalized else None,
+                take("normalizer_std") if normalized else None,
+                float(take("normalizer_eps")) if normalized else 0.0,
+                estimator,
+            )
         except PolicyError as error:
-            raise PolicyError(f"{path}: {error}") if str(path) not in str(error) else error from None
+            raise (
+                PolicyError(f"{path}: {error}") if str(path) not in str(error) else error
+            ) from None
 
     @staticmethod
     def from_actor_state(
-        state: Mapping[str, Tensor], activation: str, contract: dict[str, Any], made_by: dict[str, Any] | None = None,
-    ) -> "Policy":  # fmt: skip
-        """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of its own spread.
+        state: Mapping[str, Tensor],
+        activation: str,
+        contract: dict[str, Any],
+        made_by: dict[str, Any] | None = None,
+    ) -> "Policy":
+        """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of
+        its own spread.
 
-        Raises PolicyError if the state holds anything else (another model class), or does not fit the contract.
+        Raises PolicyError if the state holds anything else (another model class), or does not fit
+        the contract.
 
         Args:
-            state: ``actor.state_dict()``: ``mlp.<i>.weight``, ``mlp.<i>.bias``, ``obs_normalizer._mean`` and ``._std``;
-                the spread under ``distribution.`` plays no part in the deterministic action.
+            state: ``actor.state_dict()``: ``mlp.<i>.weight``, ``mlp.<i>.bias``,
+                ``obs_normalizer._mean`` and ``._std``; the spread under ``distribution.`` plays no
+                part in the deterministic action.
             activation: The actor's hidden activation by rsl_rl's name.
             contract: Conditions of the training.
             made_by: Where it comes from.
         """
         known = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(known))
-        index = sorted(int(key.split(".")[1]) for key in state if key.startswith("mlp.") and key.endswith(".weight"))
+        index = sorted(
+            int(key.split(".")[1])
+            for key in state
+            if key.startswith("mlp.") and key.endswith(".weight")
+        )
         if foreign or not index:
             came = ", ".join(foreign) or "no mlp.<i>.weight"
             wanted = "mlp.<i>.weight, mlp.<i>.bias, obs_normalizer._mean, obs_normalizer._std"
@@ -253,11 +337,15 @@ class Policy:
 
         normalized = "obs_normalizer._mean" in state
         return Policy(
-            tuple(take(f"mlp.{i}.weight") for i in index), tuple(take(f"mlp.{i}.bias") for i in index), activation.lower(),
-            json.loads(json.dumps(contract)), json.loads(json.dumps(made_by or {})),
+            tuple(take(f"mlp.{i}.weight") for i in index),
+            tuple(take(f"mlp.{i}.bias") for i in index),
+            activation.lower(),
+            json.loads(json.dumps(contract)),
+            json.loads(json.dumps(made_by or {})),
             take("obs_normalizer._mean").reshape(-1) if normalized else None,
-            take("obs_normalizer._std").reshape(-1) if normalized else None, RSL_RL_EPS if normalized else 0.0,
-        )  # fmt: skip
+            take("obs_normalizer._std").reshape(-1) if normalized else None,
+            RSL_RL_EPS if normalized else 0.0,
+        )
 
 
 _ABSENT = object()
@@ -265,16 +353,24 @@ _ABSENT = object()
 
 def _check_shapes(policy: Policy) -> None:
     if not policy.weights or len(policy.weights) != len(policy.biases):
-        raise PolicyError(f"got {len(policy.weights)} weights and {len(policy.biases)} biases; expected a pair a layer")
+        raise PolicyError(
+            f"got {len(policy.weights)} weights and {len(policy.biases)} biases; expected a pair a"
+            " layer"
+        )
     width = policy.weights[0].shape[-1]
     if policy.estimator is not None and len(policy.estimator.output_bias) != width:
-        raise PolicyError(f"the estimator gives {len(policy.estimator.output_bias)} numbers; the first layer takes {width}")
+        raise PolicyError(
+            f"the estimator gives {len(policy.estimator.output_bias)} numbers; the first layer"
+            f" takes {width}"
+        )
     named = [("normalizer mean", policy.mean), ("normalizer std", policy.std)]
     if (policy.mean is None) != (policy.std is None):
         raise PolicyError("a normaliser needs both mean and std; one is missing")
     for name, tensor in named:
         if tensor is not None and tensor.shape != (width,):
-            raise PolicyError(f"{name} has shape {tuple(tensor.shape)}; the first layer takes ({width},)")
+            raise PolicyError(
+                f"{name} has shape {tuple(tensor.shape)}; the first layer takes ({width},)"
+            )
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases)):
         if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
             came = f"weight {tuple(weight.shape)} and bias {tuple(bias.shape)}"
@@ -285,7 +381,10 @@ def _check_shapes(policy: Policy) -> None:
         if tensor is not None and not bool(torch.isfinite(tensor).all()):
             raise PolicyError(f"{name} holds numbers that are not finite")
     if policy.std is not None and not bool((policy.std + policy.eps > 0.0).all()):
-        raise PolicyError(f"normalizer std + eps must be above 0; the smallest is {float((policy.std + policy.eps).min())}")
+        raise PolicyError(
+            "normalizer std + eps must be above 0; the smallest is"
+            f" {float((policy.std + policy.eps).min())}"
+        )
 
 
 def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
@@ -296,11 +395,15 @@ def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
         raise PolicyError(f"{path}: its header is not readable: {error!r}") from error
     if version not in FORMAT_VERSIONS:
         readable = " and ".join(map(str, FORMAT_VERSIONS))
-        raise PolicyError(f"{path}: format version {version}; this program reads versions {readable}")
+        raise PolicyError(
+            f"{path}: format version {version}; this program reads versions {readable}"
+        )
     wanted = {"activation": str, "contract": dict, "made_by": dict}
     for key, kind in wanted.items():
         if not isinstance(header.get(key), kind):
-            raise PolicyError(f"{path}: header entry '{key}' is {header.get(key)!r}; expected a {kind.__name__}")
+            raise PolicyError(
+                f"{path}: header entry '{key}' is {header.get(key)!r}; expected a {kind.__name__}"
+            )
     return header
 
 

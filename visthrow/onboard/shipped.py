@@ -4,7 +4,9 @@ from pathlib import Path
 
 from visthrow.common.errors import PolicyError, suggest
 
-SHIPPED = Path(__file__).resolve().parent / "policies"  # folder of the policies that come with the package
+SHIPPED = (
+    Path(__file__).resolve().parent / "policies"
+)  # folder of the policies that come with the package
 
 
 def find_policy(name: str | Path) -> Path:
@@ -16,4 +18,6 @@ def find_policy(name: str | Path) -> Path:
         if candidate.is_file():
             return candidate
     shipped = suggest(str(name), (path.stem for path in SHIPPED.glob("*.npz")))
-    raise PolicyError(f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}")
+    raise PolicyError(
+        f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}"
+    )

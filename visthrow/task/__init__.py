@@ -1,8 +1,9 @@
-"""Schema of the throwing task and of an experiment: what is flown, seen, rewarded and trained. SI units.
+"""Schema of the throwing task and of an experiment: what is flown, seen, rewarded and trained.
 
-One experiment file of ``configs/train`` names the files of vehicle, rope, camera and task and holds the learning
-parameters; :func:`plant_of` gives what the simulator needs of it.
-"""
+SI units.
+
+One experiment file of ``configs/train`` names the files of vehicle, rope, camera and task and holds
+the learning parameters; :func:`plant_of` gives what the simulator needs of it."""
 
 import math
 from collections.abc import Iterator
@@ -48,12 +49,23 @@ class ObservationParams(Bounded):
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
-    latency: tuple[float, float]  # age of all that is measured, drawn per episode from this range [s]
-    latency_jitter: NotNegative = 0.0  # of that age, uniform up to this to either side, drawn per step [s]
-    goal_velocity: bool = False  # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
-    located: bool = False  # vision: whether the actor is given where the keypoints lie too; see visthrow.onboard.goal_motion
-    response: int = 0  # earlier steps of which the actor is given velocity, body rates and action: how this vehicle answers
-    setup: Literal["none", "told", "exact"] = "none"  # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
+    latency: tuple[
+        float, float
+    ]  # age of all that is measured, drawn per episode from this range [s]
+    latency_jitter: NotNegative = (
+        0.0  # of that age, uniform up to this to either side, drawn per step [s]
+    )
+    # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
+    goal_velocity: bool = False
+    # vision: whether the actor is given where the keypoints lie too; see
+    # visthrow.onboard.goal_motion
+    located: bool = False
+    # earlier steps of which the actor is given velocity, body rates and action: how this vehicle
+    # answers
+    response: int = 0
+    setup: Literal["none", "told", "exact"] = (
+        "none"  # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
+    )
 
     @property
     def oldest(self) -> float:
@@ -64,14 +76,23 @@ class ObservationParams(Bounded):
         super().__post_init__()
         low, high = self.latency
         if not 0.0 <= low <= high < 1.0:
-            raise ConfigError(f"task.observation.latency is {low} to {high} s; expected an ascending range from 0 up to a second")
+            raise ConfigError(
+                f"task.observation.latency is {low} to {high} s; expected an ascending range from 0"
+                " up to a second"
+            )
         if self.latency_jitter > low:
-            raise ConfigError(f"task.observation.latency_jitter is {self.latency_jitter} s; expected at most the shortest latency, {low} s")
+            raise ConfigError(
+                f"task.observation.latency_jitter is {self.latency_jitter} s; expected at most the"
+                f" shortest latency, {low} s"
+            )
 
 
 @dataclass(frozen=True)
 class NoiseParams(Bounded):
-    """Gaussian noise of measurements and commands (the paper, Sec. III-C). Keypoints have their own in the camera."""
+    """Gaussian noise of measurements and commands (the paper, Sec.
+
+    III-C). Keypoints have their own in the camera.
+    """
 
     observation_step: NotNegative  # per step, in each entry's SI unit
     observation_bias: NotNegative  # per episode
@@ -91,12 +112,17 @@ class BoundsParams(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.altitude[0] < self.altitude[1]:
-            raise ValueError(f"task.bounds.altitude is {self.altitude} m; expected the lower limit before the upper one")
+            raise ValueError(
+                f"task.bounds.altitude is {self.altitude} m; expected the lower limit before the"
+                " upper one"
+            )
 
 
 @dataclass(frozen=True)
 class RewardParams:
-    """Coefficients of Table II, by the names of its meanings; see :mod:`visthrow.training.rewards`."""
+    """Coefficients of Table II, by the names of its meanings; see
+    :mod:`visthrow.training.rewards`.
+    """
 
     scale: float  # of the whole reward; the learner's only, the paper's is 1
     velocity: float  # alpha_v
@@ -116,13 +142,17 @@ class RewardParams:
 
 @dataclass(frozen=True)
 class TargetParams:
-    """Motion of the target: a constant horizontal velocity, its heading uniform; the landing counts where it is at impact."""
+    """Motion of the target: a constant horizontal velocity, its heading uniform; the landing counts
+    where it is at impact.
+    """
 
     speed: tuple[float, float] = (0.0, 0.0)  # uniform in this range, drawn per episode [m/s]
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.speed[0] <= self.speed[1]:
-            raise ValueError(f"target.speed is {self.speed} m/s; expected an ascending range from 0 or more")
+            raise ValueError(
+                f"target.speed is {self.speed} m/s; expected an ascending range from 0 or more"
+            )
 
     @property
     def moves(self) -> bool:
@@ -144,10 +174,21 @@ class TaskParams:
 
 
 PRIVILEGED = (
-    "exact", "payload_velocity", "release_timer", "time", "mass", "voltage", "goal_velocity", "cargo", "mount", "pose_age",
+    "exact",
+    "payload_velocity",
+    "release_timer",
+    "time",
+    "mass",
+    "voltage",
+    "goal_velocity",
+    "cargo",
+    "mount",
+    "pose_age",
     "vehicle",
-)  # fmt: skip
-"""What a critic may be told beyond the actor's observation; see :class:`visthrow.training.env.ThrowEnv`."""
+)
+"""What a critic may be told beyond the actor's observation; see
+:class:`visthrow.training.env.ThrowEnv`.
+"""
 
 
 @dataclass(frozen=True)
@@ -173,10 +214,16 @@ class PPOParams(Bounded):
     entropy: NotNegative
     value_coefficient: NotNegative
     max_grad_norm: Positive
-    products: Literal["float32", "bfloat16"] = "float32"  # of the hidden layers; weights are float32 either way
+    products: Literal["float32", "bfloat16"] = (
+        "float32"  # of the hidden layers; weights are float32 either way
+    )
     critic: Counts = ()  # hidden layers of the critic; empty for the actor's
-    critic_first: Annotated[int, Bound(0)] = 0  # iterations at the beginning in which the critic alone learns
-    privileged: tuple[str, ...] = PRIVILEGED[:8]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
+    critic_first: Annotated[int, Bound(0)] = (
+        0  # iterations at the beginning in which the critic alone learns
+    )
+    privileged: tuple[str, ...] = PRIVILEGED[
+        :8
+    ]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,12 +231,16 @@ class PPOParams(Bounded):
             raise ConfigError("hidden is empty; expected one layer or more")
         for name in self.privileged:
             if name not in PRIVILEGED or self.privileged.count(name) > 1:
-                raise ConfigError(f"ppo.privileged has {name!r}; {suggest(name, PRIVILEGED)}, each once")
+                raise ConfigError(
+                    f"ppo.privileged has {name!r}; {suggest(name, PRIVILEGED)}, each once"
+                )
 
 
 @dataclass(frozen=True)
 class FirstOrderParams(Bounded):
-    """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` has the throws a gradient and the network."""
+    """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` has the throws a
+    gradient and the network.
+    """
 
     iterations: Count = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
@@ -202,23 +253,42 @@ class FirstOrderParams(Bounded):
     max_grad_norm: float = 1.0
     width: Positive = 0.5  # of the hazard at the first iteration, in units of the fifth action
     final_width: Positive = 0.35  # at most the first
-    sharp: Positive = 0.3  # share of the training after which the width is the final one; geometric till then
-    latched: tuple[float, float] = (0.1, 0.2)  # shares of the training between which the hazard's value becomes the latch's
-    first_release: int = 24  # step before which nothing is released at the beginning: else the payload is dropped at once
-    free: tuple[float, float] = (0.05, 0.15)  # shares of the training between which that step comes down to 0
+    sharp: Positive = (
+        0.3  # share of the training after which the width is the final one; geometric till then
+    )
+    latched: tuple[float, float] = (
+        0.1,
+        0.2,
+    )  # shares of the training between which the hazard's value becomes the latch's
+    # step before which nothing is released at the beginning: else the payload is dropped at once
+    first_release: int = 24
+    free: tuple[float, float] = (
+        0.05,
+        0.15,
+    )  # shares of the training between which that step comes down to 0
     initial_release: float = -2.0  # fifth action of the untrained network
     saturation: float = 1.0  # cost of the square that an action is past its limits by
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not all(0.0 <= low < high for low, high in (self.free, self.latched)) or self.final_width > self.width:
-            came = f"free is {self.free}, latched {self.latched}, the hazard {self.width} to {self.final_width} wide"
-            raise ConfigError(f"{came}; expected ascending ranges from 0 or more, and a width that falls")
+        if (
+            not all(0.0 <= low < high for low, high in (self.free, self.latched))
+            or self.final_width > self.width
+        ):
+            came = (
+                f"free is {self.free}, latched {self.latched}, the hazard {self.width} to"
+                f" {self.final_width} wide"
+            )
+            raise ConfigError(
+                f"{came}; expected ascending ranges from 0 or more, and a width that falls"
+            )
 
 
 @dataclass(frozen=True)
 class DistillationParams(Bounded):
-    """Learning parameters of :mod:`visthrow.training.distillation`; ``ppo.environments`` has the throws of an iteration."""
+    """Learning parameters of :mod:`visthrow.training.distillation`; ``ppo.environments`` has the
+    throws of an iteration.
+    """
 
     teacher: str = "state"  # state policy: a shipped name or a file
     iterations: Count = 500
@@ -236,9 +306,9 @@ class DistillationParams(Bounded):
 class DiagnosedParams(Bounded):
     """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
 
-    Training draws ``plants`` plants from the joint posterior: deviations theta of the effects, normal with this covariance
-    about the configuration as it stands, so that what is pinned together stays so. Environment e flies plant
-    ``e % plants``. With 1 all fly the configuration.
+    Training draws ``plants`` plants from the joint posterior: deviations theta of the effects,
+    normal with this covariance about the configuration as it stands, so that what is pinned
+    together stays so. Environment e flies plant ``e % plants``. With 1 all fly the configuration.
     """
 
     effects: tuple[str, ...] = ()  # of the catalogue
@@ -266,13 +336,19 @@ class Experiment:
     ppo: PPOParams
     air: AirParams = field(default_factory=AirParams)
     laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
-    sensing: SensingParams = field(default_factory=SensingParams)  # of the motion capture; the diagnosis alone reads it
+    sensing: SensingParams = field(
+        default_factory=SensingParams
+    )  # of the motion capture; the diagnosis alone reads it
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
     distillation: DistillationParams = field(default_factory=DistillationParams)
-    fleet: FleetParams | None = None  # with it, policies are trained for many vehicles; task and sim are in its units
-    flown: tuple[str, ...] = ()  # key=value changes of this configuration that its policies are flown and measured with
+    fleet: FleetParams | None = (
+        None  # with it, policies are trained for many vehicles; task and sim are in its units
+    )
+    flown: tuple[
+        str, ...
+    ] = ()  # key=value changes of this configuration that its policies are flown and measured with
 
     @property
     def iterations(self) -> int:
@@ -283,7 +359,9 @@ class Experiment:
     def samples(self) -> int:
         """Environment steps an iteration."""
         chosen = self._chosen
-        return self.ppo.environments * (chosen.steps if isinstance(chosen, PPOParams) else chosen.horizon)
+        return self.ppo.environments * (
+            chosen.steps if isinstance(chosen, PPOParams) else chosen.horizon
+        )
 
     @property
     def _chosen(self) -> PPOParams | FirstOrderParams | DistillationParams:
@@ -292,78 +370,112 @@ class Experiment:
 
     def __post_init__(self) -> None:
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
-            given = f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius {self.rope.payload_radius} m"
+            given = (
+                f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius"
+                f" {self.rope.payload_radius} m"
+            )
             raise ConfigError(f"{given}; expected the same ball")
         for wrong in () if self.fleet is not None else (*_out_of_place(self), *_no_vehicle(self)):
             raise ConfigError(wrong)
 
 
 def _out_of_place(e: Experiment) -> Iterator[str]:
-    """What of an experiment's lengths and times does not go together: a number in another unit is off by a hundred or more."""
+    """What of an experiment's lengths and times does not go together: a number in another unit is
+    off by a hundred or more.
+    """
     start, bounds, release = e.task.start, e.task.bounds, e.release
     low, high = bounds.altitude
     hangs = e.rope.length + e.rope.payload_offset - e.rope.mount[2]
     if not low <= start.spawn_height <= high:
-        yield f"task.start.spawn_height is {start.spawn_height:g} m; expected within task.bounds.altitude, {low:g} to {high:g} m"
+        yield (
+            f"task.start.spawn_height is {start.spawn_height:g} m; expected within"
+            f" task.bounds.altitude, {low:g} to {high:g} m"
+        )
     if not start.spawn_height - hangs > release.landing_height:
         yield (
-            f"the payload hangs {hangs:g} m (rope.length, rope.payload_offset) below a vehicle that starts at {start.spawn_height:g} m "
-            "(task.start.spawn_height): on the ground; expected m"
+            f"the payload hangs {hangs:g} m (rope.length, rope.payload_offset) below a vehicle that"
+            f" starts at {start.spawn_height:g} m (task.start.spawn_height): on the ground;"
+            " expected m"
         )
-    times = {"release.lag": release.lag, "vehicle.queue.delay": e.vehicle.queue.delay, "sim.control_period": e.sim.control_period,
-             "vehicle.motor.time_constant": e.vehicle.motor.time_constant}  # fmt: skip
+    times = {
+        "release.lag": release.lag,
+        "vehicle.queue.delay": e.vehicle.queue.delay,
+        "sim.control_period": e.sim.control_period,
+        "vehicle.motor.time_constant": e.vehicle.motor.time_constant,
+    }
     for name, time in times.items():
         if time >= bounds.time_limit:
-            yield f"{name} is {time:g} s, and a throw is over after {bounds.time_limit:g} s (task.bounds.time_limit); expected s"
+            yield (
+                f"{name} is {time:g} s, and a throw is over after {bounds.time_limit:g} s"
+                " (task.bounds.time_limit); expected s"
+            )
 
 
 def _no_vehicle(e: Experiment) -> Iterator[str]:
-    """Why no vehicle is as an experiment's: thrust and weight, moments of inertia and size, thrust and speed of the rotors."""
+    """Why no vehicle is as an experiment's: thrust and weight, moments of inertia and size, thrust
+    and speed of the rotors.
+    """
     vehicle, rotors, motor = e.vehicle, e.vehicle.rotors, e.vehicle.controller.max_thrust
     mass, asked = plant_of(e).total_mass, e.task.action.max_thrust
     if not GRAVITY * mass < min(4.0 * motor, asked):
         yield (
-            f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is {4.0 * motor:g} N at most (four times "
-            f"vehicle.controller.max_thrust) and asked up to {asked:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
+            f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is"
+            f" {4.0 * motor:g} N at most (four times vehicle.controller.max_thrust) and asked up to"
+            f" {asked:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
         )
     reach = max(map(math.hypot, rotors.x, rotors.y)) + rotors.radius
     if reach > e.task.bounds.horizontal:
-        yield f"vehicle.rotors reach {reach:g} m from the middle, and it may fly {e.task.bounds.horizontal:g} m far; expected m"
+        yield (
+            f"vehicle.rotors reach {reach:g} m from the middle, and it may fly"
+            f" {e.task.bounds.horizontal:g} m far; expected m"
+        )
     gyration = math.sqrt(max(vehicle.body.inertia) / vehicle.body.mass)
     if gyration > reach:
         yield (
-            f"vehicle.body.inertia up to {max(vehicle.body.inertia):g} kg m^2 puts {vehicle.body.mass:g} kg {gyration:.3g} m from its "
-            f"middle, but the rotors reach {reach:.3g} m; expected kg m^2"
+            f"vehicle.body.inertia up to {max(vehicle.body.inertia):g} kg m^2 puts"
+            f" {vehicle.body.mass:g} kg {gyration:.3g} m from its middle, but the rotors reach"
+            f" {reach:.3g} m; expected kg m^2"
         )
     tip = math.sqrt(motor / vehicle.thrust.k_f) * rotors.radius
     wake = math.sqrt(motor / (2.0 * AIR_DENSITY * math.pi * rotors.radius**2))
     if not wake < tip < SOUND:
         yield (
-            f"vehicle.thrust.k_f {vehicle.thrust.k_f:g} N s^2/rad^2 and vehicle.rotors.radius {rotors.radius:g} m make blade tips of "
-            f"{tip:.3g} m/s for {motor:g} N (vehicle.controller.max_thrust); expected more than the air through the rotor, {wake:.3g} m/s, "
-            f"and less than sound, {SOUND:g} m/s"
+            f"vehicle.thrust.k_f {vehicle.thrust.k_f:g} N s^2/rad^2 and vehicle.rotors.radius"
+            f" {rotors.radius:g} m make blade tips of {tip:.3g} m/s for {motor:g} N"
+            " (vehicle.controller.max_thrust); expected more than the air through the rotor,"
+            f" {wake:.3g} m/s, and less than sound, {SOUND:g} m/s"
         )
 
 
 def plant_of(experiment: Experiment) -> PlantParams:
     """The plant of an experiment."""
-    return PlantParams(experiment.vehicle, experiment.rope, experiment.release, experiment.sim, experiment.air, experiment.laws)
+    return PlantParams(
+        experiment.vehicle,
+        experiment.rope,
+        experiment.release,
+        experiment.sim,
+        experiment.air,
+        experiment.laws,
+    )
 
 
 def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any]:
     """What whoever flies a policy must share with its training; see :mod:`visthrow.onboard.policy`.
 
-    The camera enters for vision policies only. Noise and randomisation are training matters and stay out. An entry whose
-    field has a default enters where it differs from that: a policy from before the field was there fits what it is off in.
-    ``whole``: every entry that a contract may have, whatever the policy sees and flies.
-    """
+    The camera enters for vision policies only. Noise and randomisation are training matters and
+    stay out. An entry whose field has a default enters where it differs from that: a policy from
+    before the field was there fits what it is off in. ``whole``: every entry that a contract may
+    have, whatever the policy sees and flies."""
     from visthrow import config
     from visthrow.onboard.observations import layout_of
     from visthrow.onboard.pilot import camera_conditions
 
     layout = layout_of(experiment.task.observation)
     contract = {
-        "observation": {**config.to_dict(experiment.task.observation, defaults=whole), "dimension": layout.dimension},
+        "observation": {
+            **config.to_dict(experiment.task.observation, defaults=whole),
+            "dimension": layout.dimension,
+        },
         "action": {**config.to_dict(experiment.task.action, defaults=whole), "dimension": 5},
         "control_period": experiment.sim.control_period,
         "release": {"lag": experiment.release.lag, "threshold": experiment.release.threshold},
@@ -372,18 +484,28 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     }
     if whole or experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
-    if experiment.fleet is not None and not whole:  # for any vehicle: conditions of one are not the policy's
-        contract["fleet"] = {"rope_length": experiment.fleet.rope_length, "total_mass": experiment.fleet.total_mass}
+    if (
+        experiment.fleet is not None and not whole
+    ):  # for any vehicle: conditions of one are not the policy's
+        contract["fleet"] = {
+            "rope_length": experiment.fleet.rope_length,
+            "total_mass": experiment.fleet.total_mass,
+        }
         contract["action"] = {"max_rate": list(experiment.task.action.max_rate), "dimension": 5}
-        contract = {key: value for key, value in contract.items() if key not in ("vehicle", "rope", "release")}
+        contract = {
+            key: value
+            for key, value in contract.items()
+            if key not in ("vehicle", "rope", "release")
+        }
     return contract
 
 
 def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
-    """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or nothing is uncertain.
+    """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or
+    nothing is uncertain.
 
-    A draw that an effect's physical bounds forbid is put on the bound. ConfigError for a covariance that is none.
-    """
+    A draw that an effect's physical bounds forbid is put on the bound. ConfigError for a covariance
+    that is none."""
     diagnosed, plant = experiment.diagnosed, plant_of(experiment)
     if diagnosed.plants == 1 or not diagnosed.effects:
         return [plant]
@@ -396,12 +518,18 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     covariance = np.array(diagnosed.covariance)
     values, vectors = np.linalg.eigh(covariance)
     if not np.allclose(covariance, covariance.T) or values.min() < -1e-9 * values.max():
-        raise ConfigError("diagnosed.covariance is no covariance: it is not symmetric, or has a negative eigenvalue")
+        raise ConfigError(
+            "diagnosed.covariance is no covariance: it is not symmetric, or has a negative"
+            " eigenvalue"
+        )
     normal = np.random.default_rng(seed).standard_normal((diagnosed.plants, len(diagnosed.effects)))
     base = generalised(Setting(plant, experiment.sensing))
     effects = {name: effect.bounded(base) for name, effect in chosen(diagnosed.effects).items()}
     plants = []
     for draw in normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T:
-        theta = {name: float(np.clip(x, *effects[name].bounds)) for name, x in zip(diagnosed.effects, draw)}
+        theta = {
+            name: float(np.clip(x, *effects[name].bounds))
+            for name, x in zip(diagnosed.effects, draw)
+        }
         plants.append(specialised(apply(effects, base, theta).plant, plant))
     return plants

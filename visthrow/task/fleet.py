@@ -1,16 +1,18 @@
 """Experiments with a fleet: one policy for any vehicle of a class.
 
-The task of such an experiment is stated for a rope of ``fleet.rope_length`` and a total mass of ``fleet.total_mass``. Every vehicle is
-flown in units in which its own have these numbers (:mod:`sim.units`): the same task for all, targets, fence and rewards too,
-and control steps that are as long as the square root of the rope. What stays different is what makes vehicles different.
+The task of such an experiment is stated for a rope of ``fleet.rope_length`` and a total mass of
+``fleet.total_mass``. Every vehicle is flown in units in which its own have these numbers
+(:mod:`sim.units`): the same task for all, targets, fence and rewards too, and control steps that
+are as long as the square root of the rope. What stays different is what makes vehicles different.
 
-A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the lens is twice as far from its middle, and
-the square on the ground twice as wide. The ball has its own size.
+A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the
+lens is twice as far from its middle, and the square on the ground twice as wide. The ball has its
+own size.
 
-The actor is given a vehicle's set-up, ``told``: the throttle that holds it in hover, the share of what hangs in the total mass, the lag
-of the release, and the unit of time [s], by which links and sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody
-knows on board: an upper bound, and what the critic is given.
-"""
+The actor is given a vehicle's set-up, ``told``: the throttle that holds it in hover, the share of
+what hangs in the total mass, the lag of the release, and the unit of time [s], by which links and
+sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody knows on board: an upper
+bound, and what the critic is given."""
 
 import math
 from dataclasses import dataclass, replace
@@ -31,29 +33,54 @@ TASK: dict[str, dict[Dimension, str]] = PLANT | {
     "TaskParams": {},
     "ActionParams": {FORCE: "max_thrust", RATE: "max_rate"},
     "ObservationParams": {
-        NONE: "layout history validity goal_velocity located response setup", TIME: "latency latency_jitter",
+        NONE: "layout history validity goal_velocity located response setup",
+        TIME: "latency latency_jitter",
     },
     # One number stands for lengths, speeds and rates alike: it is taken for a length's.
     "NoiseParams": {LENGTH: "observation_step observation_bias", NONE: "command_step command_bias"},
     "RandomizationParams": {
-        LENGTH: "spawn_height position goal_radius", (1, 0, -1): "velocity", RATE: "rate_deg cable_rate_deg",
-        NONE: "attitude_deg mass cable_angle_deg tether_variants tether_spread battery_used payload_variants payload_spread drag_spread",
+        LENGTH: "spawn_height position goal_radius",
+        (1, 0, -1): "velocity",
+        RATE: "rate_deg cable_rate_deg",
+        NONE: (
+            "attitude_deg mass cable_angle_deg tether_variants tether_spread battery_used"
+            " payload_variants payload_spread drag_spread"
+        ),
     },
     "BoundsParams": {LENGTH: "altitude horizontal", NONE: "tilt_deg", TIME: "time_limit"},
     "RewardParams": {
-        NONE: "scale smoothness rate_command command_change l1_mix landing termination", (-2, 0, 2): "velocity relative_velocity",
-        (0, 0, 2): "angular_velocity", RATE: "carry_time time_of_flight", (-1, 0, 0): "landing_decay proximity",
+        NONE: "scale smoothness rate_command command_change l1_mix landing termination",
+        (-2, 0, 2): "velocity relative_velocity",
+        (0, 0, 2): "angular_velocity",
+        RATE: "carry_time time_of_flight",
+        (-1, 0, 0): "landing_decay proximity",
     },
     "TargetParams": {(1, 0, -1): "speed"},
-}  # fmt: skip
+}
 """Dimensions of a task's fields."""
 
 HIDDEN = (
-    "motor.time_constant", "queue.delay", "body.inertia.0", "body.inertia.2", "rotors.x.0", "rotors.radius", "rotors.inertia",
-    "thrust.torque_ratio", "controller.p_gain.0", "controller.i_gain.0", "controller.d_gain.0", "controller.feedforward_gain.0",
-    "controller.setpoint_time_constant", "controller.gyro_time_constant", "controller.voltage_compensation", "battery.resistance",
-    "aero.drag_x", "rope_mass", "payload_offset", "mount.2",
-)  # fmt: skip
+    "motor.time_constant",
+    "queue.delay",
+    "body.inertia.0",
+    "body.inertia.2",
+    "rotors.x.0",
+    "rotors.radius",
+    "rotors.inertia",
+    "thrust.torque_ratio",
+    "controller.p_gain.0",
+    "controller.i_gain.0",
+    "controller.d_gain.0",
+    "controller.feedforward_gain.0",
+    "controller.setpoint_time_constant",
+    "controller.gyro_time_constant",
+    "controller.voltage_compensation",
+    "battery.resistance",
+    "aero.drag_x",
+    "rope_mass",
+    "payload_offset",
+    "mount.2",
+)
 """Numbers of vehicle and rope that the actor is not told."""
 
 
@@ -76,9 +103,16 @@ class Member:
 
     @property
     def told(self) -> list[float]:
-        """Set-up that is known of it: throttle in hover, share of what hangs, lag, unit of time [s]."""
+        """Set-up that is known of it: throttle in hover, share of what hangs, lag, unit of time
+        [s].
+        """
         plant = self.plant
-        return [self.first_action[0], plant.rope.hanging_mass / plant.total_mass, plant.release.lag, self.units.time]
+        return [
+            self.first_action[0],
+            plant.rope.hanging_mass / plant.total_mass,
+            plant.release.lag,
+            self.units.time,
+        ]
 
     @property
     def exact(self) -> list[float]:
@@ -86,7 +120,11 @@ class Member:
         return [*self.told, *(math.log(abs(self._number(path))) for path in HIDDEN)]
 
     def _number(self, path: str) -> float:
-        value = self.plant.vehicle if hasattr(self.plant.vehicle, path.split(".")[0]) else self.plant.rope
+        value = (
+            self.plant.vehicle
+            if hasattr(self.plant.vehicle, path.split(".")[0])
+            else self.plant.rope
+        )
         for part in path.split("."):
             value = value[int(part)] if part.isdigit() else getattr(value, part)  # type: ignore[index]
         return float(value)  # type: ignore[arg-type]
@@ -99,8 +137,8 @@ class Member:
 def members(experiment: Experiment) -> list[Member]:
     """Vehicles that the experiment's fleet flies; none without a fleet.
 
-    The height of landing and the margin of the clearance belong to the task: they are in its units already.
-    """
+    The height of landing and the margin of the clearance belong to the task: they are in its units
+    already."""
     fleet = experiment.fleet
     if fleet is None:
         return []
@@ -110,14 +148,21 @@ def members(experiment: Experiment) -> list[Member]:
     def member(plant: PlantParams) -> Member:
         units = fleet.units_of(plant)
         stated = in_units(plant, units)
-        task = {name: getattr(experiment.release, name) for name in ("landing_height", "clearance_margin")}
-        return Member(replace(stated, release=replace(stated.release, **task), sim=experiment.sim), units)
+        task = {
+            name: getattr(experiment.release, name)
+            for name in ("landing_height", "clearance_margin")
+        }
+        return Member(
+            replace(stated, release=replace(stated.release, **task), sim=experiment.sim), units
+        )
 
     return [member(plant) for plant in drawn]
 
 
 def alone(experiment: Experiment, number: int = 0) -> Experiment:
-    """The experiment of one vehicle of the fleet, stated in SI units, vehicle and task alike; no fleet any more."""
+    """The experiment of one vehicle of the fleet, stated in SI units, vehicle and task alike; no
+    fleet any more.
+    """
     chosen = members(experiment)[number]
     back = chosen.units.inverse
     plant, task = in_units(chosen.plant, back), in_units(experiment.task, back, TASK)
@@ -125,34 +170,63 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     task = replace(task, action=action, observation=replace(task.observation, setup="none"))
     size, camera = chosen.units.length, experiment.camera
     mount = replace(camera.mount, position_b=tuple(size * x for x in camera.mount.position_b))
-    camera = replace(camera, mount=mount, payload_radius=plant.rope.payload_radius, goal_side=size * camera.goal_side)
+    camera = replace(
+        camera,
+        mount=mount,
+        payload_radius=plant.rope.payload_radius,
+        goal_side=size * camera.goal_side,
+    )
     parts = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
-    sensors = {name: getattr(experiment.task.observation, name) for name in ("latency", "latency_jitter")}  # do not know of ropes
+    sensors = {
+        name: getattr(experiment.task.observation, name) for name in ("latency", "latency_jitter")
+    }  # do not know of ropes
     task = replace(task, observation=replace(task.observation, **sensors))
     return replace(experiment, **parts, task=task, camera=camera, fleet=None, flown=())
 
 
-def specialised(policy: Policy, experiment: Experiment, number: int = 0) -> tuple[Policy, Experiment]:
-    """Policy for one vehicle of the fleet that the policy was trained for: an ordinary one, in SI units, and its experiment.
+def specialised(
+    policy: Policy, experiment: Experiment, number: int = 0
+) -> tuple[Policy, Experiment]:
+    """Policy for one vehicle of the fleet that the policy was trained for: an ordinary one, in SI
+    units, and its experiment.
 
-    Units go into the normaliser, the vehicle's set-up into the first layer's bias: nothing on board knows that it was for many. Raises
-    PolicyError: the policy is none for many vehicles, or is told what only a simulator knows of one.
-    """
+    Units go into the normaliser, the vehicle's set-up into the first layer's bias: nothing on board
+    knows that it was for many. Raises PolicyError: the policy is none for many vehicles, or is told
+    what only a simulator knows of one."""
     observation = policy.contract.get("observation", {})
-    if "fleet" not in policy.contract or observation.get("setup") == "exact" or policy.mean is None or policy.std is None:
-        raise PolicyError("policy with a contract of one vehicle; expected one that was trained for a fleet, with setup told")
+    if (
+        "fleet" not in policy.contract
+        or observation.get("setup") == "exact"
+        or policy.mean is None
+        or policy.std is None
+    ):
+        raise PolicyError(
+            "policy with a contract of one vehicle; expected one that was trained for a fleet, with"
+            " setup told"
+        )
     one, chosen = alone(experiment, number), members(experiment)[number]
     layout = ob.layout_of(experiment.task.observation)
     sizes, known = _sizes(layout, chosen.units), layout.dimension - layout.setup
-    spread, told = policy.std + policy.eps, torch.tensor(chosen.setup(experiment.task.observation.setup))
+    spread, told = (
+        policy.std + policy.eps,
+        torch.tensor(chosen.setup(experiment.task.observation.setup)),
+    )
     first = policy.weights[0]
     bias = policy.biases[0] + first[:, known:] @ ((told - policy.mean[known:]) / spread[known:])
     contract = contract_of(one)
     made_by = {**policy.made_by, "config": config.to_dict(one, defaults=False)}
-    return Policy(
-        (first[:, :known], *policy.weights[1:]), (bias, *policy.biases[1:]), policy.activation, contract, made_by,
-        policy.mean[:known] * sizes, spread[:known] * sizes,
-    ), one  # fmt: skip
+    return (
+        Policy(
+            (first[:, :known], *policy.weights[1:]),
+            (bias, *policy.biases[1:]),
+            policy.activation,
+            contract,
+            made_by,
+            policy.mean[:known] * sizes,
+            spread[:known] * sizes,
+        ),
+        one,
+    )
 
 
 def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
@@ -163,4 +237,12 @@ def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
     offsets = [thing] * (layout.goal + layout.payload * (1 + layout.history))
     places = ([length] * 2 + [1.0] * 4)[: layout.located]
     motion, step = [speed] * layout.motion, [speed] * 3 + [rate] * 3 + [1.0] * 4
-    return torch.tensor(vehicle + [1.0] * 5 + offsets + [1.0] * (1 + layout.validity) + places + motion + step * layout.response)
+    return torch.tensor(
+        vehicle
+        + [1.0] * 5
+        + offsets
+        + [1.0] * (1 + layout.validity)
+        + places
+        + motion
+        + step * layout.response
+    )

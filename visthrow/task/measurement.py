@@ -1,9 +1,9 @@
-"""The paper's measurement: throws from hover at targets ahead, scored by where and when the payload lands.
+"""The paper's measurement: throws from hover at targets ahead, scored by where and when the payload
+lands.
 
-Landing error is the horizontal distance of the landing point from the goal, duration the time from the policy's start to
-the landing (Sec. IV-A). A throw succeeds when the payload was released and landed; one that ends otherwise has no
-landing error and counts against the success rate.
-"""
+Landing error is the horizontal distance of the landing point from the goal, duration the time from
+the policy's start to the landing (Sec. IV-A). A throw succeeds when the payload was released and
+landed; one that ends otherwise has no landing error and counts against the success rate."""
 
 from dataclasses import dataclass
 
@@ -32,12 +32,18 @@ class Throws:
     error: np.ndarray  # [m], shape (N,)
     duration: np.ndarray  # [s], shape (N,)
     clearance: np.ndarray  # [m], shape (N,)
-    smoothness: np.ndarray  # root mean square change of the normalised commands from step to step, shape (N,)
-    goal_w: np.ndarray | None = None  # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
+    smoothness: (
+        np.ndarray
+    )  # root mean square change of the normalised commands from step to step, shape (N,)
+    goal_w: np.ndarray | None = (
+        None  # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
+    )
 
     def within(self, error: float) -> bool:
         """Whether they land so near on average [m], and all but one in twenty land."""
-        return bool(self.success.mean() >= LANDED) and float(self.error[self.success].mean()) <= error
+        return (
+            bool(self.success.mean() >= LANDED) and float(self.error[self.success].mean()) <= error
+        )
 
     def summary(self) -> dict[str, float]:
         """Mean and deviation of the successful throws, with the success rate."""
@@ -45,11 +51,21 @@ class Throws:
             return {"target": self.target, "throws": len(self.success), "success": 0.0}
         good = self.success
         goal = np.array([[self.target, 0.0]]) if self.goal_w is None else self.goal_w[good]
-        bias, error, duration = (self.landing_w[good] - goal).mean(axis=0), self.error[good], self.duration[good]
+        bias, error, duration = (
+            (self.landing_w[good] - goal).mean(axis=0),
+            self.error[good],
+            self.duration[good],
+        )
         return {
-            "target": self.target, "throws": len(good), "success": float(good.mean()),
-            "error_mean": float(error.mean()), "error_std": float(error.std()),
-            "duration_mean": float(duration.mean()), "duration_std": float(duration.std()),
-            "bias_x": float(bias[0]), "bias_y": float(bias[1]),
-            "clearance_min": float(self.clearance[good].min()), "smoothness": float(self.smoothness[good].mean()),
-        }  # fmt: skip
+            "target": self.target,
+            "throws": len(good),
+            "success": float(good.mean()),
+            "error_mean": float(error.mean()),
+            "error_std": float(error.std()),
+            "duration_mean": float(duration.mean()),
+            "duration_std": float(duration.std()),
+            "bias_x": float(bias[0]),
+            "bias_y": float(bias[1]),
+            "clearance_min": float(self.clearance[good].min()),
+            "smoothness": float(self.smoothness[good].mean()),
+        }

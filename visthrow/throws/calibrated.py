@@ -1,8 +1,9 @@
-"""Throws in the training simulator that begin as a runner's do with a camera of its own: a hover, a sway, a calibration.
+"""Throws in the training simulator that begin as a runner's do with a camera of its own: a hover, a
+sway, a calibration.
 
-What the simulator draws of each vehicle and its camera stays the same in the hover and in the throw. The calibration is given what the
-actor measures, with its noise, and where the goal is, as a motion-capture hall has it.
-"""
+What the simulator draws of each vehicle and its camera stays the same in the hover and in the
+throw. The calibration is given what the actor measures, with its noise, and where the goal is, as a
+motion-capture hall has it."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,17 +25,25 @@ from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
 
 SETTLE = 3.0  # after the sway, until the swing that it leaves has died down [s]
-FEW = 8  # calibrations of half a second each: here they are done before other processes have started
+FEW = (
+    8  # calibrations of half a second each: here they are done before other processes have started
+)
 
 
-def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | None = None) -> Callable[[ThrowEnv], TensorDict]:
-    """What :func:`visthrow.training.protocol.throw` begins with; ConfigError for another layout than vision, or goals that move.
+def calibrated_start(
+    experiment: Experiment, kept: list[Calibration | None] | None = None
+) -> Callable[[ThrowEnv], TensorDict]:
+    """What :func:`visthrow.training.protocol.throw` begins with; ConfigError for another layout
+    than vision, or goals that move.
 
-    ``kept`` takes the calibration of each throw; None where there was none, and keypoints stay as they came.
-    """
+    ``kept`` takes the calibration of each throw; None where there was none, and keypoints stay as
+    they came."""
     seen = experiment.task.observation
     if seen.layout != "vision" or experiment.task.target.moves:
-        raise ConfigError(f"calibration in the hover: layout {seen.layout!r}; expected 'vision' and goals that stand still")
+        raise ConfigError(
+            f"calibration in the hover: layout {seen.layout!r}; expected 'vision' and goals that"
+            " stand still"
+        )
 
     def begin(env: ThrowEnv) -> TensorDict:
         found = _calibrations(experiment, _hovered(env))
@@ -42,7 +51,9 @@ def calibrated_start(experiment: Experiment, kept: list[Calibration | None] | No
             kept[:] = found
         turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in found]
         scale = [c.scale if c else 0.0 for c in found]
-        return env.begin_throws((torch.tensor(turn, device=env.device), torch.tensor(scale, device=env.device)))
+        return env.begin_throws(
+            (torch.tensor(turn, device=env.device), torch.tensor(scale, device=env.device))
+        )
 
     return begin
 
@@ -63,20 +74,33 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
         if 0.0 <= since < SWAY:
             command[:, 1:3] += sway(since)
         if k < steps:
-            rows.append((np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:]))
-        action = act.action_from_command(torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate)
+            rows.append(
+                (np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:])
+            )
+        action = act.action_from_command(
+            torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate
+        )
         env.episode_length_buf.zero_()  # a hover has no time limit
         env.carry(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device))
-    time, pos, quat, vel, rates, thrust, points, valid = (np.stack(column, 1) for column in zip(*rows))
+    time, pos, quat, vel, rates, thrust, points, valid = (
+        np.stack(column, 1) for column in zip(*rows)
+    )
     goal = env.views.goal_w.cpu().numpy()
-    return [Hovered(time[i], pos[i], quat[i], vel[i], rates[i], thrust[i], points[i], valid[i], goal[i]) for i in range(env.num_envs)]
+    return [
+        Hovered(time[i], pos[i], quat[i], vel[i], rates[i], thrust[i], points[i], valid[i], goal[i])
+        for i in range(env.num_envs)
+    ]
 
 
 def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
-    """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of this step."""
+    """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of
+    this step.
+    """
     frame, valid = (part.cpu() for part in env.measured)
     vehicle = frame[:, : ob.VEHICLE].double().numpy()
-    quat = Rotation.from_matrix(ob.rotation_in(frame.double()).numpy()).as_quat()  # the nearest rotation
+    quat = Rotation.from_matrix(
+        ob.rotation_in(frame.double()).numpy()
+    ).as_quat()  # the nearest rotation
     points = frame[:, ob.VEHICLE :].unflatten(1, (KEYPOINTS, 2)).double().numpy()
     return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid.numpy()
 
@@ -85,4 +109,6 @@ def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibr
     """The calibration of each hover; None where it shows too little."""
     solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
     found = dict(done(solve, hovered, cores() if len(hovered) > FEW else 1, "calibrations"))
-    return [None if isinstance(found[place], str) else found[place] for place in range(len(hovered))]
+    return [
+        None if isinstance(found[place], str) else found[place] for place in range(len(hovered))
+    ]

@@ -1,8 +1,8 @@
 """The flight loop: the vehicles of a plant hover, throw and recover, a batch of them or one.
 
-A flight is a sequence of phases. In a hover the hover controller flies all vehicles. In a throw the pilots fly what carries its
-payload, and the hover controller, which runs along, what has let go or failed. A recorder sees each period, whatever it keeps of it.
-"""
+A flight is a sequence of phases. In a hover the hover controller flies all vehicles. In a throw the
+pilots fly what carries its payload, and the hover controller, which runs along, what has let go or
+failed. A recorder sees each period, whatever it keeps of it."""
 
 import math
 from abc import ABC, abstractmethod
@@ -38,14 +38,22 @@ class Decision:
 
     command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
     release: np.ndarray  # whether the latch is to trip, shape (E,), bool
-    action: np.ndarray | None = None  # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
+    action: np.ndarray | None = (
+        None  # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
+    )
     observation: np.ndarray | None = None  # of a policy, shape (E, D)
 
 
 class Pilots(ABC):
     """Who throws with E vehicles; the children decide."""
 
-    def __init__(self, experiment: Experiment, goal_w: np.ndarray, first_action: np.ndarray, goal_vel_w: np.ndarray | None = None):
+    def __init__(
+        self,
+        experiment: Experiment,
+        goal_w: np.ndarray,
+        first_action: np.ndarray,
+        goal_vel_w: np.ndarray | None = None,
+    ):
         """Begin before the throw, within the experiment's bounds.
 
         Args:
@@ -58,46 +66,79 @@ class Pilots(ABC):
 
     @abstractmethod
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
-        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the hover controller's commands."""
+        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the
+        hover controller's commands.
+        """
 
     def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
-        """Vehicles that are not to throw if the hover ended here, and why; called each period of the hover before the throw."""
+        """Vehicles that are not to throw if the hover ended here, and why; called each period of
+        the hover before the throw.
+        """
         return {}
 
 
 class Policies(Pilots):
-    """Learnt policies that share a batch, each with the same number of vehicles, the first policy's first."""
+    """Learnt policies that share a batch, each with the same number of vehicles, the first policy's
+    first.
+    """
 
     def __init__(
-        self, loaded: Sequence[Loaded], goal_w: np.ndarray, goal_vel_w: np.ndarray | None = None, draws: bool = False,
+        self,
+        loaded: Sequence[Loaded],
+        goal_w: np.ndarray,
+        goal_vel_w: np.ndarray | None = None,
+        draws: bool = False,
         eyes: "Eyes | None" = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Begin with policies that were trained for one plant; goals as of `Pilots`.
 
-        ``draws``: state policies too have a camera, to be drawn. ``eyes``: whose rendered pictures keypoints come from; None: they
-        are what measured poses project to.
-        """
+        ``draws``: state policies too have a camera, to be drawn. ``eyes``: whose rendered pictures
+        keypoints come from; None: they are what measured poses project to."""
         self.eyes, self._waited, self._lost = eyes, 0, {}
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
-        looks = [draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded]
-        self.pilots = [Pilot(item.policy, item.experiment.camera if look else None, share) for item, look in zip(loaded, looks)]
-        super().__init__(loaded[0].experiment, goal_w, np.vstack([pilot.previous_action for pilot in self.pilots]), goal_vel_w)
+        looks = [
+            draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded
+        ]
+        self.pilots = [
+            Pilot(item.policy, item.experiment.camera if look else None, share)
+            for item, look in zip(loaded, looks)
+        ]
+        super().__init__(
+            loaded[0].experiment,
+            goal_w,
+            np.vstack([pilot.previous_action for pilot in self.pilots]),
+            goal_vel_w,
+        )
 
     def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
         self._waited += 1
         if self.eyes is not None and self._waited % LOOK_EVERY == 0:
             self.eyes.look(flight.plant.exposed, seen, self.goal_w, seen.attached)
-            self._lost = {e: f"refused: the {name} is not seen in the hover" for e, name in self.eyes.lost().items()}
+            self._lost = {
+                e: f"refused: the {name} is not seen in the hover"
+                for e, name in self.eyes.lost().items()
+            }
         return self._lost
 
     def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
         outs, goal_w, looked = [], flight.goal_at(seen.time), None
         if self.eyes is not None:  # nobody looks any more once all have let go
-            looked = self.eyes.look(flight.plant.exposed, seen, goal_w, seen.attached) if np.any(flight.flown) else self.eyes.seen
+            looked = (
+                self.eyes.look(flight.plant.exposed, seen, goal_w, seen.attached)
+                if np.any(flight.flown)
+                else self.eyes.seen
+            )
         for pilot, part in zip(self.pilots, self.slices):
             keypoints = None if looked is None else (looked[0][part], looked[1][part])
-            outs.append(pilot.act(*(getattr(seen, name)[part] for name in VIEWS), goal_w[part], seen.attached[part], keypoints))
+            outs.append(
+                pilot.act(
+                    *(getattr(seen, name)[part] for name in VIEWS),
+                    goal_w[part],
+                    seen.attached[part],
+                    keypoints,
+                )
+            )
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
         return Decision(*(np.concatenate([getattr(out, name) for out in outs]) for name in names))
 
@@ -116,15 +157,23 @@ class Recorder:
 class Phase:
     """Part of a flight."""
 
-    throws: bool  # whether the pilots fly, or the hover controller, which begins with empty integrals
+    throws: (
+        bool  # whether the pilots fly, or the hover controller, which begins with empty integrals
+    )
     over: Callable[["Flight"], bool]  # asked after each period
 
 
 def throw(seconds: float | None = None) -> Phase:
-    """Throw until every payload has landed or its throw has failed, at most for a time [s]; default what the bounds allow."""
+    """Throw until every payload has landed or its throw has failed, at most for a time [s]; default
+    what the bounds allow.
+    """
 
     def over(flight: "Flight") -> bool:
-        most = flight.pilots.experiment.task.bounds.time_limit + FALL_TIME if seconds is None else seconds
+        most = (
+            flight.pilots.experiment.task.bounds.time_limit + FALL_TIME
+            if seconds is None
+            else seconds
+        )
         return not np.any(flight.open) or flight.lasted(most)
 
     return Phase(True, over)
@@ -141,22 +190,33 @@ class Flight:
     Attributes:
         elapsed: since the phase began [s].
         begin: when the first throw began, on the plant's clock [s]; NaN before it.
-        open: whose throw is neither over nor failed, shape (E,). flown: whom the pilots fly in this period, shape (E,).
+        open: whose throw is neither over nor failed, shape (E,). flown: whom the pilots fly in this
+            period, shape (E,).
         failed: shape (E,), bool. failures: why, a message or None for each.
         commands: that were sent, each of shape (E, 4).
     """
 
-    def __init__(self, plant: Plant, pilots: Pilots, recorder: Recorder | None = None, home_w: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        pilots: Pilots,
+        recorder: Recorder | None = None,
+        home_w: np.ndarray | None = None,
+    ) -> None:
         """Take over a plant at its start; each period is told to the recorder.
 
-        ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the vehicles are.
-        """
+        ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the
+        vehicles are."""
         count = plant.count
         self.plant, self.pilots, self.recorder = plant, pilots, recorder or Recorder()
         self._now: Snapshot | None = None
         self.home_w = self.now.pos_w if home_w is None else home_w
         self.begin = math.nan
-        self.open, self.flown, self.failed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+        self.open, self.flown, self.failed = (
+            np.ones(count, bool),
+            np.zeros(count, bool),
+            np.zeros(count, bool),
+        )
         self.failures: list[str | None] = [None] * count
         self.commands: list[np.ndarray] = []
         self._refused: dict[int, str] = {}  # by the pilots, in the hover
@@ -166,7 +226,9 @@ class Flight:
 
     @property
     def now(self) -> Snapshot:
-        """State of the plant, which is asked for it once a period, and only if somebody wants it."""
+        """State of the plant, which is asked for it once a period, and only if somebody
+        wants it.
+        """
         self._now = self._now or self.plant.state
         return self._now
 
@@ -241,13 +303,17 @@ class Flight:
         self.open &= ~(self.failed | landing.landed)
 
     def _causes(self, now: Snapshot) -> dict[str, np.ndarray]:
-        """Which throws have ended early, by cause, the first that holds first: the ends of an episode of training."""
+        """Which throws have ended early, by cause, the first that holds first: the ends of an
+        episode of training.
+        """
         experiment, pos_w, payload_w = self.pilots.experiment, now.pos_w, now.payload_pos_w
         bounds, rope = experiment.task.bounds, experiment.rope
         touching = rope.payload_radius + experiment.vehicle.collision_radius
         upright = 1.0 - 2.0 * (now.quat_wb[:, 0] ** 2 + now.quat_wb[:, 1] ** 2)
         height = experiment.release.landing_height
-        carrying = terminations.while_carrying(bounds, pos_w, upright, payload_w, self.plant.time - self.begin, height)
+        carrying = terminations.while_carrying(
+            bounds, pos_w, upright, payload_w, self.plant.time - self.begin, height
+        )
         return {
             "the simulation failed": ~(np.isfinite(pos_w) & np.isfinite(payload_w)).all(1),
             **terminations.out_of_bounds(bounds, pos_w),
@@ -279,13 +345,17 @@ class Scores(Recorder):
     """Measures what :class:`visthrow.task.measurement.Throws` holds.
 
     Attributes:
-        clearance: least distance of the payload from the vehicle in flight [m], shape (E,); infinite before.
+        clearance: least distance of the payload from the vehicle in flight [m], shape (E,);
+            infinite before.
         smoothness: of the pilots' commands.
     """
 
     def __init__(self, pilots: Pilots) -> None:
         """Begin before the throw."""
-        self.clearance, self.smoothness = np.full(len(pilots.goal_w), np.inf), Smoothness(pilots.first_action)
+        self.clearance, self.smoothness = (
+            np.full(len(pilots.goal_w), np.inf),
+            Smoothness(pilots.first_action),
+        )
 
     def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
         if sent.action is None:
@@ -305,7 +375,10 @@ class Scores(Recorder):
         goal = flight.goal_at(landing.time)[:, :2]
         moving = {"goal_w": goal * blank[:, None]} if np.any(flight.pilots.goal_vel_w) else {}
         return {
-            "success": success, "landing_w": point, "error": np.linalg.norm(point - goal, axis=1),
-            "duration": (landing.time - flight.begin) * blank, "clearance": np.where(success, self.clearance, np.nan),
+            "success": success,
+            "landing_w": point,
+            "error": np.linalg.norm(point - goal, axis=1),
+            "duration": (landing.time - flight.begin) * blank,
+            "clearance": np.where(success, self.clearance, np.nan),
             "smoothness": self.smoothness.value * blank,
-        } | moving  # fmt: skip
+        } | moving

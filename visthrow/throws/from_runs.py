@@ -1,4 +1,6 @@
-"""Throws of HIL runs, from the flight logs in their folders, as the tables of simulated throws want them."""
+"""Throws of HIL runs, from the flight logs in their folders, as the tables of simulated throws want
+them.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,8 +16,8 @@ from visthrow.throws.results import Entry
 PATTERN = "throw-*.npz"
 
 NOTE = (
-    "The paper's figures are ten throws a target of its vehicle. Whether a vehicle or a fake autopilot was at the other end of "
-    "these runs their folders do not say."
+    "The paper's figures are ten throws a target of its vehicle. Whether a vehicle or a fake"
+    " autopilot was at the other end of these runs their folders do not say."
 )
 
 
@@ -25,34 +27,44 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
     for folder in map(Path, folders):
         found = sorted(folder.glob(PATTERN))
         if not found:
-            here = ", ".join(sorted(path.name for path in folder.iterdir())) if folder.is_dir() else "no such folder"
+            here = (
+                ", ".join(sorted(path.name for path in folder.iterdir()))
+                if folder.is_dir()
+                else "no such folder"
+            )
             raise LogError(
-                f"{folder}: no {PATTERN} in it ({here or 'empty'}); expected the folder of a run with throws. Of a run that was "
-                f"killed they are made by: visthrow hil view {folder}"
+                f"{folder}: no {PATTERN} in it ({here or 'empty'}); expected the folder of a run"
+                " with throws. Of a run that was killed they are made by: visthrow hil view"
+                f" {folder}"
             )
         logs += map(FlightLog.load, found)
     return logs
 
 
 def entries(logs: list[FlightLog]) -> list[Entry]:
-    """An entry a policy, its throws by the distance of their goals; policies of one name and other content are told apart."""
+    """An entry a policy, its throws by the distance of their goals; policies of one name and other
+    content are told apart.
+    """
     groups: dict[tuple[str, str, str], dict[float, list[FlightLog]]] = {}
     for log in logs:
         try:
             key = (log.meta["policy"], log.meta["policy_sha256"] or "", log.meta["layout"])
             distance = round(float(np.linalg.norm(_offset(log))), 2)
         except (KeyError, TypeError) as error:
-            raise LogError(f"a log holds no throw of a run: {error!r}; it knows {', '.join(log.meta)}") from error
+            raise LogError(
+                f"a log holds no throw of a run: {error!r}; it knows {', '.join(log.meta)}"
+            ) from error
         groups.setdefault(key, {}).setdefault(distance, []).append(log)
     targets = sorted({distance for by_distance in groups.values() for distance in by_distance})
     names = [name for name, _, _ in groups]
     return [
         Entry(
-            name if names.count(name) == 1 else f"{name} {sha[:8]}", layout,
+            name if names.count(name) == 1 else f"{name} {sha[:8]}",
+            layout,
             [_throws(target, by_distance.get(target, [])) for target in targets],
         )
         for (name, sha, layout), by_distance in sorted(groups.items())
-    ]  # fmt: skip
+    ]
 
 
 def _offset(log: FlightLog) -> np.ndarray:
@@ -61,14 +73,26 @@ def _offset(log: FlightLog) -> np.ndarray:
 
 
 def _throws(target: float, logs: list[FlightLog]) -> Throws:
-    """Throws at one distance; landing points along the throw and across it, from where the vehicle hovered."""
+    """Throws at one distance; landing points along the throw and across it, from where the vehicle
+    hovered.
+    """
     columns = np.array([_row(log) for log in logs], dtype=float).reshape(-1, 5)
     error, duration, smooth = columns.T[2:]
-    return Throws(target, np.isfinite(error), columns[:, :2], error, duration, np.full(len(logs), np.nan), smooth)
+    return Throws(
+        target,
+        np.isfinite(error),
+        columns[:, :2],
+        error,
+        duration,
+        np.full(len(logs), np.nan),
+        smooth,
+    )
 
 
 def _row(log: FlightLog) -> tuple[float, ...]:
-    """Landing along and across, error, duration, smoothness; NaN for a throw that counts as failed."""
+    """Landing along and across, error, duration, smoothness; NaN for a throw that
+    counts as failed.
+    """
     result = log.meta["result"]
     if not result["success"]:
         return (np.nan,) * 5
@@ -77,11 +101,19 @@ def _row(log: FlightLog) -> tuple[float, ...]:
     ahead = offset / distance if distance > 0.0 else np.array([1.0, 0.0])
     landed = np.array(result["landing_w"][:2]) - np.array(log.meta["home_w"][:2])
     across = ahead[0] * landed[1] - ahead[1] * landed[0]
-    return float(landed @ ahead), float(across), result["error"], result["duration"], smoothness(log)
+    return (
+        float(landed @ ahead),
+        float(across),
+        result["error"],
+        result["duration"],
+        smoothness(log),
+    )
 
 
 def smoothness(log: FlightLog) -> float:
-    """Root mean square change of the normalised commands from step to step of a throw, as `visthrow.training.protocol` has it."""
+    """Root mean square change of the normalised commands from step to step of a throw, as
+    `visthrow.training.protocol` has it.
+    """
     times = log.meta["times"]
     of, seen = log["action"], log["observation"]
     during = (of.time >= times["policy_start"] - 1e-9) & (of.time < times["recovery"] - 1e-9)

@@ -21,26 +21,39 @@ class Loaded:
     name: str
     policy: Policy
     experiment: Experiment
-    departures: dict[str, Any] = field(default_factory=dict)  # where that breaks the contract by allowance: dotted key -> value flown with
+    departures: dict[str, Any] = field(
+        default_factory=dict
+    )  # where that breaks the contract by allowance: dotted key -> value flown with
 
 
-def load_policy(name: str | Path, config_name: str | None = None, overrides: Iterable[str] = (), allow: Collection[str] = ()) -> Loaded:
-    """Load a policy and the experiment that it was trained in, or another one that fits its contract.
+def load_policy(
+    name: str | Path,
+    config_name: str | None = None,
+    overrides: Iterable[str] = (),
+    allow: Collection[str] = (),
+) -> Loaded:
+    """Load a policy and the experiment that it was trained in, or another one that fits its
+    contract.
 
-    Raises PolicyError: no such policy, or it does not carry its config and none was named; MismatchError: the config breaks the policy's
-    contract; the message names every difference; ConfigError: a wrong config or override, or a part that no contract has.
+    Raises PolicyError: no such policy, or it does not carry its config and none was named;
+    MismatchError: the config breaks the policy's contract; the message names every difference;
+    ConfigError: a wrong config or override, or a part that no contract has.
 
     Args:
         name: of a shipped policy, or a file.
-        config_name: a config of ``configs/train`` to fly in instead of the policy's own, as its training says that it is flown.
+        config_name: a config of ``configs/train`` to fly in instead of the policy's own, as its
+            training says that it is flown.
         overrides: ``key=value`` changes of that config.
-        allow: parts of the contract that may be broken, as of :meth:`visthrow.onboard.policy.Policy.require`.
+        allow: parts of the contract that may be broken, as of
+            :meth:`visthrow.onboard.policy.Policy.require`.
     """
     path = find_policy(name)
     policy = Policy.load(path)
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
-        own = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]  # of the program, not of the camera
+        own = (
+            [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
+        )  # of the program, not of the camera
         experiment = config.load(Experiment, config.find("train", config_name), [*own, *overrides])
     else:
         experiment = trained_in(policy, path, overrides)
@@ -50,13 +63,24 @@ def load_policy(name: str | Path, config_name: str | None = None, overrides: Ite
     try:
         within = _within(policy, experiment)
         departures = policy.require(now, allow=(*allow, *within))
-        departures = {key: value for key, value in departures.items() if key.split("[")[0] not in within}
+        departures = {
+            key: value for key, value in departures.items() if key.split("[")[0] not in within
+        }
     except MismatchError as error:
         allowing = " ".join(f"--allow {key}" for key in error.keys)
-        raise MismatchError(f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys) from None
+        raise MismatchError(
+            f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
+        ) from None
     if experiment.fleet is not None:  # one vehicle is flown, that of the config
-        policy, experiment = specialised(policy, replace(experiment, fleet=replace(experiment.fleet, count=0)))
-    return Loaded(path.stem if path.stem != "policy" else path.resolve().parent.name, policy, experiment, departures)
+        policy, experiment = specialised(
+            policy, replace(experiment, fleet=replace(experiment.fleet, count=0))
+        )
+    return Loaded(
+        path.stem if path.stem != "policy" else path.resolve().parent.name,
+        policy,
+        experiment,
+        departures,
+    )
 
 
 def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
@@ -65,7 +89,10 @@ def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
     known = {key[: mark.start()] for key in keys for mark in re.finditer(r"[.\[]|$", key)}
     if part not in known:
         sections = sorted(name for name in known if "." not in name)
-        raise ConfigError(f"allow '{part}': a contract has {', '.join(sections)} and their entries, but not that; {suggest(part, known)}")
+        raise ConfigError(
+            f"allow '{part}': a contract has {', '.join(sections)} and their entries, but not that;"
+            f" {suggest(part, known)}"
+        )
 
 
 def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) -> Experiment:
@@ -75,16 +102,26 @@ def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) 
     """
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
-        raise PolicyError(f"{path} does not carry the config it was trained with; name one with --config")
-    # Learning parameters are today's: they play no part in flight, and an older policy may lack a newer one.
+        raise PolicyError(
+            f"{path} does not carry the config it was trained with; name one with --config"
+        )
+    # Learning parameters are today's: they play no part in flight, and an older policy may lack a
+    # newer one.
     layout = policy.contract.get("observation", {}).get("layout", "state")
     learning = config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)
     text = toml_text.dumps(config.without_none({**trained, "ppo": learning}))
-    return config.loads(Experiment, text, [*trained.get("flown", ()), *overrides], name=f"{path} (the config it was trained with)")
+    return config.loads(
+        Experiment,
+        text,
+        [*trained.get("flown", ()), *overrides],
+        name=f"{path} (the config it was trained with)",
+    )
 
 
 def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
-    """Keys of the contract that differ, but no further than the training went: latencies inside its range."""
+    """Keys of the contract that differ, but no further than the training went: latencies inside its
+    range.
+    """
     seen, trained = experiment.task.observation, policy.contract.get("observation", {})
     low, high = trained.get("latency", (0.0, 0.0))
     jitter = trained.get("latency_jitter", 0.0)

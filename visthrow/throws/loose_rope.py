@@ -1,20 +1,22 @@
-"""The rope after the release, for drawing: it flies with the ball, and sinks to the ground once the ball lies there.
+"""The rope after the release, for drawing: it flies with the ball, and sinks to the ground once the
+ball lies there.
 
-The training simulator's landing is that of a lone ball in closed form, so here the ball is not pulled by the rope's
-4 g: the joints are equal point masses on rigid links, the last link ends in the ball. Positions are kept from the ball,
-in whose free-falling frame gravity vanishes. The reference plant has its own rope in flight; of it only the sinking is
-drawn here.
+The training simulator's landing is that of a lone ball in closed form, so here the ball is not
+pulled by the rope's 4 g: the joints are equal point masses on rigid links, the last link ends in
+the ball. Positions are kept from the ball, in whose free-falling frame gravity vanishes. The
+reference plant has its own rope in flight; of it only the sinking is drawn here.
 
-Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23,
-1977).
-"""
+Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccotti, Berendsen, J.
+Comput. Phys. 23, 1977)."""
 
 import numpy as np
 
 from sim.params import GRAVITY
 
 STEP = 1e-3  # [s]
-ITERATIONS = 4  # Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and converge at once
+# Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and
+# converge at once
+ITERATIONS = 4
 
 SINKING_STEP = 4e-3  # [s]
 SINKING_DAMPING = 6.0  # damping of the rope on the ground [1/s]; a picture's taste, no measurement
@@ -24,17 +26,28 @@ class LooseRope:
     """One rope that hangs on nothing but the ball.
 
     Attributes:
-        offset_w: joints from the ball's centre, mount end first [m], shape (L, 3). velocity_w: [m/s], shape (L, 3).
+        offset_w: joints from the ball's centre, mount end first [m], shape (L, 3). velocity_w:
+            [m/s], shape (L, 3).
     """
 
-    def __init__(self, points_w: np.ndarray, velocity_w: np.ndarray, ball_w: np.ndarray, ball_vel_w: np.ndarray) -> None:
-        """Take over a rope of joints [m], [m/s], upper end first, shape (L + 1, 3), and its ball's centre [m], [m/s], shape (3,)."""
+    def __init__(
+        self,
+        points_w: np.ndarray,
+        velocity_w: np.ndarray,
+        ball_w: np.ndarray,
+        ball_vel_w: np.ndarray,
+    ) -> None:
+        """Take over a rope of joints [m], [m/s], upper end first, shape (L + 1, 3), and its ball's
+        centre [m], [m/s], shape (3,).
+        """
         self.offset_w = np.array(points_w[:-1], dtype=float) - ball_w
         self.velocity_w = np.array(velocity_w[:-1], dtype=float) - ball_vel_w
         ends = np.vstack((self.offset_w, np.zeros(3)))
         self._lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
         last = np.linalg.norm(np.asarray(points_w[-1]) - points_w[-2])
-        self._knot = 1.0 - last / self._lengths[-1]  # where the rope ends on the last link, from the ball
+        self._knot = (
+            1.0 - last / self._lengths[-1]
+        )  # where the rope ends on the last link, from the ball
 
     def fly(self, duration: float) -> None:
         """Fly on with the ball for a time [s]."""
@@ -45,11 +58,12 @@ class LooseRope:
             self.velocity_w, self.offset_w = (moved - self.offset_w) / h, moved
 
     def sink(self, duration: float, ground: float) -> None:
-        """Fall and come to rest for a time [s] while the ball lies still, its centre over a ground of this height [m].
+        """Fall and come to rest for a time [s] while the ball lies still, its centre over a ground
+        of this height [m].
 
-        From the ball outwards each joint goes to its link's length from the one before (Mueller, Kim, Chentanez, Fast
-        simulation of inextensible hair and fur, 2012): not accurate, but it rests on the ground wherever it starts.
-        """
+        From the ball outwards each joint goes to its link's length from the one before (Mueller,
+        Kim, Chentanez, Fast simulation of inextensible hair and fur, 2012): not accurate, but it
+        rests on the ground wherever it starts."""
         count = max(1, round(duration / SINKING_STEP))
         h = duration / count
         for _ in range(count):
@@ -76,13 +90,17 @@ class LooseRope:
         return moved
 
     def points_w(self, ball_w: np.ndarray) -> np.ndarray:
-        """Joints and lower end of the rope [m], shape (L + 1, 3), for a ball at ``ball_w``, shape (3,)."""
+        """Joints and lower end of the rope [m], shape (L + 1, 3), for a ball at ``ball_w``, shape
+        (3,).
+        """
         knot = self._knot * self.offset_w[-1:]
         return np.vstack((self.offset_w, knot)) + ball_w
 
 
 def _on_link(joint: np.ndarray, end: np.ndarray, length: float, ground: float) -> np.ndarray:
-    """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's centre [m]."""
+    """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's
+    centre [m].
+    """
     away = joint - end
     away *= length / max(float(np.linalg.norm(away)), 1e-9)
     lowest = max(ground - end[2], -length)

@@ -1,4 +1,6 @@
-"""The two plants behind one face: the training simulator and the reference plant, NumPy in and out."""
+"""The two plants behind one face: the training simulator and the reference plant, NumPy
+in and out.
+"""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +33,14 @@ def known_plant(name: str) -> str:
     return name
 
 
-BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")  # state arrays of bodies and ropes
+BODIES = (
+    "pos_w",
+    "quat_wb",
+    "vel_w",
+    "rate_b",
+    "cable_dir_w",
+    "cable_vel_w",
+)  # state arrays of bodies and ropes
 FALL_STEP = 0.02  # largest of RK4 in flight [s]; 1e-8 m off a tennis ball's path after a second
 
 
@@ -44,7 +53,9 @@ class Plant(Protocol):
     time: float
 
     def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
-        """Put the vehicles level and at rest to positions [m], shape (E, 3), with stated rope directions (E, L, 3)."""
+        """Put the vehicles level and at rest to positions [m], shape (E, 3), with stated rope
+        directions (E, L, 3).
+        """
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         """Advance one control period under commands [N, rad/s], shape (E, 4)."""
@@ -58,11 +69,15 @@ class Plant(Protocol):
 
     @property
     def exposed(self) -> Snapshot:
-        """The truth of which :meth:`measured` tells: what a camera sees that is triggered with motion capture."""
+        """The truth of which :meth:`measured` tells: what a camera sees that is triggered with
+        motion capture.
+        """
 
     @property
     def sample(self) -> Snapshot:
-        """What motion capture and gyro took down behind the last :meth:`measured`; ``time`` is when it was true."""
+        """What motion capture and gyro took down behind the last :meth:`measured`; ``time`` is when
+        it was true.
+        """
 
     @property
     def landing(self) -> Landings:
@@ -70,14 +85,24 @@ class Plant(Protocol):
 
 
 class HybridPlant:
-    """The training simulator. After the release the ball flies in closed form and the rope with it (`LooseRope`)."""
+    """The training simulator.
+
+    After the release the ball flies in closed form and the rope with it (`LooseRope`).
+    """
 
     name = "hybrid"
 
     def __init__(
-        self, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu", noise: NoiseParams | None = None,
-        latency: tuple[float, float] = (0.0, 0.0), start: RandomizationParams | None = None, motors: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        experiment: Experiment,
+        count: int = 1,
+        seed: int = 0,
+        device: str = "cpu",
+        noise: NoiseParams | None = None,
+        latency: tuple[float, float] = (0.0, 0.0),
+        start: RandomizationParams | None = None,
+        motors: bool = False,
+    ) -> None:
         """Build the simulator of an experiment's plant.
 
         Args:
@@ -85,13 +110,20 @@ class HybridPlant:
             seed: of the measurements' noise.
             noise: of the measurements, in each quantity's SI unit as in training; None for none.
             latency: range that each vehicle's age of measurements is drawn from at a reset [s].
-            start: with it, vehicles, ropes and starts are those of :func:`visthrow.training.protocol.throw` with the same seed and
-                start, and commands are disturbed as in training.
-            motors: commands are motor-speed set-points [rad/s], shape (E, 4); see `sim.hybrid.HybridSim`.
+            start: with it, vehicles, ropes and starts are those of
+                :func:`visthrow.training.protocol.throw` with the same seed and start, and commands
+                are disturbed as in training.
+            motors: commands are motor-speed set-points [rad/s], shape (E, 4); see
+                `sim.hybrid.HybridSim`.
         """
         from sim.hybrid import HybridSim, rope_variants
 
-        self.params, self.count, self.noise, self.latency = plant_of(experiment), count, noise, latency
+        self.params, self.count, self.noise, self.latency = (
+            plant_of(experiment),
+            count,
+            noise,
+            latency,
+        )
         self.period = self.params.sim.control_period
         self._start, self._action = start, experiment.task.action
         ropes = None if start is None else rope_variants(self.params.rope, start)
@@ -102,7 +134,9 @@ class HybridPlant:
             self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
         else:
             self._sim.randomize(start)
-            self._sim.randomize(start)  # as ThrowEnv, which draws once when it is built and once when it is reset
+            self._sim.randomize(
+                start
+            )  # as ThrowEnv, which draws once when it is built and once when it is reset
             self._command_bias = noise.command_bias * self._rng.standard_normal((count, 4))
             self._begin()
 
@@ -119,7 +153,9 @@ class HybridPlant:
         self._bias = bias * self._rng.standard_normal((5, count, 3))
         self._age = self._rng.uniform(*self.latency, count)
         self._error = np.zeros((5, count, 3))
-        self._past = [self.state] * max(math.ceil(self.latency[1] / self.period - 1e-9), 1)  # newest first
+        self._past = [self.state] * max(
+            math.ceil(self.latency[1] / self.period - 1e-9), 1
+        )  # newest first
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
@@ -143,7 +179,8 @@ class HybridPlant:
         self.time += self.period
 
     def hold(self, names: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-        """Put bodies and ropes back to where an earlier call found them, or only look; motors and battery go on.
+        """Put bodies and ropes back to where an earlier call found them, or only look; motors and
+        battery go on.
 
         Takes and returns state arrays of bodies and ropes.
         """
@@ -153,7 +190,9 @@ class HybridPlant:
         return names or {name: getattr(self._sim.state, name).numpy().copy() for name in BODIES}
 
     def look(self, *names: str) -> list[np.ndarray]:
-        """Arrays of the simulator's state, environment first: a snapshot's price is many times that."""
+        """Arrays of the simulator's state, environment first: a snapshot's price is many times
+        that.
+        """
         return [self._sim.get(name).astype(float) for name in names]
 
     def stop_motors(self) -> None:
@@ -162,10 +201,14 @@ class HybridPlant:
         self._sim.state.motor_speed.zero_()
 
     def postpone(self, time: float) -> None:
-        """Let payloads that are latched and still hang separate so much later [s]: the latch tripped within the last period."""
+        """Let payloads that are latched and still hang separate so much later [s]: the latch
+        tripped within the last period.
+        """
         timer = self._sim.get("release_timer")
         waits = self._latched & (self._sim.get("attached") != 0) & (timer >= 0.0)
-        self._sim.state.release_timer.assign(np.where(waits, timer + time, timer).astype(timer.dtype))
+        self._sim.state.release_timer.assign(
+            np.where(waits, timer + time, timer).astype(timer.dtype)
+        )
 
     def _disturbed(self, command: np.ndarray) -> np.ndarray:
         """Commands with the training's noise, which is on their normalised form."""
@@ -173,17 +216,30 @@ class HybridPlant:
 
         from visthrow.onboard import actions as act
 
-        most, rates = self._action.max_thrust, torch.tensor(self._action.max_rate, dtype=torch.float64)
-        action = act.action_from_command(torch.from_numpy(np.asarray(command, dtype=float)), most, rates)
-        error = self._command_bias + self.noise.command_step * self._rng.standard_normal((self.count, 4))
+        most, rates = (
+            self._action.max_thrust,
+            torch.tensor(self._action.max_rate, dtype=torch.float64),
+        )
+        action = act.action_from_command(
+            torch.from_numpy(np.asarray(command, dtype=float)), most, rates
+        )
+        error = self._command_bias + self.noise.command_step * self._rng.standard_normal(
+            (self.count, 4)
+        )
         return act.command_from_action(action + torch.from_numpy(error), most, rates).numpy()
 
     def _let_go(self, e: int) -> LooseRope:
-        """Rope of one plant at separation: the simulator keeps its directions and rates of that instant."""
+        """Rope of one plant at separation: the simulator keeps its directions and rates of that
+        instant.
+        """
         rope = self.params.rope
-        ball, ball_vel = (self._sim.get(name)[e].astype(float) for name in ("payload_pos_w", "payload_vel_w"))
+        ball, ball_vel = (
+            self._sim.get(name)[e].astype(float) for name in ("payload_pos_w", "payload_vel_w")
+        )
         link = rope.length / rope.segments
-        direction, turn = (self._sim.get(name)[e].astype(float) for name in ("cable_dir_w", "cable_vel_w"))
+        direction, turn = (
+            self._sim.get(name)[e].astype(float) for name in ("cable_dir_w", "cable_vel_w")
+        )
 
         def upwards(end: np.ndarray, step: np.ndarray) -> np.ndarray:
             knot = end - rope.payload_offset * step[-1]
@@ -194,9 +250,14 @@ class HybridPlant:
 
     def _ball(self) -> tuple[np.ndarray, np.ndarray]:
         """Ball in flight: position and velocity; at rest after landing."""
-        pos, vel = self._sim.get("payload_pos_w").astype(float), self._sim.get("payload_vel_w").astype(float)
+        pos, vel = (
+            self._sim.get("payload_pos_w").astype(float),
+            self._sim.get("payload_vel_w").astype(float),
+        )
         landing = self.landing
-        pos, vel = flown(self.params.rope, self.params.air, pos, vel, np.nan_to_num(self.time - self._separation))
+        pos, vel = flown(
+            self.params.rope, self.params.air, pos, vel, np.nan_to_num(self.time - self._separation)
+        )
         down = landing.landed[:, None]
         return np.where(down, landing.point_w, pos), np.where(down, 0.0, vel)
 
@@ -213,15 +274,25 @@ class HybridPlant:
         for e, rope in enumerate(self._ropes):
             if rope is not None:
                 points[e] = rope.points_w(ball[e])
-        body = {name: sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")}
+        body = {
+            name: sim.get(name).astype(float)
+            for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")
+        }
         return Snapshot(
-            self.time, payload_pos_w=ball, payload_vel_w=ball_vel, cable_points_w=points,
-            battery_voltage=sim.get("voltage").astype(float), attached=sim.get("attached") != 0,
-            latched=self._latched.copy(), **body,
-        )  # fmt: skip
+            self.time,
+            payload_pos_w=ball,
+            payload_vel_w=ball_vel,
+            cable_points_w=points,
+            battery_voltage=sim.get("voltage").astype(float),
+            attached=sim.get("attached") != 0,
+            latched=self._latched.copy(),
+            **body,
+        )
 
     def measured(self) -> Snapshot:
-        """The truth, late and with the training's observation noise, which on the attitude is an angle [rad]."""
+        """The truth, late and with the training's observation noise, which on the attitude is an
+        angle [rad].
+        """
         if self.noise is not None:
             step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
             self._error = self._bias + step
@@ -235,8 +306,8 @@ class HybridPlant:
     def sample(self) -> Snapshot:
         """The truth now, with the error of the last :meth:`measured`.
 
-        The pilot hears of it late, by a chord between two control steps as in training; sensors know no chord.
-        """
+        The pilot hears of it late, by a chord between two control steps as in training; sensors
+        know no chord."""
         return self._erring(self.state)
 
     def _erring(self, now: Snapshot) -> Snapshot:
@@ -244,9 +315,13 @@ class HybridPlant:
             return now
         error = self._error
         return replace(
-            now, pos_w=now.pos_w + error[0], vel_w=now.vel_w + error[1], rate_b=now.rate_b + error[2],
-            payload_pos_w=now.payload_pos_w + error[3], quat_wb=turned(now.quat_wb, error[4]),
-        )  # fmt: skip
+            now,
+            pos_w=now.pos_w + error[0],
+            vel_w=now.vel_w + error[1],
+            rate_b=now.rate_b + error[2],
+            payload_pos_w=now.payload_pos_w + error[3],
+            quat_wb=turned(now.quat_wb, error[4]),
+        )
 
     @property
     def landing(self) -> Landings:
@@ -257,16 +332,26 @@ class HybridPlant:
 
 
 class ReferenceAdapter:
-    """The reference plant, with the pinned extras or with none but the latency and drag that the policy was trained for."""
+    """The reference plant, with the pinned extras or with none but the latency and drag that the
+    policy was trained for.
+    """
 
-    def __init__(self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True) -> None:
-        """Build the plant; a realistic one has the extras of ``configs/vehicle/reference_realistic.toml``."""
+    def __init__(
+        self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True
+    ) -> None:
+        """Build the plant; a realistic one has the extras of
+        ``configs/vehicle/reference_realistic.toml``.
+        """
         from sim.reference.extras import ReferenceExtras
         from sim.reference.plant import ReferencePlant
 
         latency = float(np.mean(experiment.task.observation.latency))
         trained = ReferenceExtras(mocap_latency=latency, payload_drag=experiment.rope.payload_drag)
-        extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic")) if realistic else trained
+        extras = (
+            config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
+            if realistic
+            else trained
+        )
         self.name = "reference-realistic" if realistic else "reference"
         self.params, self.count = plant_of(experiment), count
         self.period = self.params.sim.control_period
@@ -287,21 +372,31 @@ class ReferenceAdapter:
         return self.sample
 
 
-def flown(rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position [m] and velocity [m/s] of payloads, shape (E, 3), after flights [s], shape (E,), under gravity, wind, air forces."""
+def flown(
+    rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray, time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position [m] and velocity [m/s] of payloads, shape (E, 3), after flights [s], shape (E,),
+    under gravity, wind, air forces.
+    """
     time = np.asarray(time, dtype=float)[:, None]
     if not (rope.payload_drag or rope.payload_side or rope.payload_lift):
         fall = np.array([0.0, 0.0, -GRAVITY])
         return pos_w + time * vel_w + 0.5 * time**2 * fall, vel_w + time * fall
     wind = np.array(air.wind_w)
-    share, side, lift = (x / rope.payload_mass for x in (rope.payload_drag, rope.payload_side, rope.payload_lift))
+    share, side, lift = (
+        x / rope.payload_mass for x in (rope.payload_drag, rope.payload_side, rope.payload_lift)
+    )
 
     def acceleration(v: np.ndarray) -> np.ndarray:
         through = v - wind
         across = np.cross([0.0, 0.0, 1.0], through)
         size = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         turned = side * across + lift * np.cross(through, across / size)
-        return np.linalg.norm(through, axis=1, keepdims=True) * (turned - share * through) - [0.0, 0.0, GRAVITY]
+        return np.linalg.norm(through, axis=1, keepdims=True) * (turned - share * through) - [
+            0.0,
+            0.0,
+            GRAVITY,
+        ]
 
     count = max(int(np.ceil(np.max(time, initial=0.0) / FALL_STEP)), 1)
     h, x, v = time / count, pos_w, vel_w
@@ -315,15 +410,28 @@ def flown(rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray
     return x, v
 
 
-def make_plant(name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu") -> Plant:
-    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and latency."""
+def make_plant(
+    name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu"
+) -> Plant:
+    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and
+    latency.
+    """
     if known_plant(name) == "hybrid":
-        return HybridPlant(experiment, count, seed, device, experiment.task.noise, experiment.task.observation.latency)
+        return HybridPlant(
+            experiment,
+            count,
+            seed,
+            device,
+            experiment.task.noise,
+            experiment.task.observation.latency,
+        )
     return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
 
 
 def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
-    """What is measured, linear between states one control period apart, newest first; age: in periods, shape (E,)."""
+    """What is measured, linear between states one control period apart, newest first; age: in
+    periods, shape (E,).
+    """
     now = states[0]
     if not np.any(age):
         return now
@@ -338,7 +446,9 @@ def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
 
 
 def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> np.ndarray:
-    """Straight ropes off the vertical by a normal angle of deviation ``angle`` [rad], shape (E, L, 3)."""
+    """Straight ropes off the vertical by a normal angle of deviation ``angle`` [rad], shape (E, L,
+    3).
+    """
     tilt = angle * rng.standard_normal((count, 2))
     down = np.column_stack((tilt, -np.ones(count)))
     down /= np.linalg.norm(down, axis=1, keepdims=True)

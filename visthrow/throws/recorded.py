@@ -1,4 +1,6 @@
-"""Recorded throws: one from hover to the vehicle hovering again, and what any flight is recorded by."""
+"""Recorded throws: one from hover to the vehicle hovering again, and what any flight is recorded
+by.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -20,16 +22,24 @@ if TYPE_CHECKING:
 START_SPREAD = 0.10  # of the start about the hover point [m]
 START_SWING = 0.05  # of the rope at the start [rad]
 HOVER_LEAST, HOVER_MOST = 1.5, 6.0  # time in hover before the throw [s]
-QUIET_OFFSET, QUIET_SPEED = 0.03, 0.12  # vehicle off its hover point [m]; payload against the world [m/s]
+QUIET_OFFSET, QUIET_SPEED = (
+    0.03,
+    0.12,
+)  # vehicle off its hover point [m]; payload against the world [m/s]
 QUIET_TIME = 0.4  # for which it must last [s]
 RECOVERY_MOST = 8.0  # [s]
-ROPE_ON_GROUND = 0.003  # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
+# height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
+ROPE_ON_GROUND = 0.003
 MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "payload_pos_w": "m"}
-"""Channels recorded a second time as measured, under ``measured_<name>``, stamped when they were true, with their units."""
+"""Channels recorded a second time as measured, under ``measured_<name>``, stamped when they were
+true, with their units.
+"""
 
 
 class Recording(Recorder):
-    """A flight log of each vehicle, ``recorders``: what is true at each period's beginning, and what is sent then."""
+    """A flight log of each vehicle, ``recorders``: what is true at each period's beginning, and
+    what is sent then.
+    """
 
     def __init__(self, names: Sequence[str], count: int, meta: dict[str, Any]) -> None:
         """Start empty, with standard channels that a snapshot has."""
@@ -43,7 +53,9 @@ class Recording(Recorder):
 
 
 class _Full(Recording):
-    """Everything of one vehicle: the rope down to the ground, what the camera sees, and when the release was asked for, ``latch`` [s]."""
+    """Everything of one vehicle: the rope down to the ground, what the camera sees, and when the
+    release was asked for, ``latch`` [s].
+    """
 
     def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:
         truth = ("payload_vel_w", "motor_speed", "battery_voltage", "attached")
@@ -51,7 +63,9 @@ class _Full(Recording):
         self.pilots = pilots
         self.latch: float | None = None
         for name, unit in MEASURED.items():
-            self.recorders[0].declare(f"measured_{name}", unit, "body" if name == "rate_b" else "world")
+            self.recorders[0].declare(
+                f"measured_{name}", unit, "body" if name == "rate_b" else "world"
+            )
         self._resting: LooseRope | None = None
         self._before: Snapshot | None = None
         self._sampled = -np.inf  # stamp of the last measured sample [s]
@@ -62,26 +76,45 @@ class _Full(Recording):
         if sent.release[0] and self.latch is None:
             self.latch = now.time
         looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
-        points, valid = looked or self.pilots.pilots[0].see(seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w)
-        recorder.add(now.time, goal_w=self.pilots.goal_w[0], mode=int(throws), keypoints=points[0], keypoints_valid=valid[0])
+        points, valid = looked or self.pilots.pilots[0].see(
+            seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w
+        )
+        recorder.add(
+            now.time,
+            goal_w=self.pilots.goal_w[0],
+            mode=int(throws),
+            keypoints=points[0],
+            keypoints_valid=valid[0],
+        )
         if sent.action is not None and sent.observation is not None:
             recorder.add(now.time, action=sent.action[0], observation=sent.observation[0])
         self.sample(flight)
 
     def sample(self, flight: Flight) -> None:
-        """Record the rope now, and the measured state that the pilot was given last, stamped when it was true."""
+        """Record the rope now, and the measured state that the pilot was given last, stamped when
+        it was true.
+        """
         points = self._rope(flight)
         points[:, 2] = np.maximum(points[:, 2], ROPE_ON_GROUND)
         self.recorders[0].add(flight.now.time, cable_points_w=points)
         sample = flight.plant.sample
         if sample.time > self._sampled:
-            self.recorders[0].add(sample.time, **{f"measured_{name}": getattr(sample, name)[0] for name in MEASURED})
+            self.recorders[0].add(
+                sample.time, **{f"measured_{name}": getattr(sample, name)[0] for name in MEASURED}
+            )
             self._sampled = sample.time
         self._before = flight.now
 
     def _rope(self, flight: Flight) -> np.ndarray:
-        """Rope now; after the landing it sinks to the ground instead of standing still as the plants leave it."""
-        now, landing, before, period = flight.now, flight.plant.landing, self._before, flight.plant.period
+        """Rope now; after the landing it sinks to the ground instead of standing still as the
+        plants leave it.
+        """
+        now, landing, before, period = (
+            flight.now,
+            flight.plant.landing,
+            self._before,
+            flight.plant.period,
+        )
         if not landing.landed[0] or before is None:
             return np.array(now.cable_points_w[0])
         if self._resting is None:
@@ -96,22 +129,30 @@ class _Full(Recording):
 
 
 def fly(
-    loaded: Loaded, goal_w: np.ndarray, plant_name: str = "hybrid", seed: int = 0, device: str = "cpu", eyes: "Eyes | None" = None
+    loaded: Loaded,
+    goal_w: np.ndarray,
+    plant_name: str = "hybrid",
+    seed: int = 0,
+    device: str = "cpu",
+    eyes: "Eyes | None" = None,
 ) -> FlightLog:
     """Hover until the swing is quiet, throw, and hover again at the start.
 
-    The throw ends at separation; from there the hover controller has the vehicle. Keypoints are those that the pilot
-    computes from measured poses, and are recorded for a state policy too. Raises ConfigError: the goal is not a point in reach of the
-    vehicle's bounds.
+    The throw ends at separation; from there the hover controller has the vehicle. Keypoints are
+    those that the pilot computes from measured poses, and are recorded for a state policy too.
+    Raises ConfigError: the goal is not a point in reach of the vehicle's bounds.
 
     Args:
         loaded: policy and experiment.
         goal_w: on the ground [m], shape (3,).
-        plant_name: of :data:`visthrow.throws.plants.PLANTS`. seed: of start, plant and measurements. device: of the training simulator.
-        eyes: of one vehicle, whose rendered pictures keypoints come from; recorded are those that the policy was shown.
+        plant_name: of :data:`visthrow.throws.plants.PLANTS`. seed: of start, plant and
+            measurements. device: of the training simulator.
+        eyes: of one vehicle, whose rendered pictures keypoints come from; recorded are those that
+            the policy was shown.
 
     Returns:
-        The flight with all standard channels; ``meta["result"]`` says how it ended, ``meta["times"]`` when.
+        The flight with all standard channels; ``meta["result"]`` says how it ended,
+        ``meta["times"]`` when.
     """
     check_goal(loaded, goal_w)
     experiment = loaded.experiment
@@ -123,19 +164,31 @@ def fly(
     pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True, eyes=eyes)
     recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
-    hangs_still = _hovering(lambda now: bool(np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED), home, HOVER_LEAST, HOVER_MOST)
-    flight.run([hangs_still, Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))])
+    hangs_still = _hovering(
+        lambda now: bool(np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED),
+        home,
+        HOVER_LEAST,
+        HOVER_MOST,
+    )
+    flight.run(
+        [hangs_still, Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))]
+    )
     recovery = plant.time
 
     def recovered(now: Snapshot) -> bool:  # the payload lies on the ground or hangs still
-        return bool(np.linalg.norm(now.vel_w[0]) < QUIET_SPEED and (plant.landing.landed[0] or now.attached[0]))
+        return bool(
+            np.linalg.norm(now.vel_w[0]) < QUIET_SPEED
+            and (plant.landing.landed[0] or now.attached[0])
+        )
 
     flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
     return _finished(flight, recording, recovery)
 
 
 def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
-    """Refuse a goal that is not three finite numbers, or further than the vehicle may fly, with a ConfigError."""
+    """Refuse a goal that is not three finite numbers, or further than the vehicle may fly, with a
+    ConfigError.
+    """
     goal_w = np.asarray(goal_w, dtype=float)
     limit = loaded.experiment.task.bounds.horizontal
     if goal_w.shape != (3,) or not np.all(np.isfinite(goal_w)):
@@ -148,13 +201,20 @@ def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
 
 def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dict[str, Any]:
     return {
-        "policy": loaded.name, "layout": loaded.policy.contract["observation"]["layout"], "plant": plant_name,
-        "plant_meaning": PLANTS[plant_name], "goal_w": [float(x) for x in goal_w], "seed": seed,
-        "config": config.to_dict(loaded.experiment), "provenance": provenance.collect(),
-    }  # fmt: skip
+        "policy": loaded.name,
+        "layout": loaded.policy.contract["observation"]["layout"],
+        "plant": plant_name,
+        "plant_meaning": PLANTS[plant_name],
+        "goal_w": [float(x) for x in goal_w],
+        "seed": seed,
+        "config": config.to_dict(loaded.experiment),
+        "provenance": provenance.collect(),
+    }
 
 
-def _hovering(quiet: Callable[[Snapshot], bool], home: np.ndarray, least: float, most: float) -> Phase:
+def _hovering(
+    quiet: Callable[[Snapshot], bool], home: np.ndarray, least: float, most: float
+) -> Phase:
     """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
     still = 0.0
 
@@ -174,7 +234,12 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     plant.measured()
     recording.sample(flight)
     landing, failure = plant.landing, flight.failures[0]
-    times = {"policy_start": flight.begin, "latch": recording.latch, "recovery": recovery, "end": plant.time}
+    times = {
+        "policy_start": flight.begin,
+        "latch": recording.latch,
+        "recovery": recovery,
+        "end": plant.time,
+    }
     result: dict[str, Any] = {"success": False, "failure": failure}
     if not np.isnan(landing.separation_time[0]):
         times["separation"] = float(landing.separation_time[0])
@@ -183,11 +248,19 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
         times["landing"] = when
         recorder.add(when, landing=point)
         off = point[:2] - flight.pilots.goal_w[0, :2]
-        result |= {"success": failure is None, "landing_w": point.tolist(), "error": float(np.hypot(*off)),
-                   "duration": when - flight.begin}  # fmt: skip
-    result["hovering_again"] = bool(np.linalg.norm(now.vel_w[0]) < 2 * QUIET_SPEED and now.pos_w[0, 2] > 0.5)
+        result |= {
+            "success": failure is None,
+            "landing_w": point.tolist(),
+            "error": float(np.hypot(*off)),
+            "duration": when - flight.begin,
+        }
+    result["hovering_again"] = bool(
+        np.linalg.norm(now.vel_w[0]) < 2 * QUIET_SPEED and now.pos_w[0, 2] > 0.5
+    )
     recorder.meta |= {"times": times, "result": result}
     log = recorder.log()
     if (begins := times.get("separation")) is not None:
-        log.channels["separation"] = Channel(np.array([begins]), log["payload_pos_w"].at(begins)[None], "m", "world")
+        log.channels["separation"] = Channel(
+            np.array([begins]), log["payload_pos_w"].at(begins)[None], "m", "world"
+        )
     return log

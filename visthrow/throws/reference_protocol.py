@@ -1,10 +1,11 @@
-"""The paper's measurement on the reference plant: throws from hover, scored as :mod:`visthrow.task.measurement` says.
+"""The paper's measurement on the reference plant: throws from hover, scored as
+:mod:`visthrow.task.measurement` says.
 
-Each throw hovers first under the hover controller, so that battery, integrals and swing are those of a hover, and sees
-the plant's own measurements. Keypoints come from measured poses, as in the paper's hardware-in-the-loop tests. Throws
-fly in batches of :data:`BATCH`, each with a seed of its own made of seed, target and number of the batch: results do
-not depend on the number of processes, and every policy meets the same vehicles, winds and starts.
-"""
+Each throw hovers first under the hover controller, so that battery, integrals and swing are those
+of a hover, and sees the plant's own measurements. Keypoints come from measured poses, as in the
+paper's hardware-in-the-loop tests. Throws fly in batches of :data:`BATCH`, each with a seed of its
+own made of seed, target and number of the batch: results do not depend on the number of processes,
+and every policy meets the same vehicles, winds and starts."""
 
 import importlib
 import math
@@ -52,30 +53,43 @@ def batch_plant(
 ) -> tuple[Plant, np.random.Generator]:
     """Plant of one batch, and the generator of its starts: the same for whoever throws."""
     seeds = np.random.SeedSequence([seed, round(1000 * target), batch])
-    return make_plant(plant_name, experiment, count, int(seeds.generate_state(1)[0])), np.random.default_rng(seeds)
+    return make_plant(
+        plant_name, experiment, count, int(seeds.generate_state(1)[0])
+    ), np.random.default_rng(seeds)
 
 
 def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generator) -> np.ndarray:
-    """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m], shape (3,)."""
+    """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m],
+    shape (3,).
+    """
     start = pilots_hover()
     home = np.array([0.0, 0.0, start.spawn_height])
     spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (plant.count, 3))
-    ropes = random_ropes(rng, plant.count, experiment.rope.segments, math.radians(start.cable_angle_deg))
+    ropes = random_ropes(
+        rng, plant.count, experiment.rope.segments, math.radians(start.cable_angle_deg)
+    )
     plant.reset(home + spread, ropes)
     return home
 
 
-def fly_batch(loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes | None" = None) -> dict[str, np.ndarray]:
-    """Fly one batch of policies that are trained for one plant, on the rendered pictures of ``eyes`` where there are any.
+def fly_batch(
+    loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes | None" = None
+) -> dict[str, np.ndarray]:
+    """Fly one batch of policies that are trained for one plant, on the rendered pictures of
+    ``eyes`` where there are any.
 
-    Returns :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws first, and ``goal_w`` where goals move;
-    NaN where a throw failed.
-    """
+    Returns :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws
+    first, and ``goal_w`` where goals move; NaN where a throw failed."""
     flown = [loaded[i] for i in job.policies]
     experiment, count = flown[0].experiment, job.count * len(flown)
     plant, rng = batch_plant(experiment, plant_name, job.target, job.batch, count, job.seed)
     home = place_in_hover(plant, experiment, rng)
-    pilots = Policies(flown, np.tile([job.target, 0.0, 0.0], (count, 1)), _goal_velocities(experiment, count, rng), eyes=eyes)
+    pilots = Policies(
+        flown,
+        np.tile([job.target, 0.0, 0.0], (count, 1)),
+        _goal_velocities(experiment, count, rng),
+        eyes=eyes,
+    )
     flight = Flight(plant, pilots, scores := _Scores(pilots), home)
     flight.run([hover(HOVER_TIME), throw()])
     return scores.columns(flight)
@@ -89,10 +103,15 @@ class _Scores(Scores):
 
 
 def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Velocities of the task's goals [m/s], shape (E, 3); nothing is drawn where they stand still."""
+    """Velocities of the task's goals [m/s], shape (E, 3); nothing is drawn where they
+    stand still.
+    """
     if not experiment.task.target.moves:
         return np.zeros((count, 3))
-    speed, heading = rng.uniform(*experiment.task.target.speed, count), rng.uniform(0.0, 2.0 * math.pi, count)
+    speed, heading = (
+        rng.uniform(*experiment.task.target.speed, count),
+        rng.uniform(0.0, 2.0 * math.pi, count),
+    )
     return np.column_stack((speed * np.cos(heading), speed * np.sin(heading), np.zeros(count)))
 
 
@@ -101,36 +120,61 @@ def batches(throws: int, size: int = BATCH) -> list[tuple[int, int]]:
     return [(first // size, min(size, throws - first)) for first in range(0, throws, size)]
 
 
-def plan(policies: int, targets: Sequence[float], throws: int, seed: int, together: bool = False, size: int = BATCH) -> list[Job]:
-    """Cut throws of each policy at each target into batches, with all policies in one batch or each in its own."""
+def plan(
+    policies: int,
+    targets: Sequence[float],
+    throws: int,
+    seed: int,
+    together: bool = False,
+    size: int = BATCH,
+) -> list[Job]:
+    """Cut throws of each policy at each target into batches, with all policies in one batch or each
+    in its own.
+    """
     groups = [tuple(range(policies))] if together else [(i,) for i in range(policies)]
     cut = batches(throws, size)
-    return [Job(group, target, *part, seed) for target in targets for group in groups for part in cut]
+    return [
+        Job(group, target, *part, seed) for target in targets for group in groups for part in cut
+    ]
 
 
 class Throwing(Workers):
-    """Throws on their way in processes of their own; a context manager that stops them when left early.
+    """Throws on their way in processes of their own; a context manager that stops them when left
+    early.
 
-    >>> with Throwing(policies, (1.5, 2.0), 200, "reference-realistic", seed=0) as throwing:  # doctest: +SKIP
+    >>> plant = "reference-realistic"
+    >>> with Throwing(policies, (1.5, 2.0), 200, plant, seed=0) as throwing:  # doctest: +SKIP
     ...     results = throwing.results()
     """
 
     def __init__(
-        self, loaded: Sequence[Loaded], targets: Sequence[float], throws: int, plant_name: str, seed: int,
-        processes: int | None = None, together: bool = False, size: int = BATCH,
-    ) -> None:  # fmt: skip
+        self,
+        loaded: Sequence[Loaded],
+        targets: Sequence[float],
+        throws: int,
+        plant_name: str,
+        seed: int,
+        processes: int | None = None,
+        together: bool = False,
+        size: int = BATCH,
+    ) -> None:
         """Start so many throws of each policy at each target [m] along x.
 
-        Raises ConfigError: policies of different plants that are to fly together; ModuleNotFoundError: MuJoCo is not installed.
+        Raises ConfigError: policies of different plants that are to fly together;
+        ModuleNotFoundError: MuJoCo is not installed.
 
         Args:
             loaded, targets, throws, plant_name, seed: of everything random.
             processes: default one a core, and no more than there are batches.
-            together: fly all policies in one batch, which is cheaper for a few throws; they must share a plant.
-            size: throws of a policy in a batch; fewer are sooner done where there are more cores. Other sizes, other draws.
+            together: fly all policies in one batch, which is cheaper for a few throws; they must
+                share a plant.
+            size: throws of a policy in a batch; fewer are sooner done where there are more cores.
+                Other sizes, other draws.
         """
         importlib.import_module("mujoco")  # said here rather than by every worker
-        if together and any(plant_of(item.experiment) != plant_of(loaded[0].experiment) for item in loaded):
+        if together and any(
+            plant_of(item.experiment) != plant_of(loaded[0].experiment) for item in loaded
+        ):
             raise ConfigError("policies of different plants cannot fly in one batch")
         self.jobs = plan(len(loaded), targets, throws, seed, together, size)
         self._count, self._targets = len(loaded), list(targets)
@@ -138,11 +182,16 @@ class Throwing(Workers):
         super().__init__(flown, self.jobs, processes or cores(), "throws on the reference plant")
 
     def results(self, show: bool = True) -> list[list[Throws]]:
-        """Wait, with a progress line on a terminal; returns for each policy a :class:`visthrow.task.measurement.Throws` a target."""
+        """Wait, with a progress line on a terminal; returns for each policy a
+        :class:`visthrow.task.measurement.Throws` a target.
+        """
         self.label *= show
         found = dict(self)
         parts = [found[index] for index in range(len(self.jobs))]
-        return [[self._throws(parts, policy, target) for target in self._targets] for policy in range(self._count)]
+        return [
+            [self._throws(parts, policy, target) for target in self._targets]
+            for policy in range(self._count)
+        ]
 
     def _throws(self, parts: Sequence[dict[str, np.ndarray]], policy: int, target: float) -> Throws:
         """All throws of one policy at one target."""
@@ -150,5 +199,9 @@ class Throwing(Workers):
         for job, part in zip(self.jobs, parts):
             if job.target == target and policy in job.policies:
                 first = job.policies.index(policy) * job.count
-                of.append({name: values[first : first + job.count] for name, values in part.items()})
-        return Throws(target, **{name: np.concatenate([part[name] for part in of]) for name in of[0]})
+                of.append(
+                    {name: values[first : first + job.count] for name, values in part.items()}
+                )
+        return Throws(
+            target, **{name: np.concatenate([part[name] for part in of]) for name in of[0]}
+        )

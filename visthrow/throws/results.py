@@ -1,9 +1,10 @@
-"""Results of throws as units of work: what goes in is named and hashed, what comes out is one small file, or a packed record.
+"""Results of throws as units of work: what goes in is named and hashed, what comes out is one small
+file, or a packed record.
 
-A unit is a flat description of everything that its throws depend on (:func:`policy_unit` and the like). Its key is a hash of
-that, so that a changed input is another unit and an unchanged one is never worked twice. Each unit is written whole
-when it is done: a process killed at any moment loses no more than the units that it was working on.
-"""
+A unit is a flat description of everything that its throws depend on (:func:`policy_unit` and the
+like). Its key is a hash of that, so that a changed input is another unit and an unchanged one is
+never worked twice. Each unit is written whole when it is done: a process killed at any moment loses
+no more than the units that it was working on."""
 
 import hashlib
 import json
@@ -22,7 +23,9 @@ from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import done
 
-PROTOCOL = 1  # goes up when the same unit would come out otherwise: an older result is then no longer used
+PROTOCOL = (
+    1  # goes up when the same unit would come out otherwise: an older result is then no longer used
+)
 
 RECORDS = Path(__file__).resolve().parents[1] / "evidence" / "records"
 """Committed records: ``throws`` (packed results), ``training`` (runs), ``findings`` (text)."""
@@ -34,13 +37,14 @@ DIGITS = 4  # after the decimal point, in SI units: 0.1 mm, a hundredth of what 
 class Result:
     """Throws of one unit.
 
-    Its columns have a row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m], ``duration`` [s] and whatever else
-    was measured; NaN where a throw failed.
-    """
+    Its columns have a row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m],
+    ``duration`` [s] and whatever else was measured; NaN where a throw failed."""
 
     unit: dict[str, Any]  # what they depend on
     columns: dict[str, np.ndarray]
-    provenance: dict[str, Any] = field(default_factory=dict)  # commit, command, time [UTC], seconds of work
+    provenance: dict[str, Any] = field(
+        default_factory=dict
+    )  # commit, command, time [UTC], seconds of work
     extra: dict[str, Any] = field(default_factory=dict)  # further figures of the whole unit
 
     @property
@@ -59,14 +63,20 @@ class Result:
 
     @property
     def miss(self) -> np.ndarray:
-        """Landing points of the successful throws from the target, or where it was at impact [m], shape (N, 2): along x, to the left."""
-        goal = self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
+        """Landing points of the successful throws from the target, or where it was at impact [m],
+        shape (N, 2): along x, to the left.
+        """
+        goal = (
+            self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
+        )
         return self.of("landing_w") - goal
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws a target."""
+    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws
+    a target.
+    """
 
     name: str
     layout: str
@@ -75,7 +85,9 @@ class Entry:
 
 def key_of(unit: dict[str, Any]) -> str:
     """Hash of a unit: 16 hexadecimal digits, independent of the order of its entries."""
-    return hashlib.sha256(json.dumps(unit, sort_keys=True, allow_nan=False).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(unit, sort_keys=True, allow_nan=False).encode()).hexdigest()[
+        :16
+    ]
 
 
 def hash_of(path: str | Path) -> str:
@@ -84,9 +96,19 @@ def hash_of(path: str | Path) -> str:
 
 
 def policy_unit(
-    policy: str, weights: str, layout: str, plant: str, target: float, throws: int, seed: int = 0, *,
-    run: str = "", variant: str = "full", train_seed: int | None = None, departures: dict[str, Any] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    policy: str,
+    weights: str,
+    layout: str,
+    plant: str,
+    target: float,
+    throws: int,
+    seed: int = 0,
+    *,
+    run: str = "",
+    variant: str = "full",
+    train_seed: int | None = None,
+    departures: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Unit of so many throws with a learnt policy at a target [m] along x.
 
     Args:
@@ -95,19 +117,36 @@ def policy_unit(
         target, throws, seed: of starts and noise.
         run, train_seed: config and seed of its training.
         variant: "full", or the name of what the training lacked or had more of.
-        departures: config key -> value, where the throws are flown under other conditions than the policy's own.
+        departures: config key -> value, where the throws are flown under other conditions than the
+            policy's own.
     """
     return {
-        "kind": "policy", "protocol": PROTOCOL, "policy": policy, "weights": weights, "layout": layout, "run": run or layout,
-        "variant": variant, "train_seed": train_seed, "plant": plant, "target": float(target), "throws": int(throws),
-        "seed": int(seed), "departures": dict(departures or {}),
-    }  # fmt: skip
+        "kind": "policy",
+        "protocol": PROTOCOL,
+        "policy": policy,
+        "weights": weights,
+        "layout": layout,
+        "run": run or layout,
+        "variant": variant,
+        "train_seed": train_seed,
+        "plant": plant,
+        "target": float(target),
+        "throws": int(throws),
+        "seed": int(seed),
+        "departures": dict(departures or {}),
+    }
 
 
 def columns_of(throws: Any) -> dict[str, np.ndarray]:
-    """Per-throw arrays of a dataclass of throws (:class:`visthrow.task.measurement.Throws`, :class:`visthrow.baseline.fly.Flown`)."""
+    """Per-throw arrays of a dataclass of throws (:class:`visthrow.task.measurement.Throws`,
+    :class:`visthrow.baseline.fly.Flown`).
+    """
     count = len(throws.success)
-    found = {name: np.asarray(value) for name, value in vars(throws).items() if isinstance(value, np.ndarray)}
+    found = {
+        name: np.asarray(value)
+        for name, value in vars(throws).items()
+        if isinstance(value, np.ndarray)
+    }
     return {name: value for name, value in found.items() if value.ndim and len(value) == count}
 
 
@@ -124,26 +163,33 @@ def write_line(path: str | Path, value: Any) -> None:
 
 
 def load(path: str | Path) -> list[Result]:
-    """Read the results of one file, a single one or a packed record; StorageError where it is no such file."""
+    """Read the results of one file, a single one or a packed record; StorageError where it is no
+    such file.
+    """
     try:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
         return [_from_json(item) for item in value.get("results", [value])]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StorageError(f"{path}; expected throws as visthrow writes them; got {type(error).__name__}: {error}") from error
+        raise StorageError(
+            f"{path}; expected throws as visthrow writes them; got {type(error).__name__}: {error}"
+        ) from error
 
 
 def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
     """Read all results in folders and files, by key; of two with one key the later place counts."""
     found: dict[str, Result] = {}
     for place in map(Path, places):
-        files = sorted(place.glob("*.json")) if place.is_dir() else [place] if place.exists() else []
+        files = (
+            sorted(place.glob("*.json")) if place.is_dir() else [place] if place.exists() else []
+        )
         for path in files:
             found.update({result.key: result for result in load(path)})
     return found
 
 
 def join(found: Iterable[Result]) -> list[Result]:
-    """Put the batches of one set of throws together: units that differ in nothing but ``batch`` and its size, in order.
+    """Put the batches of one set of throws together: units that differ in nothing but ``batch`` and
+    its size, in order.
 
     Of two results for one batch the larger counts. Units without a batch stay as they are.
     """
@@ -153,7 +199,9 @@ def join(found: Iterable[Result]) -> list[Result]:
         if "batch" not in result.unit:
             whole.append(result)
             continue
-        rest = {name: value for name, value in result.unit.items() if name not in ("batch", "throws")}
+        rest = {
+            name: value for name, value in result.unit.items() if name not in ("batch", "throws")
+        }
         group, batch = groups.setdefault(key_of(rest), {}), result.unit["batch"]
         if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
             group[batch] = result
@@ -165,23 +213,35 @@ def _joined(group: list[Result]) -> Result:
         return group[0]
     unit = {name: value for name, value in group[0].unit.items() if name != "batch"}
     unit["throws"] = sum(result.unit["throws"] for result in group)
-    columns = {name: np.concatenate([result.columns[name] for result in group]) for name in group[0].columns}
+    columns = {
+        name: np.concatenate([result.columns[name] for result in group])
+        for name in group[0].columns
+    }
     seconds = sum(result.provenance.get("seconds", 0.0) for result in group)
     return Result(unit, columns, {**group[0].provenance, "seconds": seconds}, group[0].extra)
 
 
 def pack(results: Iterable[Result], path: str | Path) -> None:
-    """Write results into one file, sorted by what they are, so that the same results give the same file."""
+    """Write results into one file, sorted by what they are, so that the same results give the same
+    file.
+    """
     ordered = sorted(results, key=lambda result: json.dumps(result.unit, sort_keys=True))
-    lines = ",\n".join(json.dumps(_to_json(result), allow_nan=False, separators=(",", ":")) for result in ordered)
+    lines = ",\n".join(
+        json.dumps(_to_json(result), allow_nan=False, separators=(",", ":")) for result in ordered
+    )
     atomic_write(path, f'{{"results": [\n{lines}\n]}}\n')
 
 
 def work(
-    units: Sequence[dict[str, Any]], folder: str | Path, function: Callable[[dict], tuple[dict[str, np.ndarray], dict[str, Any]]],
-    known: dict[str, Result] | None = None, processes: int = 1, say: Callable[[str], None] = lambda text: None,
-) -> dict[str, Result]:  # fmt: skip
-    """Do what the folder does not hold yet, in order, in so many processes at once; returns the results of all units by key.
+    units: Sequence[dict[str, Any]],
+    folder: str | Path,
+    function: Callable[[dict], tuple[dict[str, np.ndarray], dict[str, Any]]],
+    known: dict[str, Result] | None = None,
+    processes: int = 1,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Result]:
+    """Do what the folder does not hold yet, in order, in so many processes at once; returns the
+    results of all units by key.
 
     Args:
         units, folder: what is wanted, and where each result is written when it is done.
@@ -200,20 +260,31 @@ def work(
     return {key_of(unit): results[key_of(unit)] for unit in units}
 
 
-def finish(folder: str | Path, function: Callable, commit: str, command: str, unit: dict[str, Any]) -> Result:
-    """Do one unit as :func:`work` does, and write its result with commit, command, time and seconds."""
+def finish(
+    folder: str | Path, function: Callable, commit: str, command: str, unit: dict[str, Any]
+) -> Result:
+    """Do one unit as :func:`work` does, and write its result with commit, command, time and
+    seconds.
+    """
     begin = time.perf_counter()
     columns, extra = function(unit)
     origin = {
-        "commit": commit, "command": command, "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit,
+        "command": command,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": round(time.perf_counter() - begin, 2),
-    }  # fmt: skip
+    }
     return load(save(folder, Result(unit, columns, origin, extra)))[0]
 
 
 def _to_json(result: Result) -> dict[str, Any]:
     throws = {name: _plain(value) for name, value in result.columns.items()}
-    return {"unit": result.unit, "throws": throws, "provenance": result.provenance, "extra": result.extra}
+    return {
+        "unit": result.unit,
+        "throws": throws,
+        "provenance": result.provenance,
+        "extra": result.extra,
+    }
 
 
 def _plain(value: np.ndarray) -> list:

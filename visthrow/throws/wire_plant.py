@@ -1,4 +1,5 @@
-"""The training simulator's vehicle for the fake autopilot (`hil.fakes.process`), which takes its plant from outside.
+"""The training simulator's vehicle for the fake autopilot (`hil.fakes.process`), which takes its
+plant from outside.
 
 ``hil`` imports no simulator; it is given ``"visthrow.throws.wire_plant:make"``.
 """
@@ -14,18 +15,23 @@ from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
 MECHANISM = 0.06
-"""From the trip of the latch to separation behind a firmware [s]: a quick servo, so that the firmware's own delay has room
-within the lag that the policies were trained with."""
+"""From the trip of the latch to separation behind a firmware [s]: a quick servo, so that the
+firmware's own delay has room within the lag that the policies were trained with.
+"""
 
-CARRIED = 0.8  # share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all where it stands too high
+# share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all
+# where it stands too high
+CARRIED = 0.8
 
 
 class WirePlant:
     """One vehicle with its payload; NumPy in and out, batch axis left out.
 
     Attributes:
-        period: of a step [s]: commands that come between two control periods wait no longer than this.
-        home_w: hover point [m]. mass: with and without payload [kg]. max_thrust: that a thrust of 1 stands for [N].
+        period: of a step [s]: commands that come between two control periods wait no longer than
+            this.
+        home_w: hover point [m]. mass: with and without payload [kg]. max_thrust: that a thrust of 1
+            stands for [N].
     """
 
     period = 0.005
@@ -37,7 +43,10 @@ class WirePlant:
         self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
         self.max_thrust = experiment.task.action.max_thrust
         rng = np.random.default_rng(seed)
-        self._plant.reset(self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)), random_ropes(rng, 1, experiment.rope.segments, 0.05))
+        self._plant.reset(
+            self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)),
+            random_ropes(rng, 1, experiment.rope.segments, 0.05),
+        )
 
     def _built(self, experiment: Experiment) -> HybridPlant:
         return HybridPlant(self._fine(experiment))
@@ -45,14 +54,17 @@ class WirePlant:
     def _fine(self, experiment: Experiment) -> Experiment:
         """The experiment with this plant's period, nothing measured late."""
         observation = replace(experiment.task.observation, latency=(0.0, 0.0))
-        sim, task = replace(experiment.sim, control_period=self.period), replace(experiment.task, observation=observation)
+        sim, task = (
+            replace(experiment.sim, control_period=self.period),
+            replace(experiment.task, observation=observation),
+        )
         return replace(experiment, sim=sim, task=task)
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
 
-        ``release``: whether the latch trips in this period, so long after its beginning [s], or has before.
-        """
+        ``release``: whether the latch trips in this period, so long after its beginning [s], or has
+        before."""
         first = release and not self._plant.state.latched[0]
         self._plant.step(np.asarray(command)[None], np.array([release]))
         if first and after > 0.0:
@@ -90,12 +102,14 @@ def make(policy: str, seed: int) -> WirePlant:
 class MotorPlant(WirePlant):
     """The same vehicle without its rate controller, for a firmware that puts out motor commands.
 
-    Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``: thrust goes with the square of
-    the command and of the battery's voltage. The reference is the voltage that the controller's full thrust holds at. The vehicle
-    stands still at its start, the rope hanging, until its rotors nearly carry its weight.
+    Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``:
+    thrust goes with the square of the command and of the battery's voltage. The reference is the
+    voltage that the controller's full thrust holds at. The vehicle stands still at its start, the
+    rope hanging, until its rotors nearly carry its weight.
 
     Attributes:
-        force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it still stands.
+        force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it
+            still stands.
         quat_wb, rate_b: attitude xyzw and body rates [rad/s] now.
     """
 
@@ -103,22 +117,33 @@ class MotorPlant(WirePlant):
 
     def __init__(self, experiment: Experiment, seed: int) -> None:
         super().__init__(experiment, seed)
-        controller, thrust, battery = experiment.vehicle.controller, experiment.vehicle.thrust, experiment.vehicle.battery
+        controller, thrust, battery = (
+            experiment.vehicle.controller,
+            experiment.vehicle.thrust,
+            experiment.vehicle.battery,
+        )
         self._full_speed = (controller.max_thrust / thrust.k_f) ** 0.5
         mixing = controller.kind == "motor_mixing"
-        self._k_f, self._reference = thrust.k_f, controller.calibration_voltage if mixing else battery.reference_voltage
+        self._k_f, self._reference = (
+            thrust.k_f,
+            (controller.calibration_voltage if mixing else battery.reference_voltage),
+        )
         self._plant.stop_motors()
         self._stand: dict[str, np.ndarray] | None = self._plant.hold()
         self._look()
         self.force_b = np.array([0.0, 0.0, GRAVITY])
 
     def look(self) -> dict[str, np.ndarray]:
-        """Attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the charge now."""
+        """Attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the charge
+        now.
+        """
         names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
         return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
 
     def rope(self) -> list[np.ndarray]:
-        """Directions of the rope's segments and their derivatives [1/s], shapes (L, 3), world frame."""
+        """Directions of the rope's segments and their derivatives [1/s], shapes (L, 3), world
+        frame.
+        """
         return [value[0] for value in self._plant.look("cable_dir_w", "cable_vel_w")]
 
     def _look(self) -> None:
@@ -126,9 +151,16 @@ class MotorPlant(WirePlant):
         self.quat_wb, self.rate_b = self._now["quat_wb"], self._now["rate_b"]
 
     def _built(self, experiment: Experiment) -> HybridPlant:
-        queue = replace(experiment.vehicle.queue, delay=0.0)  # the firmware's own path comes in its place
-        vehicle, release = replace(experiment.vehicle, queue=queue), replace(experiment.release, lag=MECHANISM)
-        return HybridPlant(self._fine(replace(experiment, vehicle=vehicle, release=release)), motors=True)
+        queue = replace(
+            experiment.vehicle.queue, delay=0.0
+        )  # the firmware's own path comes in its place
+        vehicle, release = (
+            replace(experiment.vehicle, queue=queue),
+            replace(experiment.release, lag=MECHANISM),
+        )
+        return HybridPlant(
+            self._fine(replace(experiment, vehicle=vehicle, release=release)), motors=True
+        )
 
     @property
     def held(self) -> bool:
@@ -136,9 +168,13 @@ class MotorPlant(WirePlant):
         return self._stand is not None
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
-        """Advance by one period under motor commands, 0 to 1, shape (4,); release: see `WirePlant`."""
+        """Advance by one period under motor commands, 0 to 1, shape (4,); release: see
+        `WirePlant`.
+        """
         vel_w = self._now["vel_w"]
-        speed = self._full_speed * np.clip(command, 0.0, 1.0) * self._now["voltage"] / self._reference
+        speed = (
+            self._full_speed * np.clip(command, 0.0, 1.0) * self._now["voltage"] / self._reference
+        )
         super().step(speed, release and not self.held, after)
         self._look()
         if self._stand is None:

@@ -8,7 +8,8 @@ from visthrow.common.errors import DeviceError
 
 
 def resolve(name: str = "auto") -> str:
-    """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu`` or ``cuda:<i>``.
+    """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu``
+    or ``cuda:<i>``.
 
     Raises DeviceError if there is no such device.
     """
@@ -18,13 +19,16 @@ def resolve(name: str = "auto") -> str:
     exists = ["cpu", *(f"cuda:{i}" for i in range(count))]
     wanted = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
     if wanted not in exists:
-        raise DeviceError(f"device '{name}' is not there; expected auto or one of {', '.join(exists)}")
+        raise DeviceError(
+            f"device '{name}' is not there; expected auto or one of {', '.join(exists)}"
+        )
     return wanted
 
 
 @contextmanager
 def rounded_products(allowed: bool) -> Iterator[None]:
-    """Whether float32 products on a GPU may have TF32's ten bits while this lasts, which networks bear and rays of keypoints do not.
+    """Whether float32 products on a GPU may have TF32's ten bits while this lasts, which networks
+    bear and rays of keypoints do not.
 
     A CUDA graph keeps what held when it was captured.
     """

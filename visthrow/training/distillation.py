@@ -1,10 +1,12 @@
-"""A vision policy with a memory, distilled from a state policy: an estimator learns what the state policy looks at.
+"""A vision policy with a memory, distilled from a state policy: an estimator learns what the state
+policy looks at.
 
-The state policy decides; in place of its observation it is given the estimate that a recurrent network makes of all that a
-vision policy has seen (:mod:`visthrow.onboard.estimator`). The network flies from the first iteration on, and is fitted by
-regression to the exact observation on the states that it meets (DAgger: Ross et al., AISTATS 2011), with backpropagation
-through the whole throw. Throws that the exact observation flies would teach it to read the truth out of the action before.
-"""
+The state policy decides; in place of its observation it is given the estimate that a recurrent
+network makes of all that a vision policy has seen (:mod:`visthrow.onboard.estimator`). The network
+flies from the first iteration on, and is fitted by regression to the exact observation on the
+states that it meets (DAgger: Ross et al., AISTATS 2011), with backpropagation through the whole
+throw. Throws that the exact observation flies would teach it to read the truth out of the action
+before."""
 
 from types import SimpleNamespace
 
@@ -25,23 +27,33 @@ from visthrow.training.ppo.network import averaged, cosine_rate, normalizer_stat
 from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
-"""Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal and payload offsets [m]."""
+"""Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal
+and payload offsets [m].
+"""
 
 AVERAGED = 100  # gradient steps that the exported weights are a mean of, at most
 
-WATCHED = 50  # iterations in which the observations' mean and spread are taken; from there they stand still
+# iterations in which the observations' mean and spread are taken; from there they stand still
+WATCHED = 50
 
 
 class Network(nn.Module):
-    """The estimator as it is trained; see :class:`visthrow.onboard.estimator.Estimator` for its parts and shapes."""
+    """The estimator as it is trained; see :class:`visthrow.onboard.estimator.Estimator` for its
+    parts and shapes.
+    """
 
     def __init__(self, kept: Tensor, learnt: Tensor, width: int, hidden: int, memory: int):
-        """Begin with an estimate of what is kept: the entry of the observation that each estimate corrects, ``width`` for none, shape (S,).
+        """Begin with an estimate of what is kept: the entry of the observation that each estimate
+        corrects, ``width`` for none, shape (S,).
 
         ``learnt``: which estimates are learnt, bool, shape (S,). width: D. hidden: N. memory: H.
         """
         super().__init__()
-        self.encoder, self.gru, self.output = nn.Linear(width, hidden), nn.GRU(hidden, memory), nn.Linear(memory, len(kept))
+        self.encoder, self.gru, self.output = (
+            nn.Linear(width, hidden),
+            nn.GRU(hidden, memory),
+            nn.Linear(memory, len(kept)),
+        )
         with torch.no_grad():
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
@@ -74,48 +86,75 @@ class Distillation:
         self.cfg, self.p = experiment, experiment.distillation
         seen = experiment.task.observation
         if experiment.task.target.moves or seen.layout != "vision":
-            raise ConfigError('algorithm = "distillation" takes goals that stand still and observation.layout = "vision"')
+            raise ConfigError(
+                'algorithm = "distillation" takes goals that stand still and observation.layout ='
+                ' "vision"'
+            )
         self._ranks = ranks
         self.teacher = Policy.load(find_policy(self.p.teacher), device)
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
         self._layout = ob.layout_of(SimpleNamespace(**contract))
         if self._layout.name != "state" or self._layout.motion:
-            came = f"{self._layout.name!r}" + " with the goal's velocity" * bool(self._layout.motion)
-            raise ConfigError(f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state' without it")
+            came = f"{self._layout.name!r}" + " with the goal's velocity" * bool(
+                self._layout.motion
+            )
+            raise ConfigError(
+                f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state'"
+                " without it"
+            )
         self.env = env = ThrowEnv(experiment, device, seed)
         self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
         kept, learnt = _passed(env.layout, self._layout)
-        self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(device)
+        self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(
+            device
+        )
         ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
         make = {"device": device, "dtype": torch.float32}
-        self._scales = torch.cat([torch.full((width,), scale, **make) for width, scale in zip(widths, scales)])
-        self._obs, self._truth = torch.zeros(T, E, env.layout.dimension, **make), torch.zeros(T, E, self._layout.dimension, **make)
+        self._scales = torch.cat(
+            [torch.full((width,), scale, **make) for width, scale in zip(widths, scales)]
+        )
+        self._obs, self._truth = (
+            torch.zeros(T, E, env.layout.dimension, **make),
+            torch.zeros(T, E, self._layout.dimension, **make),
+        )
         self._alive = torch.zeros(T, E, **make)
         self._history = torch.zeros(E, 1 + self._layout.history, self._layout.payload, **make)
         self._flying = self.network.frozen()
         self.average = averaged(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=self.p.learning_rate, fused=on_gpu)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=self.p.learning_rate, fused=on_gpu
+        )
         self.rollout = Replayed(self._fly) if on_gpu else self._fly
 
     @torch.no_grad()
     def _fly(self) -> None:
-        """Fly one batch from new starts and record what was seen, what there was, and until when each throw lasted."""
+        """Fly one batch from new starts and record what was seen, what there was, and until when
+        each throw lasted.
+        """
         env, policy = self.env, self.teacher
-        seen, memory = env.reset()["actor"], torch.zeros(env.num_envs, self.p.memory, device=env.device)
+        seen, memory = (
+            env.reset()["actor"],
+            torch.zeros(env.num_envs, self.p.memory, device=env.device),
+        )
         alive = torch.ones_like(self._alive[0])
         fresh = alive > 0.0
         for k in range(self.p.horizon):
             self._obs[k].copy_(seen)
             truth, history = ob.observe(
-                self._layout, env.exact_frame(self._age), None, env.previous_action, env.views.state["attached"].float(), self._history,
+                self._layout,
+                env.exact_frame(self._age),
+                None,
+                env.previous_action,
+                env.views.state["attached"].float(),
+                self._history,
                 fresh if k == 0 else ~fresh,
-            )  # fmt: skip
+            )
             self._history.copy_(history)
             self._truth[k].copy_(truth)
             self._alive[k].copy_(alive)
@@ -137,12 +176,21 @@ class Distillation:
         """Fit the last rollout, each throw once an epoch."""
         total = torch.zeros((), device=self.env.device)
         for _ in range(self.p.epochs):
-            for rows in torch.randperm(self.env.num_envs, device=self.env.device).chunk(self.p.minibatches):
+            for rows in torch.randperm(self.env.num_envs, device=self.env.device).chunk(
+                self.p.minibatches
+            ):
                 obs, truth, alive = self._obs[:, rows], self._truth[:, rows], self._alive[:, rows]
                 estimate = self.network(obs)
-                off = F.smooth_l1_loss(estimate / self._scales, truth / self._scales, reduction="none").mean(-1)
-                wanted, action = act.clip_action(self.teacher.decide(truth)), self.teacher.decide(estimate)
-                wrong = (act.clip_action(action) - wanted).detach()  # beyond the limits only the way back counts
+                off = F.smooth_l1_loss(
+                    estimate / self._scales, truth / self._scales, reduction="none"
+                ).mean(-1)
+                wanted, action = (
+                    act.clip_action(self.teacher.decide(truth)),
+                    self.teacher.decide(estimate),
+                )
+                wrong = (
+                    act.clip_action(action) - wanted
+                ).detach()  # beyond the limits only the way back counts
                 acted = (wrong * action).sum(-1) if self.p.action_weight else 0.0
                 loss = (alive * (off + self.p.action_weight * acted)).sum() / alive.sum()
                 self.optimizer.zero_grad(set_to_none=True)
@@ -156,29 +204,50 @@ class Distillation:
         return {"value": float(total) / (self.p.epochs * self.p.minibatches)}
 
     def _refresh(self) -> None:
-        """Take the network's state into what flies, in place: a captured rollout reads these tensors."""
+        """Take the network's state into what flies, in place: a captured rollout reads these
+        tensors.
+        """
         for name, value in vars(self.network.frozen()).items():
             getattr(self._flying, name).copy_(value)
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         t = self.teacher.to("cpu")
-        estimator = Estimator(**{name: value.detach().cpu().clone() for name, value in vars(self.average.module.frozen()).items()})
-        return Policy(t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator)
+        estimator = Estimator(
+            **{
+                name: value.detach().cpu().clone()
+                for name, value in vars(self.average.module.frozen()).items()
+            }
+        )
+        return Policy(
+            t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator
+        )
 
     def take_up(self, policy: Policy) -> None:
         e, n = policy.estimator, self.network
         if e is None or e.input_weight.shape != n.gru.weight_ih_l0.shape:
-            raise ConfigError("--from: the policy has no estimator of this configuration's shape to start from")
-        parts = {"encoder.weight": e.encoder_weight, "encoder.bias": e.encoder_bias, "gru.weight_ih_l0": e.input_weight,
-                 "gru.bias_ih_l0": e.input_bias, "gru.weight_hh_l0": e.memory_weight, "gru.bias_hh_l0": e.memory_bias,
-                 "output.weight": e.output_weight, "output.bias": e.output_bias}  # fmt: skip
+            raise ConfigError(
+                "--from: the policy has no estimator of this configuration's shape to start from"
+            )
+        parts = {
+            "encoder.weight": e.encoder_weight,
+            "encoder.bias": e.encoder_bias,
+            "gru.weight_ih_l0": e.input_weight,
+            "gru.bias_ih_l0": e.input_bias,
+            "gru.weight_hh_l0": e.memory_weight,
+            "gru.bias_hh_l0": e.memory_bias,
+            "output.weight": e.output_weight,
+            "output.bias": e.output_bias,
+        }
         n.load_state_dict(n.state_dict() | parts)
         n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
         self.average.module.load_state_dict(n.state_dict())
         self._refresh()
 
     def state_dict(self) -> dict:
-        return {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer", "env")}
+        return {
+            name: getattr(self, name).state_dict()
+            for name in ("network", "average", "optimizer", "env")
+        }
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         for name in ("network", "average", "optimizer", *["env"] * own_throws):
@@ -187,11 +256,19 @@ class Distillation:
 
 
 def _passed(seen: ob.Layout, wanted: ob.Layout) -> tuple[Tensor, Tensor]:
-    """Which entry of a vision observation each entry of a state observation corrects, and which of these are learnt."""
-    none, vehicle, places = seen.dimension, list(range(ob.VEHICLE + 5)), seen.dimension - seen.motion - seen.located
+    """Which entry of a vision observation each entry of a state observation corrects, and which of
+    these are learnt.
+    """
+    none, vehicle, places = (
+        seen.dimension,
+        list(range(ob.VEHICLE + 5)),
+        seen.dimension - seen.motion - seen.located,
+    )
     goal = [places, places + 1] if seen.located else [none, none]
     between = wanted.dimension - len(vehicle) - len(goal) - 1
     kept = torch.tensor([*vehicle, *goal, *[none] * between, places - seen.validity - 1])
     learnt = torch.ones(wanted.dimension, dtype=torch.bool)
-    learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = False  # the action before and the latch are known
+    learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = (
+        False  # the action before and the latch are known
+    )
     return kept, learnt

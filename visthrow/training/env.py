@@ -1,8 +1,8 @@
 """ThrowEnv: the throwing task as rsl_rl's vectorised environment.
 
-A step is a chain of device operations without branches on data, allocations on the simulator's side or copies to the
-host, so a whole rollout can be captured in one CUDA graph (:mod:`visthrow.training.ppo.algorithm`). Every observation is a fresh tensor.
-"""
+A step is a chain of device operations without branches on data, allocations on the simulator's side
+or copies to the host, so a whole rollout can be captured in one CUDA graph
+(:mod:`visthrow.training.ppo.algorithm`). Every observation is a fresh tensor."""
 
 import math
 
@@ -29,31 +29,39 @@ from visthrow.training.device import rounded_products
 RESULTS = ("episodes", "released", "landing_error", "duration")
 """Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
 
-POSE = ob.VEHICLE + 3  # width of a pose sample: vehicle's part of a frame and the payload's position
+POSE = (
+    ob.VEHICLE + 3
+)  # width of a pose sample: vehicle's part of a frame and the payload's position
 
 
 class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
-    The critic sees what ``ppo.privileged`` names. ``exact``: vehicle, goal offset and payload history without noise, else
-    the actor's observation. ``payload_velocity`` [m/s]. ``release_timer``: to separation [s]. ``time``: since the start [s].
-    ``mass``: the vehicle's scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of payload
-    mass and cable length, where the task has them. ``mount``: the camera's rotation [rad] and offset [m] from its nominal
-    pose. ``pose_age``: of what is measured [s]. ``vehicle``: of a fleet, all of its set-up. The paper's critic (Sec. III-C and
-    IV-C; 38 numbers) is told the first two.
+    The critic sees what ``ppo.privileged`` names. ``exact``: vehicle, goal offset and payload
+    history without noise, else the actor's observation. ``payload_velocity`` [m/s].
+    ``release_timer``: to separation [s]. ``time``: since the start [s]. ``mass``: the vehicle's
+    scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of
+    payload mass and cable length, where the task has them. ``mount``: the camera's rotation [rad]
+    and offset [m] from its nominal pose. ``pose_age``: of what is measured [s]. ``vehicle``: of a
+    fleet, all of its set-up. The paper's critic (Sec. III-C and IV-C; 38 numbers) is told the first
+    two.
 
     Attributes:
-        last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m], ``duration`` [s] from the
-            policy's start to the payload's landing, ``landing_w`` [m], ``clearance`` [m]; each over (E,). Where goals move,
-            ``goal_w`` [m] too, where the goal is at impact.
+        last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m],
+            ``duration`` [s] from the policy's start to the payload's landing, ``landing_w`` [m],
+            ``clearance`` [m]; each over (E,). Where goals move, ``goal_w`` [m] too, where the goal
+            is at impact.
     """
 
-    def __init__(self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None):
+    def __init__(
+        self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None
+    ):
         """Build simulator and buffers and start all episodes.
 
         Args:
             experiment, device: plant, camera, task; "cpu" or "cuda:0".
-            seed: of the simulator's resets; torch's own generator draws the noise and is the caller's to seed.
+            seed: of the simulator's resets; torch's own generator draws the noise and is the
+                caller's to seed.
             count: number of environments; default the experiment's.
         """
         self.cfg, self.device, task = experiment, device, experiment.task
@@ -63,8 +71,13 @@ class ThrowEnv(VecEnv):
         plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
         ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
         share = len(ropes) // len(plants)
-        each = {name: [getattr(plant, name) for plant in plants for _ in range(share)] for name in ("vehicle", "air", "release")}
-        many = {f"{name}s": parts for name, parts in each.items()} if fleet or len(plants) > 1 else {}
+        each = {
+            name: [getattr(plant, name) for plant in plants for _ in range(share)]
+            for name in ("vehicle", "air", "release")
+        }
+        many = (
+            {f"{name}s": parts for name, parts in each.items()} if fleet or len(plants) > 1 else {}
+        )
         self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **many)
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
@@ -72,7 +85,9 @@ class ThrowEnv(VecEnv):
         self.camera = KeypointCamera(experiment.camera, device)
         E, make = self.num_envs, {"device": device, "dtype": torch.float32}
         self._max_thrust: float | Tensor = task.action.max_thrust
-        self._start_action = torch.tensor(act.hover_action(GRAVITY * plant_of(experiment).total_mass, self._max_thrust), **make)
+        self._start_action = torch.tensor(
+            act.hover_action(GRAVITY * plant_of(experiment).total_mass, self._max_thrust), **make
+        )
         self._setup = self._known = self._clock = None
         if fleet:
             each_of = torch.arange(E, device=device) % len(ropes) // share
@@ -80,8 +95,14 @@ class ThrowEnv(VecEnv):
             def of(values: list) -> Tensor:
                 return torch.tensor(values, **make)[each_of]
 
-            self._max_thrust, self._start_action = of([[m.max_thrust] for m in fleet]), of([m.first_action for m in fleet])
-            self._setup, self._known = of([m.setup(task.observation.setup) for m in fleet]), of([m.exact for m in fleet])
+            self._max_thrust, self._start_action = (
+                of([[m.max_thrust] for m in fleet]),
+                of([m.first_action for m in fleet]),
+            )
+            self._setup, self._known = (
+                of([m.setup(task.observation.setup) for m in fleet]),
+                of([m.exact for m in fleet]),
+            )
             self._clock = of([m.units.time for m in fleet])
             self.camera.radius = of([m.plant.rope.payload_radius for m in fleet])
         self._max_rate = torch.tensor(task.action.max_rate, **make)
@@ -92,7 +113,10 @@ class ThrowEnv(VecEnv):
         self._latency = torch.tensor(experiment.camera.noise.latency, **make)
         self._cargo: Tensor | None = None
         if task.start.payload_variants > 1:
-            scales = [[r.payload_mass / experiment.rope.payload_mass, r.length / experiment.rope.length] for r in ropes]
+            scales = [
+                [r.payload_mass / experiment.rope.payload_mass, r.length / experiment.rope.length]
+                for r in ropes
+            ]
             self._cargo = torch.tensor([scales[e % len(ropes)] for e in range(E)], **make)
         self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
@@ -100,7 +124,11 @@ class ThrowEnv(VecEnv):
 
     def _remembered(self) -> dict[str, Tensor]:
         """What an episode carries from step to step beside the simulator's state."""
-        task, E, make = self.cfg.task, self.num_envs, {"device": self.device, "dtype": torch.float32}
+        task, E, make = (
+            self.cfg.task,
+            self.num_envs,
+            {"device": self.device, "dtype": torch.float32},
+        )
         seen, latency, device = task.observation, self.cfg.camera.noise.history_length, self.device
         oldest = seen.oldest if self._clock is None else seen.oldest / float(self._clock.min())
         memory = {
@@ -113,7 +141,9 @@ class ThrowEnv(VecEnv):
             "extrinsic_rotation": torch.zeros(E, 3, **make),
             "extrinsic_offset": torch.zeros(E, 3, **make),
             "pose_age": torch.zeros(E, **make),
-            "poses": torch.zeros(E, 1 + max(math.ceil(oldest / self.cfg.sim.control_period - 1e-6), 1), POSE, **make),
+            "poses": torch.zeros(
+                E, 1 + max(math.ceil(oldest / self.cfg.sim.control_period - 1e-6), 1), POSE, **make
+            ),
             "scale_error": torch.zeros(E, 1, 1, **make),
             "held_points": torch.zeros(E, KEYPOINTS, 2, **make),
             "held_valid": torch.zeros(E, KEYPOINTS, device=device, dtype=torch.bool),
@@ -141,14 +171,20 @@ class ThrowEnv(VecEnv):
         return self._memory["pose_age"]
 
     def extrinsics(self) -> tuple[Tensor, Tensor] | None:
-        """Mounts of these episodes' cameras (:meth:`camera.keypoints.KeypointCamera.extrinsics`); None where all are nominal."""
+        """Mounts of these episodes' cameras (:meth:`camera.keypoints.KeypointCamera.extrinsics`);
+        None where all are nominal.
+        """
         mount = self.cfg.camera.mount
         if mount.rotation_error_std == 0.0 and mount.position_error_std == 0.0:
             return None
-        return self.camera.extrinsics(self._memory["extrinsic_rotation"], self._memory["extrinsic_offset"])
+        return self.camera.extrinsics(
+            self._memory["extrinsic_rotation"], self._memory["extrinsic_offset"]
+        )
 
     def exact_frame(self, age: float) -> Tensor:
-        """State frame without noise, shape (E, 20), as it was so long ago [s], at most a control period."""
+        """State frame without noise, shape (E, 20), as it was so long ago [s], at most a control
+        period.
+        """
         newer, older = self._memory["poses"][:, :2].unbind(1)
         pose = torch.lerp(newer, older, age / self.cfg.sim.control_period)
         offset = ob.state_part(pose[:, :3], self.views.goal_w, pose[:, ob.VEHICLE :])
@@ -157,8 +193,8 @@ class ThrowEnv(VecEnv):
     def begin_throws(self, found: tuple[Tensor, Tensor]) -> TensorDict:
         """Begin throws where the vehicles are, with what a calibration in the hover before found.
 
-        Keypoints are corrected from here on for the cameras' turns [rad], shape (E, 3), and errors of focal length [-], shape (E,).
-        """
+        Keypoints are corrected from here on for the cameras' turns [rad], shape (E, 3), and errors
+        of focal length [-], shape (E,)."""
         self._found = found
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
         self.episode_length_buf.zero_()
@@ -167,7 +203,9 @@ class ThrowEnv(VecEnv):
         return self._observations
 
     def fix_goal(self, goal_w: Tensor | None) -> None:
-        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones again (None)."""
+        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones
+        again (None).
+        """
         self._goal = goal_w
 
     def _start(self, fresh: Tensor) -> None:
@@ -185,8 +223,8 @@ class ThrowEnv(VecEnv):
     def episode_means(self) -> dict[str, float]:
         """Means over the episodes that finished since :meth:`clear_totals`, and their number.
 
-        ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are means over the released.
-        """
+        ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are
+        means over the released."""
         totals = dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
         released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
         means = {name: totals[name] / released for name in ("landing_error", "duration")}
@@ -205,7 +243,8 @@ class ThrowEnv(VecEnv):
         return self._observations.clone()
 
     def carry(self, actions: Tensor, mask: wp.array | None = None) -> TensorDict:
-        """Apply unclipped actions, shape (E, 5), for one control period with the latch shut, whatever becomes of it: no episode ends.
+        """Apply unclipped actions, shape (E, 5), for one control period with the latch shut,
+        whatever becomes of it: no episode ends.
 
         ``mask``: plants that move on, shape (E,), int32; default all.
         """
@@ -214,15 +253,22 @@ class ThrowEnv(VecEnv):
         return self._observations
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start anew.
+        """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start
+        anew.
 
-        Returns observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a negative end and must not be
-        bootstrapped, so there are no ``time_outs``.
-        """
+        Returns observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a
+        negative end and must not be bootstrapped, so there are no ``time_outs``."""
         action = self._apply(actions)
         reward, done = self._judge(action)
         hit = self.last["released"].to(torch.float32)
-        rows = torch.stack([done.to(torch.float32), hit, self.last["landing_error"] * hit, self.last["duration"] * hit])
+        rows = torch.stack(
+            [
+                done.to(torch.float32),
+                hit,
+                self.last["landing_error"] * hit,
+                self.last["duration"] * hit,
+            ]
+        )
         self._memory["totals"] += rows.sum(-1, dtype=torch.float64)
         self._start(done)
         self._memory["previous"].copy_(action)
@@ -234,10 +280,15 @@ class ThrowEnv(VecEnv):
         """Fly one control period; returns the clipped actions."""
         task, memory = self.cfg.task, self._memory
         action = act.clip_action(actions)
-        noisy = action[:, : act.COMMANDS] + torch.randn_like(memory["command_bias"]) * task.noise.command_step
+        noisy = (
+            action[:, : act.COMMANDS]
+            + torch.randn_like(memory["command_bias"]) * task.noise.command_step
+        )
         noisy = noisy + memory["command_bias"]
         self.views.command.copy_(act.command_from_action(noisy, self._max_thrust, self._max_rate))
-        self.views.release.copy_(act.release_asked(actions, self.cfg.release.threshold) & (not hold))
+        self.views.release.copy_(
+            act.release_asked(actions, self.cfg.release.threshold) & (not hold)
+        )
         with on_torch_stream(self.device):
             self.sim.step(mask)
         if task.target.moves:
@@ -247,12 +298,28 @@ class ThrowEnv(VecEnv):
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step just made."""
-        task, state, out, period = self.cfg.task, self.views.state, self.views.out, self.cfg.sim.control_period
-        p, time, released, latched = task.reward, self.episode_length_buf * period, out["separated"] != 0, state["release_timer"] >= 0.0
+        task, state, out, period = (
+            self.cfg.task,
+            self.views.state,
+            self.views.out,
+            self.cfg.sim.control_period,
+        )
+        p, time, released, latched = (
+            task.reward,
+            self.episode_length_buf * period,
+            out["separated"] != 0,
+            state["release_timer"] >= 0.0,
+        )
         negative = ~released & terminations.negative(
-            task.bounds, state["pos_w"], ob.rotation_from_quat(state["quat_wb"]), out["payload_pos_w"], state["status"], latched, time,
+            task.bounds,
+            state["pos_w"],
+            ob.rotation_from_quat(state["quat_wb"]),
+            out["payload_pos_w"],
+            state["status"],
+            latched,
+            time,
             self.cfg.release.landing_height,
-        )  # fmt: skip
+        )
         goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
         error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
         attached = (
@@ -265,10 +332,20 @@ class ThrowEnv(VecEnv):
             + rewards.time_of_flight(p, out["time_to_impact"])
             + rewards.proximity(p, out["clearance"], self.cfg.release.clearance_margin)
         )
-        reward = torch.where(released, at_release, attached) + rewards.carry_time(p, period) - p.termination * negative
+        reward = (
+            torch.where(released, at_release, attached)
+            + rewards.carry_time(p, period)
+            - p.termination * negative
+        )
         duration = time - period + out["separation_time"] + out["time_to_impact"]
         copied = {name: out[name].clone() for name in ("landing_w", "clearance")}
-        self.last = {"released": released, "negative": negative, "landing_error": error, "duration": duration, "action": action} | copied
+        self.last = {
+            "released": released,
+            "negative": negative,
+            "landing_error": error,
+            "duration": duration,
+            "action": action,
+        } | copied
         if task.target.moves:
             self.last["goal_w"] = goal
         return p.scale * reward, released | negative
@@ -285,10 +362,13 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf.masked_fill_(fresh, 0)
         torch.where(fresh[:, None], self._start_action, memory["previous"], out=memory["previous"])
         spreads = {
-            "frame_bias": noise.observation_bias, "command_bias": noise.command_bias, "keypoint_bias": camera.noise.bias_std,
-            "extrinsic_rotation": camera.mount.rotation_error_std, "extrinsic_offset": camera.mount.position_error_std,
+            "frame_bias": noise.observation_bias,
+            "command_bias": noise.command_bias,
+            "keypoint_bias": camera.noise.bias_std,
+            "extrinsic_rotation": camera.mount.rotation_error_std,
+            "extrinsic_offset": camera.mount.position_error_std,
             "scale_error": camera.noise.scale_std,
-        }  # fmt: skip
+        }
         for name, std in spreads.items():
             if std > 0.0:
                 old = memory[name]
@@ -304,7 +384,9 @@ class ThrowEnv(VecEnv):
             velocity = memory["goal_vel"]
             drawn = torch.rand_like(velocity[:, :2])
             speed, heading = slow + (fast - slow) * drawn[:, 0], 2.0 * math.pi * drawn[:, 1]
-            new = torch.stack([speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)], dim=-1)
+            new = torch.stack(
+                [speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)], dim=-1
+            )
             velocity.copy_(torch.where(fresh[:, None], new, velocity))
 
     def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
@@ -333,7 +415,10 @@ class ThrowEnv(VecEnv):
         attached = state["attached"].to(torch.float32)
         pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
         late_goal = self._goal_in(-memory["pose_age"])
-        seen = torch.cat([pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], late_goal, pose[:, ob.VEHICLE :])], dim=-1)
+        seen = torch.cat(
+            [pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], late_goal, pose[:, ob.VEHICLE :])],
+            dim=-1,
+        )
         measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":
@@ -345,20 +430,39 @@ class ThrowEnv(VecEnv):
         time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
         goal_vel = places = answers = None
         if self.layout.fits:
-            fitted = goal_motion.fitted_goal(self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh)
+            fitted = goal_motion.fitted_goal(
+                self.layout, measured, valid, self.camera, memory["goal_fit"], time, fresh
+            )
             memory["goal_fit"].copy_(fitted.sums)
             _, goal_vel, places, measured, valid = fitted
         if self.layout.response:
-            memory["answers"].copy_(hist.push(memory["answers"], ob.answer(measured, memory["previous"]), fresh))
+            memory["answers"].copy_(
+                hist.push(memory["answers"], ob.answer(measured, memory["previous"]), fresh)
+            )
             answers = memory["answers"][:, 1:]
         actor, history = ob.observe(
-            self.layout, measured, valid, memory["previous"], attached, memory["history"], fresh, goal_vel, places, answers, self._setup
+            self.layout,
+            measured,
+            valid,
+            memory["previous"],
+            attached,
+            memory["history"],
+            fresh,
+            goal_vel,
+            places,
+            answers,
+            self._setup,
         )
         memory["history"].copy_(history)
-        observed = {"actor": actor, "critic": self._privileged(actor, vehicle, payload, time, fresh)}
+        observed = {
+            "actor": actor,
+            "critic": self._privileged(actor, vehicle, payload, time, fresh),
+        }
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
-    def _privileged(self, actor: Tensor, vehicle: Tensor, payload: Tensor, time: Tensor, fresh: Tensor) -> Tensor:
+    def _privileged(
+        self, actor: Tensor, vehicle: Tensor, payload: Tensor, time: Tensor, fresh: Tensor
+    ) -> Tensor:
         """Critic's view: what ``ppo.privileged`` names."""
         state, memory, named = self.views.state, self._memory, self.cfg.ppo.privileged
         parts = [actor]
@@ -368,18 +472,28 @@ class ThrowEnv(VecEnv):
             memory["true_history"].copy_(true_history)
             parts = [vehicle, memory["previous"], offset[:, :2], true_history.flatten(1)]
         known = (
-            ("payload_velocity", self.views.out["payload_vel_w"]), ("release_timer", state["release_timer"][:, None]),
-            ("time", time[:, None]), ("mass", state["mass_scale"][:, None]), ("voltage", state["voltage"][:, None]),
+            ("payload_velocity", self.views.out["payload_vel_w"]),
+            ("release_timer", state["release_timer"][:, None]),
+            ("time", time[:, None]),
+            ("mass", state["mass_scale"][:, None]),
+            ("voltage", state["voltage"][:, None]),
             ("exact", state["attached"].to(torch.float32)[:, None]),
-            ("goal_velocity", memory["goal_vel"][:, :2] if self.cfg.task.target.moves else None), ("cargo", self._cargo),
-            ("mount", memory["extrinsic_rotation"]), ("mount", memory["extrinsic_offset"]), ("pose_age", memory["pose_age"][:, None]),
+            ("goal_velocity", memory["goal_vel"][:, :2] if self.cfg.task.target.moves else None),
+            ("cargo", self._cargo),
+            ("mount", memory["extrinsic_rotation"]),
+            ("mount", memory["extrinsic_offset"]),
+            ("pose_age", memory["pose_age"][:, None]),
             ("vehicle", self._known),
-        )  # fmt: skip
+        )
         parts += [value for name, value in known if name in named and value is not None]
         return torch.cat(parts, dim=-1) if len(parts) > 1 else actor
 
-    def _see(self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
-        """Keypoints as the detector reports them: errors of mount and focal length, latency, noise, drop-out, held images."""
+    def _see(
+        self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Keypoints as the detector reports them: errors of mount and focal length, latency, noise,
+        drop-out, held images.
+        """
         memory, camera = self._memory, self.cfg.camera
         points, valid = keypoints(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
         if camera.noise.seen_radius < 1.0:
@@ -389,7 +503,9 @@ class ThrowEnv(VecEnv):
         if camera.noise.latency > 0.0:
             memory["late_points"].copy_(hist.push(memory["late_points"], points, fresh))
             memory["late_valid"].copy_(hist.push(memory["late_valid"], valid, fresh))
-            points, valid = apply_latency(memory["late_points"], memory["late_valid"], self._latency)
+            points, valid = apply_latency(
+                memory["late_points"], memory["late_valid"], self._latency
+            )
         draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
         if camera.noise.wrong_probability > 0.0:
             draw = draw._replace(wrong=torch.rand(*points.shape[:2], 3, device=points.device))
@@ -400,22 +516,43 @@ class ThrowEnv(VecEnv):
             valid = torch.where(held[:, None], memory["held_valid"], valid)
             memory["held_points"].copy_(points)
             memory["held_valid"].copy_(valid)
-        return (points, valid) if self._found is None else corrected_keypoints(self.camera, points, valid, *self._found)
+        return (
+            (points, valid)
+            if self._found is None
+            else corrected_keypoints(self.camera, points, valid, *self._found)
+        )
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""
-        groups = {"sim": self.views.state, "out": self.views.out, "memory": self._memory, "obs": self._observations}
-        found = {f"{group}.{name}": tensor for group, tensors in groups.items() for name, tensor in tensors.items()}
-        return found | {"episode": wp.to_torch(self.sim.episode), "goal_w": self.views.goal_w, "length": self.episode_length_buf}
+        groups = {
+            "sim": self.views.state,
+            "out": self.views.out,
+            "memory": self._memory,
+            "obs": self._observations,
+        }
+        found = {
+            f"{group}.{name}": tensor
+            for group, tensors in groups.items()
+            for name, tensor in tensors.items()
+        }
+        return found | {
+            "episode": wp.to_torch(self.sim.episode),
+            "goal_w": self.views.goal_w,
+            "length": self.episode_length_buf,
+        }
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copy of all that the next step depends on, besides torch's generators."""
         return {k: v.clone() for k, v in self._tensors().items()}
 
     def load_state_dict(self, saved: dict[str, Tensor]) -> None:
-        """Take up a state of :meth:`state_dict`; ValueError where it is of an environment of another experiment or size."""
+        """Take up a state of :meth:`state_dict`; ValueError where it is of an environment of
+        another experiment or size.
+        """
         for name, target in self._tensors().items():
             if name not in saved or saved[name].shape != target.shape:
                 have = tuple(saved[name].shape) if name in saved else "nothing"
-                raise ValueError(f"environment state {name!r}; expected shape {tuple(target.shape)}, got {have}")
+                raise ValueError(
+                    f"environment state {name!r}; expected shape {tuple(target.shape)}, got {have}"
+                )
             target.copy_(saved[name])

@@ -1,4 +1,6 @@
-"""Progress of a training run: a picture on the terminal, lines where there is none, a CSV row an iteration."""
+"""Progress of a training run: a picture on the terminal, lines where there is none, a CSV row an
+iteration.
+"""
 
 import csv
 import io
@@ -13,9 +15,22 @@ from visthrow.task.measurement import Throws
 from visthrow.view import terminal
 
 COLUMNS = (
-    "iteration", "released", "landing_error", "duration", "episodes", "value", "surrogate", "entropy", "learning_rate",
-    "rollout_s", "learning_s", "wall_s", "error_2m", "duration_2m", "landed_2m",
-)  # fmt: skip
+    "iteration",
+    "released",
+    "landing_error",
+    "duration",
+    "episodes",
+    "value",
+    "surrogate",
+    "entropy",
+    "learning_rate",
+    "rollout_s",
+    "learning_s",
+    "wall_s",
+    "error_2m",
+    "duration_2m",
+    "landed_2m",
+)
 
 REDRAWN = 0.5  # between two pictures [s]
 
@@ -27,10 +42,12 @@ REACH = 0.3  # half of the square about the target that the scatter shows [m]
 class TrainLog:
     """Open log of one run, to be used as a context manager.
 
-    A resumed run keeps the rows up to its checkpoint and drops later ones, a torn last row included: they are made again.
-    """
+    A resumed run keeps the rows up to its checkpoint and drops later ones, a torn last row
+    included: they are made again."""
 
-    def __init__(self, path: Path, samples: int, last: int, done: int = 0, minutes: float | None = None):
+    def __init__(
+        self, path: Path, samples: int, last: int, done: int = 0, minutes: float | None = None
+    ):
         """Open the CSV file.
 
         Args:
@@ -49,12 +66,16 @@ class TrainLog:
         self._picture = Picture(rows) if sys.stdout.isatty() else None
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
-        self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        self._writer = csv.DictWriter(
+            self._file, COLUMNS, extrasaction="ignore", lineterminator="\n"
+        )
 
     def __enter__(self) -> "TrainLog":
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             self._file.close()
         except OSError:
@@ -62,16 +83,23 @@ class TrainLog:
                 raise
 
     def row(self, figures: dict, throws: Throws | None = None) -> None:
-        """Write one iteration's figures and, where it ended in throws, what came of them; OSError where the disk is full."""
+        """Write one iteration's figures and, where it ended in throws, what came of them; OSError
+        where the disk is full.
+        """
         gone = time.perf_counter() - self._start
-        figures = figures | {"wall_s": self._before + gone} | (evaluated(throws) if throws is not None else {})
+        figures = (
+            figures
+            | {"wall_s": self._before + gone}
+            | (evaluated(throws) if throws is not None else {})
+        )
         self._writer.writerow(figures)
         self._file.flush()
         speed = self.samples / (figures["rollout_s"] + figures["learning_s"]) / 1e6
         text = (
-            f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released {100 * figures['released']:.0f} %  "
-            f"landing error {figures['landing_error']:.3f} m  {terminal.clock(figures['wall_s'])}, "
-            f"{terminal.clock(self._left(figures['iteration'], gone))} left"
+            f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
+            f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
+            f" {terminal.clock(figures['wall_s'])},"
+            f" {terminal.clock(self._left(figures['iteration'], gone))} left"
         )
         if self._picture is not None:
             self._picture.draw(text, figures, throws)
@@ -87,12 +115,20 @@ class TrainLog:
 
 
 class Picture:
-    """Landing error against wall time, and where the last evaluation's throws landed, drawn over itself."""
+    """Landing error against wall time, and where the last evaluation's throws landed, drawn over
+    itself.
+    """
 
     def __init__(self, rows: Sequence[dict]):
         """Begin with the rows of a resumed run."""
-        self._training = [(float(row["wall_s"]), float(row["landing_error"])) for row in rows if row["landing_error"]]
-        self._thrown = [(float(row["wall_s"]), float(row["error_2m"])) for row in rows if row["error_2m"]]
+        self._training = [
+            (float(row["wall_s"]), float(row["landing_error"]))
+            for row in rows
+            if row["landing_error"]
+        ]
+        self._thrown = [
+            (float(row["wall_s"]), float(row["error_2m"])) for row in rows if row["error_2m"]
+        ]
         self._last: Throws | None = None
         self._said, self._lines, self._drawn = "no evaluation yet", 0, 0.0
 
@@ -119,23 +155,37 @@ class Picture:
             offsets = last.landing_w - ((last.target, 0.0) if last.goal_w is None else last.goal_w)
             points = [(-float(y), float(x)) for x, y in offsets[last.success]]
         right = terminal.scatter(points, REACH, *SCATTER)
-        heads = "landing error: . training, o throws at 2.0 m", f"landings within {REACH:g} m: {self._said}"
+        heads = (
+            "landing error: . training, o throws at 2.0 m",
+            f"landings within {REACH:g} m: {self._said}",
+        )
         return terminal.side_by_side([heads[0], *left], [heads[1], *right])
 
 
 def evaluated(throws: Throws) -> dict[str, float]:
     """Columns of an evaluation; no error where none landed."""
     row, nan = throws.summary(), float("nan")
-    return {"error_2m": row.get("error_mean", nan), "duration_2m": row.get("duration_mean", nan), "landed_2m": row["success"]}
+    return {
+        "error_2m": row.get("error_mean", nan),
+        "duration_2m": row.get("duration_mean", nan),
+        "landed_2m": row["success"],
+    }
 
 
 def figures_text(figures: dict) -> str:
     """An evaluation in words."""
-    return f"{figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s, landed {100 * figures['landed_2m']:.1f} %"
+    return (
+        f"{figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s, landed"
+        f" {100 * figures['landed_2m']:.1f} %"
+    )
 
 
 def _rows(path: Path, done: int) -> list[dict]:
     """Whole rows of a log up to an iteration."""
     with path.open(newline="", encoding="utf-8") as file:
-        whole = [row for row in csv.DictReader(file) if (row.get("iteration") or "").isdigit() and row[COLUMNS[-1]] is not None]
+        whole = [
+            row
+            for row in csv.DictReader(file)
+            if (row.get("iteration") or "").isdigit() and row[COLUMNS[-1]] is not None
+        ]
     return [row for row in whole if int(row["iteration"]) <= done]

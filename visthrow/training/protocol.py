@@ -1,4 +1,6 @@
-"""The paper's measurement in the training simulator: throws from hover, scored as :mod:`visthrow.task.measurement` says."""
+"""The paper's measurement in the training simulator: throws from hover, scored as
+:mod:`visthrow.task.measurement` says.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,22 +15,34 @@ from visthrow.training.env import ThrowEnv
 
 
 def hover_start(experiment: Experiment) -> Experiment:
-    """The experiment with its episodes started from hover; cables and payloads vary as in the experiment."""
+    """The experiment with its episodes started from hover; cables and payloads vary as in the
+    experiment.
+    """
     kept = ("tether_variants", "tether_spread", "payload_variants", "payload_spread", "drag_spread")
-    start = dataclasses.replace(pilots_hover(), **{name: getattr(experiment.task.start, name) for name in kept})
+    start = dataclasses.replace(
+        pilots_hover(), **{name: getattr(experiment.task.start, name) for name in kept}
+    )
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
 
 
 def throw(
-    experiment: Experiment, policy, target: float, count: int, device: str = "cpu", seed: int = 0,
-    build: Callable[..., ThrowEnv] = ThrowEnv, begin: Callable[[ThrowEnv], TensorDict] = ThrowEnv.reset,
-) -> Throws:  # fmt: skip
-    """Throw ``count`` times in the training simulator, with all its noise, as one batch, at a target [m] along x.
+    experiment: Experiment,
+    policy,
+    target: float,
+    count: int,
+    device: str = "cpu",
+    seed: int = 0,
+    build: Callable[..., ThrowEnv] = ThrowEnv,
+    begin: Callable[[ThrowEnv], TensorDict] = ThrowEnv.reset,
+) -> Throws:
+    """Throw ``count`` times in the training simulator, with all its noise, as one batch, at a
+    target [m] along x.
 
     Args:
         experiment: its start is replaced by :func:`hover_start`.
         policy: function of observations (E, D) -> actions (E, 5), on the device.
-        target, count, device, seed: of starts and noise; torch's generators are put back afterwards.
+        target, count, device, seed: of starts and noise; torch's generators are put back
+            afterwards.
         build: makes the environment, as the class does.
         begin: brings it to where the throws begin and returns what is observed there.
     """
@@ -40,7 +54,9 @@ def throw(
         return _fly(env, policy, target, count, begin)
 
 
-def _fly(env: ThrowEnv, policy, target: float, count: int, begin: Callable[[ThrowEnv], TensorDict]) -> Throws:
+def _fly(
+    env: ThrowEnv, policy, target: float, count: int, begin: Callable[[ThrowEnv], TensorDict]
+) -> Throws:
     observations, previous = begin(env), env.previous_action.clone()
     open_ = torch.ones(count, dtype=torch.bool, device=env.device)
     kept: dict[str, torch.Tensor] = {}
@@ -62,6 +78,9 @@ def _fly(env: ThrowEnv, policy, target: float, count: int, begin: Callable[[Thro
     blank = np.where(success, 1.0, np.nan)
     array = {k: v.cpu().numpy().astype(np.float64) for k, v in kept.items()}
     smoothness = (change / steps.clamp(min=1)).sqrt().cpu().numpy().astype(np.float64)
-    landing_w, goal_w = (array[name][:, :2] * blank[:, None] if name in array else None for name in ("landing_w", "goal_w"))
+    landing_w, goal_w = (
+        array[name][:, :2] * blank[:, None] if name in array else None
+        for name in ("landing_w", "goal_w")
+    )
     measured = (array[name] * blank for name in ("landing_error", "duration", "clearance"))
     return Throws(target, success, landing_w, *measured, smoothness * blank, goal_w)

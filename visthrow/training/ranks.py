@@ -1,4 +1,6 @@
-"""The processes of one training, a GPU or a share of the cores each: what they agree on and what they share."""
+"""The processes of one training, a GPU or a share of the cores each: what they agree on and what
+they share.
+"""
 
 import gc
 import io
@@ -25,7 +27,9 @@ class Ranks:
     @classmethod
     def join(cls, on_gpu: bool) -> "Ranks":
         """Join the processes that torchrun started, over NCCL on GPUs and Gloo on CPUs."""
-        rank, local, world = (int(os.environ[name]) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"))
+        rank, local, world = (
+            int(os.environ[name]) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE")
+        )
         if on_gpu:
             torch.cuda.set_device(local)
         distributed.init_process_group("nccl" if on_gpu else "gloo", rank=rank, world_size=world)
@@ -39,7 +43,11 @@ class Ranks:
     @property
     def rsl_rl(self) -> dict | None:
         """rsl_rl's ``multi_gpu`` dictionary."""
-        return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.world} if self.world > 1 else None
+        return (
+            {"global_rank": self.rank, "local_rank": self.local, "world_size": self.world}
+            if self.world > 1
+            else None
+        )
 
     def share(self, *modules: nn.Module) -> None:
         """Give every process the first one's weights and buffers."""
@@ -62,17 +70,26 @@ class Ranks:
         return int(given)
 
     def gather(self, state: dict) -> list[Tensor]:
-        """Every process' state as torch saves it, in the order of ranks; of use to the lead alone."""
+        """Every process' state as torch saves it, in the order of ranks; of use to the
+        lead alone.
+        """
         buffer = io.BytesIO()
         torch.save(state, buffer)
         own = buffer.getvalue()
         saved: list[bytes] = [own] * self.world
         if self.world > 1:
             distributed.gather_object(own, saved if self.lead else None)
-        return [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved] if self.lead else []
+        return (
+            [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved]
+            if self.lead
+            else []
+        )
 
     def leave(self) -> None:
-        """Part from the others. No CUDA graph with collectives may be left: NCCL would wait for it for ever."""
+        """Part from the others.
+
+        No CUDA graph with collectives may be left: NCCL would wait for it for ever.
+        """
         if self.world > 1:
             gc.collect()
             distributed.destroy_process_group()

@@ -1,8 +1,9 @@
-"""The paper's reward, term by term (Eqs. 2 to 5, Table II), with coefficients from ``[reward]`` of ``configs/task``.
+"""The paper's reward, term by term (Eqs. 2 to 5, Table II), with coefficients from ``[reward]`` of
+``configs/task``.
 
-Each term is a function of tensors over the batch. ``u`` is the clipped normalised action; its rates enter ``command`` and its
-four commands ``change`` (the paper leaves the unit of u open; normalised, chosen so that Table II's weights are of one order).
-"""
+Each term is a function of tensors over the batch. ``u`` is the clipped normalised action; its rates
+enter ``command`` and its four commands ``change`` (the paper leaves the unit of u open; normalised,
+chosen so that Table II's weights are of one order)."""
 
 from torch import Tensor
 
@@ -20,12 +21,16 @@ def kinetic(p: RewardParams, vel_w: Tensor, rate_b: Tensor, payload_vel_w: Tenso
 
 
 def command(p: RewardParams, action: Tensor, weights: Tensor) -> Tensor:
-    """r_cmd: -beta sum_i c^omega_i u_i^2 over the three rate commands, shape (E,). weights: c^omega, shape (3,)."""
+    """r_cmd: -beta sum_i c^omega_i u_i^2 over the three rate commands, shape (E,). weights:
+    c^omega, shape (3,).
+    """
     return -p.smoothness * (weights * action[:, 1:4].square()).sum(-1)
 
 
 def change(p: RewardParams, action: Tensor, previous: Tensor, weights: Tensor) -> Tensor:
-    """r_rate: -beta sum_j c^Delta_j (eta |du_j| + du_j^2) over the four commands, shape (E,). weights: shape (4,)."""
+    """r_rate: -beta sum_j c^Delta_j (eta |du_j| + du_j^2) over the four commands, shape (E,).
+    weights: shape (4,).
+    """
     delta = action[:, :4] - previous[:, :4]
     return -p.smoothness * (weights * (p.l1_mix * delta.abs() + delta.square())).sum(-1)
 
@@ -36,7 +41,9 @@ def carry_time(p: RewardParams, period: float) -> float:
 
 
 def landing(p: RewardParams, error: Tensor) -> Tensor:
-    """r_land: k_l exp(-lambda error), shape (E,). error: distance of impact and goal [m], shape (E,)."""
+    """r_land: k_l exp(-lambda error), shape (E,). error: distance of impact and goal [m], shape
+    (E,).
+    """
     return p.landing * (-p.landing_decay * error).exp()
 
 

@@ -1,8 +1,9 @@
-"""A training from its beginning or a checkpoint to its policy: log, evaluations on the way, checkpoints, an orderly stop.
+"""A training from its beginning or a checkpoint to its policy: log, evaluations on the way,
+checkpoints, an orderly stop.
 
-It stops at its last iteration, at an error that was asked for, by the clock, or at Ctrl-C and SIGTERM. Each stop leaves ``policy.npz``,
-``checkpoint.pt`` and ``progress.csv`` in the folder of the run.
-"""
+It stops at its last iteration, at an error that was asked for, by the clock, or at Ctrl-C and
+SIGTERM. Each stop leaves ``policy.npz``, ``checkpoint.pt`` and ``progress.csv`` in the folder of
+the run."""
 
 import contextlib
 import json
@@ -31,7 +32,10 @@ from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, f
 
 EVALUATION_TARGET = 2.0  # [m]
 
-EVALUATION_SHARE, CHECKPOINT_SHARE = 0.05, 0.01  # of the wall time that each may take where its number is left to the command
+EVALUATION_SHARE, CHECKPOINT_SHARE = (
+    0.05,
+    0.01,
+)  # of the wall time that each may take where its number is left to the command
 
 FIRST = 20.0  # time after which the first of them comes then: what it costs is not known before [s]
 
@@ -66,7 +70,9 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
     name = device.resolve(args.device)
     ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
     start = time.perf_counter()
-    trainer = Trainer(experiment, ranks.device, seed, ranks)  # refuses what cannot be trained before a folder is made
+    trainer = Trainer(
+        experiment, ranks.device, seed, ranks
+    )  # refuses what cannot be trained before a folder is made
     if args.resume:
         trainer.load(folder / CHECKPOINT)
     elif policy is not None:
@@ -75,7 +81,9 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
     if ranks.lead:
         told: dict[str, Any] = {"seed": seed, "processes": ranks.world}
         if policy is not None:
-            made = {k: policy.made_by[k] for k in ("commit", "command", "seed") if k in policy.made_by}
+            made = {
+                k: policy.made_by[k] for k in ("commit", "command", "seed") if k in policy.made_by
+            }
             told["from"] = {"policy": Path(args.start).name, **made}
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
     why = _loop(args, trainer, folder, last, viewer)
@@ -87,19 +95,31 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
     if why in (DONE, REACHED):
         return 0
     if ranks.lead:
-        words = ["visthrow train --resume", f"--out {folder}", *([f"--iterations {args.iterations}"] if args.iterations else [])]
-        print(f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}", file=sys.stderr)
+        words = [
+            "visthrow train --resume",
+            f"--out {folder}",
+            *([f"--iterations {args.iterations}"] if args.iterations else []),
+        ]
+        print(
+            f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}",
+            file=sys.stderr,
+        )
     return 0 if why == OVER else EXIT_INTERRUPTED
 
 
 def _check(args: Options) -> None:
-    """Refuse numbers that stop nothing or everything, and words that contradict each other, with a TrainError."""
+    """Refuse numbers that stop nothing or everything, and words that contradict each other, with a
+    TrainError.
+    """
     for name in ("iterations", "minutes", "until", "evaluate_every", "checkpoint_every"):
         value = getattr(args, name)
         if value is not None and not value > 0:
             raise TrainError(f"--{name.replace('_', '-')} {value}; expected a number above 0")
     if args.until is not None and args.until >= EVALUATION_TARGET:
-        raise TrainError(f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected an error below that, in m")
+        raise TrainError(
+            f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected an error"
+            " below that, in m"
+        )
     if args.resume and args.start:
         raise TrainError("--resume goes on with its own policy; --from starts a new run")
     if args.resume and not args.out and not args.config:
@@ -109,44 +129,74 @@ def _check(args: Options) -> None:
 
 
 def _begun(args: Options) -> tuple:
-    """Experiment, policy to start from or None, folder and seed of a new run; StorageError where the folder holds one already."""
+    """Experiment, policy to start from or None, folder and seed of a new run; StorageError where
+    the folder holds one already.
+    """
     path, seed = config.find("train", args.config), 1 if args.seed is None else args.seed
     folder = Path(args.out or f"runs/{path.stem}-{seed}")
     provenance.check_free(folder)
     if args.start is None:
         return config.load(Experiment, path, args.overrides), None, folder, seed
     policy = Policy.load(find_policy(args.start))
-    return fitted(config.load(Experiment, path, [ADAPTATION, *args.overrides]), policy), policy, folder, seed
+    return (
+        fitted(config.load(Experiment, path, [ADAPTATION, *args.overrides]), policy),
+        policy,
+        folder,
+        seed,
+    )
 
 
 def _resumed(args: Options) -> tuple:
-    """Experiment, None, folder and seed of the run in the folder; CheckpointError where there is none, or what is named contradicts it."""
+    """Experiment, None, folder and seed of the run in the folder; CheckpointError where there is
+    none, or what is named contradicts it.
+    """
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
     if not (folder / CHECKPOINT).exists():
         raise CheckpointError(f"{folder}: no {CHECKPOINT} to resume from")
     experiment = config.load(Experiment, folder / "config.toml")
-    if args.overrides and config.load(Experiment, folder / "config.toml", args.overrides) != experiment:
-        raise CheckpointError(f"{folder}: a run of another configuration than --set says; resume without it, or begin a new run")
-    if path is not None and not args.overrides and config.load(Experiment, path).task.observation != experiment.task.observation:
-        raise CheckpointError(f"{folder}: a run of another configuration than {path.stem}; resume with --out alone")
+    if (
+        args.overrides
+        and config.load(Experiment, folder / "config.toml", args.overrides) != experiment
+    ):
+        raise CheckpointError(
+            f"{folder}: a run of another configuration than --set says; resume without it, or begin"
+            " a new run"
+        )
+    if (
+        path is not None
+        and not args.overrides
+        and config.load(Experiment, path).task.observation != experiment.task.observation
+    ):
+        raise CheckpointError(
+            f"{folder}: a run of another configuration than {path.stem}; resume with --out alone"
+        )
     seed = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))["seed"]
     if args.seed not in (None, seed):
         raise CheckpointError(f"{folder}: a run of another seed, {seed}; resume without --seed")
     return experiment, None, folder, seed
 
 
-DONE, REACHED, OVER, STOPPED = ENDS = ("finished", "reached the error that was asked for", "the time is over", "stopped")
+DONE, REACHED, OVER, STOPPED = ENDS = (
+    "finished",
+    "reached the error that was asked for",
+    "the time is over",
+    "stopped",
+)
 """Why a loop ended."""
 
 STOPPING = "\nstopping after this iteration"
 
 
 class Regularly:
-    """When to do something on the way: every so many iterations, or as often as a share of the wall time allows."""
+    """When to do something on the way: every so many iterations, or as often as a share of the wall
+    time allows.
+    """
 
     def __init__(self, every: int | None, share: float):
-        """Begin; ``every``: iterations, None leaves it to the clock; ``share``: of the wall time then, 0 for never."""
+        """Begin; ``every``: iterations, None leaves it to the clock; ``share``: of the wall time
+        then, 0 for never.
+        """
         self._every, self._share = every, share
         self._after, self._wait = time.perf_counter(), FIRST
 
@@ -171,12 +221,25 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
     TrainError where a file cannot be written; what the last checkpoint holds is not lost.
     """
     start, kept, why, ranks = time.perf_counter(), trainer.iteration, DONE, trainer.ranks
-    evaluations = Regularly(args.evaluate_every, EVALUATION_SHARE if args.until or viewer or sys.stdout.isatty() else 0.0)
+    evaluations = Regularly(
+        args.evaluate_every,
+        EVALUATION_SHARE if args.until or viewer or sys.stdout.isatty() else 0.0,
+    )
     checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
-    shown = viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
-    log = TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes) if ranks.lead else None
+    shown = (
+        viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
+    )
+    log = (
+        TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes)
+        if ranks.lead
+        else None
+    )
     try:
-        with log or contextlib.nullcontext(), StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING) as stop, shown as show:
+        with (
+            log or contextlib.nullcontext(),
+            StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING) as stop,
+            shown as show,
+        ):
             while trainer.iteration < last and why == DONE:
                 figures, throws = trainer.step(), None
                 if ranks.lead and evaluations.due(trainer.iteration):
@@ -197,8 +260,14 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
                 why = ENDS[ranks.agree(ENDS.index(why))]
             trainer.save(folder / CHECKPOINT)
     except (OSError, StorageError) as error:
-        state = f"the checkpoint of iteration {kept} is whole; make room and go on with --resume" if kept else "no checkpoint yet"
-        raise TrainError(f"{folder}: cannot write ({error}) in iteration {trainer.iteration}; {state}") from error
+        state = (
+            f"the checkpoint of iteration {kept} is whole; make room and go on with --resume"
+            if kept
+            else "no checkpoint yet"
+        )
+        raise TrainError(
+            f"{folder}: cannot write ({error}) in iteration {trainer.iteration}; {state}"
+        ) from error
     return why
 
 
@@ -206,15 +275,21 @@ def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -
     """Throw at all targets, write the policy with what came of it, and print it."""
     rows = [trainer.throw(target).summary() for target in TARGETS]
     steps = trainer.iteration * trainer.algorithm.samples
-    spent = {"wall_s": wall, "iterations": trainer.iteration, "env_steps": steps, "seconds": dict(trainer.seconds)}
+    spent = {
+        "wall_s": wall,
+        "iterations": trainer.iteration,
+        "env_steps": steps,
+        "seconds": dict(trainer.seconds),
+    }
     figures = {"throws": rows, **spent}
     finish(trainer, folder, figures, finished)
     print(f"\n{trainer.iteration} iterations, {steps / 1e6:.1f} M environment steps, {wall:.1f} s")
     for row in rows:
         if row["success"] > 0:
             print(
-                f"target {row['target']:.1f} m: error {row['error_mean']:.3f} +- {row['error_std']:.3f} m, duration "
-                f"{row['duration_mean']:.3f} s, landed {100 * row['success']:.1f} %"
+                f"target {row['target']:.1f} m: error {row['error_mean']:.3f} +-"
+                f" {row['error_std']:.3f} m, duration {row['duration_mean']:.3f} s, landed"
+                f" {100 * row['success']:.1f} %"
             )
         else:
             print(f"target {row['target']:.1f} m: no throw landed")

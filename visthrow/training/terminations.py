@@ -1,4 +1,6 @@
-"""Ends of a throw (the paper, Sec. III-C), for an episode of training and for a flight on any plant.
+"""Ends of a throw (the paper, Sec.
+
+III-C), for an episode of training and for a flight on any plant.
 
 The functions take and return tensors or NumPy arrays over the batch, shape (E,) or (E, 3).
 """
@@ -22,19 +24,30 @@ def out_of_bounds(p: BoundsParams, pos_w: Array) -> dict[str, Array]:
     height = pos_w[:, 2]
     low, high = p.altitude
     return {
-        f"the vehicle left its altitude bounds of {low:g} to {high:g} m": (height < low) | (height > high),
-        f"the vehicle went further than {p.horizontal:g} m": (pos_w[:, :2] ** 2).sum(-1) > p.horizontal**2,
+        f"the vehicle left its altitude bounds of {low:g} to {high:g} m": (
+            (height < low) | (height > high)
+        ),
+        f"the vehicle went further than {p.horizontal:g} m": (
+            (pos_w[:, :2] ** 2).sum(-1) > p.horizontal**2
+        ),
     }
 
 
 def while_carrying(
-    p: BoundsParams, pos_w: Array, upright: Array, payload_w: Array, time: Array | float, landing_height: float
+    p: BoundsParams,
+    pos_w: Array,
+    upright: Array,
+    payload_w: Array,
+    time: Array | float,
+    landing_height: float,
 ) -> dict[str, Array]:
-    """What ends a throw before the latch has tripped only; the payload on the ground is not in the paper, whose bounds leave it open.
+    """What ends a throw before the latch has tripped only; the payload on the ground is not in the
+    paper, whose bounds leave it open.
 
     Args:
         p, landing_height: bounds; [m].
-        pos_w, payload_w: [m], shape (E, 3). upright: vertical component of the body's z axis, shape (E,).
+        pos_w, payload_w: [m], shape (E, 3). upright: vertical component of the body's z axis, shape
+            (E,).
         time: since the start [s], shape (E,) or one for all.
     """
     return {
@@ -46,13 +59,22 @@ def while_carrying(
 
 
 def negative(
-    p: BoundsParams, pos_w: Tensor, rot_wb: Tensor, payload_w: Tensor, status: Tensor, latched: Tensor, time: Tensor,
+    p: BoundsParams,
+    pos_w: Tensor,
+    rot_wb: Tensor,
+    payload_w: Tensor,
+    status: Tensor,
+    latched: Tensor,
+    time: Tensor,
     landing_height: float,
-) -> Tensor:  # fmt: skip
-    """All negative ends of an episode. Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
+) -> Tensor:
+    """All negative ends of an episode.
+
+    Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
 
     Args:
-        p, pos_w, payload_w, time, landing_height: as of :func:`while_carrying`. rot_wb: shape (E, 3, 3).
+        p, pos_w, payload_w, time, landing_height: as of :func:`while_carrying`. rot_wb: shape (E,
+            3, 3).
         status: bits of :mod:`sim.kernels.state`, shape (E,). latched: shape (E,), bool.
     """
     always = (*out_of_bounds(p, pos_w).values(), (status & (COLLISION | NONFINITE)) != 0)

@@ -1,4 +1,6 @@
-"""A training run: one algorithm, its evaluation, checkpoints that hold all state, and the policy that comes of it."""
+"""A training run: one algorithm, its evaluation, checkpoints that hold all state, and the policy
+that comes of it.
+"""
 
 import dataclasses
 import io
@@ -20,15 +22,26 @@ from visthrow.training.device import rounded_products
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ranks import Ranks
 
-CHECKPOINT, POLICY, SUMMARY, EVALUATION = "checkpoint.pt", "policy.npz", "summary.json", "evaluation.json"
-"""Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its end, and of one that did not."""
+CHECKPOINT, POLICY, SUMMARY, EVALUATION = (
+    "checkpoint.pt",
+    "policy.npz",
+    "summary.json",
+    "evaluation.json",
+)
+"""Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its
+end, and of one that did not.
+"""
 
-ADAPTATION = 'ppo="ppo/adapt.toml"'  # override that puts the schedule of a training from a policy in the place of the configuration's own
+# override that puts the schedule of a training from a policy in the place of the configuration's
+# own
+ADAPTATION = 'ppo="ppo/adapt.toml"'
 
 EVALUATED = 200  # throws of an evaluation
 
 TASK = ("observation", "action", "control_period")
-"""Parts of a policy's contract that its network cannot do without; plant, camera and release may differ from its training's."""
+"""Parts of a policy's contract that its network cannot do without; plant, camera and release may
+differ from its training's.
+"""
 
 
 class Algorithm(Protocol):
@@ -39,16 +52,20 @@ class Algorithm(Protocol):
     samples: int  # environment steps an iteration, over all ranks
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        """Build environment, of this seed, and networks; torch's own generators are the caller's to seed.
+        """Build environment, of this seed, and networks; torch's own generators are the caller's to
+        seed.
 
         Raises ConfigError: what this algorithm cannot train.
         """
 
     def collect(self, done: float) -> None:
-        """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for schedules."""
+        """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for
+        schedules.
+        """
 
     def learn(self, done: float) -> dict[str, float]:
-        """Learn from the last batch; returns figures for the log, of :data:`visthrow.training.progress.COLUMNS` those that there are.
+        """Learn from the last batch; returns figures for the log, of
+        :data:`visthrow.training.progress.COLUMNS` those that there are.
 
         Always there are the finished episodes' :meth:`ThrowEnv.episode_means`.
         """
@@ -57,13 +74,17 @@ class Algorithm(Protocol):
         """The policy as a file's content."""
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy that :func:`fitted` found to fit: its weights, and its normaliser, which hardly moves from there."""
+        """Start from a policy that :func:`fitted` found to fit: its weights, and its normaliser,
+        which hardly moves from there.
+        """
 
     def state_dict(self) -> dict:
         """Tensors and numbers that the next iteration depends on, besides torch's generators."""
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start anew."""
+        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start
+        anew.
+        """
 
 
 def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algorithm:
@@ -82,20 +103,26 @@ def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algor
 
 
 def fitted(experiment: Experiment, policy: Policy) -> Experiment:
-    """The experiment with the policy's layers as its actor's, for a training that starts from the policy.
+    """The experiment with the policy's layers as its actor's, for a training that starts from the
+    policy.
 
-    MismatchError where the experiment's task observes or acts otherwise; the message names every difference.
-    """
+    MismatchError where the experiment's task observes or acts otherwise; the message names every
+    difference."""
     try:
         policy.require(contract_of(experiment), TASK, allow=("observation.latency",))
     except MismatchError as error:
         raise MismatchError(f"--from: the task of this run is not the policy's; {error}") from None
     if (policy.estimator is None) == (experiment.algorithm == "distillation"):
         kinds = ("without", "with") if policy.estimator is None else ("with", "without")
-        raise MismatchError(f'--from: the policy is one {kinds[0]} a memory; algorithm = "{experiment.algorithm}" trains those {kinds[1]}')
+        raise MismatchError(
+            f'--from: the policy is one {kinds[0]} a memory; algorithm = "{experiment.algorithm}"'
+            f" trains those {kinds[1]}"
+        )
     p, hidden = experiment.ppo, tuple(len(bias) for bias in policy.biases[:-1])
     layers = {"hidden": hidden, "critic": p.critic or p.hidden, "activation": policy.activation}
-    return dataclasses.replace(experiment, ppo=dataclasses.replace(p, **layers, normalize=policy.mean is not None))
+    return dataclasses.replace(
+        experiment, ppo=dataclasses.replace(p, **layers, normalize=policy.mean is not None)
+    )
 
 
 class Trainer:
@@ -119,7 +146,9 @@ class Trainer:
 
     @rounded_products(True)
     def step(self) -> dict[str, float]:
-        """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and ``learning_s`` [s]."""
+        """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and
+        ``learning_s`` [s].
+        """
         start, done = time.perf_counter(), min(self.iteration / self.algorithm.iterations, 1.0)
         self.algorithm.collect(done)
         if self.device.startswith("cuda"):
@@ -130,42 +159,65 @@ class Trainer:
         self.iteration += 1
         for part, spent in times.items():
             self.seconds[part] += spent
-        return figures | {f"{part}_s": spent for part, spent in times.items()} | {"iteration": self.iteration}
+        return (
+            figures
+            | {f"{part}_s": spent for part, spent in times.items()}
+            | {"iteration": self.iteration}
+        )
 
     def throw(self, target: float, count: int | None = None, seed: int = 12345) -> Throws:
-        """Throws from hover with the current policy, :data:`EVALUATED` if not said; see :mod:`visthrow.training.protocol`."""
+        """Throws from hover with the current policy, :data:`EVALUATED` if not said; see
+        :mod:`visthrow.training.protocol`.
+        """
         count = count or EVALUATED
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
-        return protocol.throw(self.experiment, policy.actor(count), target, count, self.device, seed)
+        return protocol.throw(
+            self.experiment, policy.actor(count), target, count, self.device, seed
+        )
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint that a resumed run goes on from as if it had not stopped, all processes' in one; all or nothing."""
+        """Write a checkpoint that a resumed run goes on from as if it had not stopped, all
+        processes' in one; all or nothing.
+        """
         own = {
             "algorithm": self.algorithm.state_dict(),
             "rng": torch.get_rng_state(),
-            "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None,
+            "cuda_rng": (
+                torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None
+            ),
         }
         ranks = self.ranks.gather(own)
         if not self.ranks.lead:
             return
-        content = {"ranks": ranks, "iteration": self.iteration, "seed": self.seed, "config": config.dumps(self.experiment)}
+        content = {
+            "ranks": ranks,
+            "iteration": self.iteration,
+            "seed": self.seed,
+            "config": config.dumps(self.experiment),
+        }
         buffer = io.BytesIO()
         torch.save(content, buffer)
         atomic_write(path, buffer.getvalue())
 
     def load(self, path: Path) -> None:
-        """Take up a checkpoint, each process its own part; one that has none starts new episodes under a new seed.
+        """Take up a checkpoint, each process its own part; one that has none starts new episodes
+        under a new seed.
 
         Raises CheckpointError: a broken file, or one of another configuration or seed.
         """
         try:
             saved = torch.load(path, map_location="cpu", weights_only=True)
         except FileNotFoundError:
-            raise CheckpointError(f"{path}: no checkpoint there; expected a file that `visthrow train` wrote") from None
+            raise CheckpointError(
+                f"{path}: no checkpoint there; expected a file that `visthrow train` wrote"
+            ) from None
         except Exception as error:
             raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
         if saved["config"] != config.dumps(self.experiment) or saved["seed"] != self.seed:
-            raise CheckpointError(f"{path}: written by a run of another configuration or seed; resume with the same ones")
+            raise CheckpointError(
+                f"{path}: written by a run of another configuration or seed; resume with the same"
+                " ones"
+            )
         self.iteration = saved["iteration"]
         rank, parts = self.ranks.rank, saved["ranks"]
         known = rank < len(parts)
@@ -181,15 +233,22 @@ class Trainer:
 
 
 def finish(trainer: Trainer, folder: Path, figures: dict, finished: bool = True) -> Policy:
-    """Write the policy and its figures into the run's folder; a summary only where the run came to its end."""
+    """Write the policy and its figures into the run's folder; a summary only where the run came to
+    its end.
+    """
     made_by = provenance.collect() | {
         "seed": trainer.seed,
-        "config": config.to_dict(trainer.experiment, defaults=False),  # readable when fields come and go
+        "config": config.to_dict(
+            trainer.experiment, defaults=False
+        ),  # readable when fields come and go
         "figures": figures,
     }
     policy = trainer.algorithm.export(contract_of(trainer.experiment), made_by)
     policy.save(folder / POLICY)
-    write_json(folder / (SUMMARY if finished else EVALUATION), {k: v for k, v in made_by.items() if k != "config"})
+    write_json(
+        folder / (SUMMARY if finished else EVALUATION),
+        {k: v for k, v in made_by.items() if k != "config"},
+    )
     if finished:
         (folder / EVALUATION).unlink(missing_ok=True)
     return policy

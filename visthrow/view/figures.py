@@ -1,4 +1,7 @@
-"""Pictures of the report: intervals, scatter, fronts, curves. All in the style of :mod:`visthrow.common.style`."""
+"""Pictures of the report: intervals, scatter, fronts, curves.
+
+All in the style of :mod:`visthrow.common.style`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,7 +54,9 @@ class Trade:
     """Durations and errors on one plant."""
 
     title: str
-    fronts: tuple[tuple[int, str, np.ndarray], ...]  # series, label, points (N, 2): duration [s], error [m]
+    fronts: tuple[
+        tuple[int, str, np.ndarray], ...
+    ]  # series, label, points (N, 2): duration [s], error [m]
     stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
     crosses: tuple[tuple[str, np.ndarray], ...] = ()  # the paper's
 
@@ -60,14 +65,24 @@ def _look(series: int) -> tuple[str, str]:
     return style.COLOURS[series % len(style.COLOURS)], style.MARKERS[series % len(style.MARKERS)]
 
 
-def _axes(count: int, columns: int, width: float, height: float, more: float, sharex: bool = False) -> tuple[Any, Any]:
-    """A figure so wide [inch] with axes for ``count`` panels, each row so high, and some room more."""
+def _axes(
+    count: int, columns: int, width: float, height: float, more: float, sharex: bool = False
+) -> tuple[Any, Any]:
+    """A figure so wide [inch] with axes for ``count`` panels, each row so high, and
+    some room more.
+    """
     style.use()
     import matplotlib.pyplot as plt
 
     rows = -(-count // columns)
     figure, axes = plt.subplots(
-        rows, columns, figsize=(width, height * rows + more), layout="constrained", squeeze=False, sharex=sharex, sharey=True
+        rows,
+        columns,
+        figsize=(width, height * rows + more),
+        layout="constrained",
+        squeeze=False,
+        sharex=sharex,
+        sharey=True,
     )
     for axis in axes.flat[count:]:
         axis.set_visible(False)
@@ -82,24 +97,46 @@ def _labelled(axes: Any, below: str | None, left: str, **look: Any) -> None:
         axis.set_ylabel(left, **look)
 
 
-def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float | None = None, log: bool = False) -> bytes:
-    """Values with intervals, one below the other; crosses stand for the paper's, a line at ``zero`` for what they are compared with."""
+def marks(
+    rows: Sequence[Mark],
+    xlabel: str,
+    series: Sequence[str],
+    zero: float | None = None,
+    log: bool = False,
+) -> bytes:
+    """Values with intervals, one below the other; crosses stand for the paper's, a line at ``zero``
+    for what they are compared with.
+    """
     style.use()
     import matplotlib.pyplot as plt
 
     names = list(dict.fromkeys(row.label for row in rows))
     count = len({row.series for row in rows})
-    figure, axis = plt.subplots(figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained")
+    figure, axis = plt.subplots(
+        figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained"
+    )
     shown = {}
     for row in rows:
         (colour, marker), value, paper = _look(row.series), row.interval, row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
-        axis.plot([value.low, value.high], [y, y], "-", color=colour, lw=2.2, solid_capstyle="butt", alpha=0.55)
-        shown[row.series] = axis.plot(value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3)[0]
+        axis.plot(
+            [value.low, value.high],
+            [y, y],
+            "-",
+            color=colour,
+            lw=2.2,
+            solid_capstyle="butt",
+            alpha=0.55,
+        )
+        shown[row.series] = axis.plot(
+            value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3
+        )[0]
         if paper is not None:
             ends = [max(paper.low, 0.1 * paper.value) if log else paper.low, paper.high]
             axis.plot(ends, [y + 0.14] * 2, "-", color=style.QUIET, lw=1.0)
-            shown[len(series)] = axis.plot(paper.value, y + 0.14, "x", color=style.INK, ms=7, mew=1.5, zorder=4)[0]
+            shown[len(series)] = axis.plot(
+                paper.value, y + 0.14, "x", color=style.INK, ms=7, mew=1.5, zorder=4
+            )[0]
     if zero is not None:
         axis.axvline(zero, color=style.QUIET, lw=1.0, ls=(0, (4, 3)), zorder=1)
     if log:
@@ -112,7 +149,9 @@ def marks(rows: Sequence[Mark], xlabel: str, series: Sequence[str], zero: float 
     axis.set_xlabel(xlabel)
     if len(shown) > 1:
         keys, names = sorted(shown), [*series, "the paper's vehicle"]
-        figure.legend([shown[key] for key in keys], [names[key] for key in keys], loc="outside right upper")
+        figure.legend(
+            [shown[key] for key in keys], [names[key] for key in keys], loc="outside right upper"
+        )
     return png_of(figure)
 
 
@@ -126,12 +165,19 @@ def _log_axis(axis, name: str) -> None:
     which.set_minor_formatter(NullFormatter())
 
 
-def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], columns: int = 3, heading: str = "") -> bytes:
+def scatter(
+    panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]],
+    columns: int = 3,
+    heading: str = "",
+) -> bytes:
     """Landing points from above, the throw upwards.
 
-    A panel is a title and, for each colour, its label and misses (N, 2) [m]: along the throw, to the left.
-    """
-    far = max((np.abs(points).max() for _, series in panels for _, points in series if len(points)), default=0.2)
+    A panel is a title and, for each colour, its label and misses (N, 2) [m]: along the throw, to
+    the left."""
+    far = max(
+        (np.abs(points).max() for _, series in panels for _, points in series if len(points)),
+        default=0.2,
+    )
     half = float(np.clip(1.06 * far, 0.12, 0.7))
     columns = min(columns, len(panels))
     size = WIDTH / max(columns, 3)
@@ -146,7 +192,12 @@ def scatter(panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], colu
     _labelled(axes, "lateral, to the right [m]", "along the throw [m]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     if len(labels) > 1:
-        figure.legend(handles, labels, loc=f"outside {'lower' if heading else 'upper'} center", ncols=min(len(labels), 3))
+        figure.legend(
+            handles,
+            labels,
+            loc=f"outside {'lower' if heading else 'upper'} center",
+            ncols=min(len(labels), 3),
+        )
     if heading:
         figure.suptitle(heading, fontsize=11.5)
     return png_of(figure)
@@ -157,10 +208,26 @@ def _target(axis, half: float) -> None:
 
     for radius in CIRCLES:
         if radius < half:
-            axis.add_patch(Circle((0, 0), radius, fill=False, color=style.QUIET, lw=0.8, ls=(0, (4, 3)), zorder=1))
+            axis.add_patch(
+                Circle(
+                    (0, 0), radius, fill=False, color=style.QUIET, lw=0.8, ls=(0, (4, 3)), zorder=1
+                )
+            )
         if 0.3 * half < radius < half:
-            place = {"xytext": (2, -2), "textcoords": "offset points", "ha": "left", "va": "top", "zorder": 2}
-            axis.annotate(f"{radius:g} m", (0.7071 * radius, -0.7071 * radius), fontsize=7.5, color=style.QUIET, **place)
+            place = {
+                "xytext": (2, -2),
+                "textcoords": "offset points",
+                "ha": "left",
+                "va": "top",
+                "zorder": 2,
+            }
+            axis.annotate(
+                f"{radius:g} m",
+                (0.7071 * radius, -0.7071 * radius),
+                fontsize=7.5,
+                color=style.QUIET,
+                **place,
+            )
     axis.plot(0, 0, "+", color=style.INK, ms=12, mew=1.4, zorder=5)
     axis.grid(True)
     axis.set_axisbelow(True)
@@ -172,16 +239,37 @@ def _landings(axis, points: np.ndarray, half: float, series: int, label: str) ->
     shown = np.clip(points, -half, half)
     inside = np.all(shown == points, axis=1)
     alpha = 0.8 if len(points) <= 40 else 0.35
-    axis.scatter(-points[inside, 1], points[inside, 0], s=11, color=colour, marker=marker, alpha=alpha, lw=0, label=label, zorder=3)
+    axis.scatter(
+        -points[inside, 1],
+        points[inside, 0],
+        s=11,
+        color=colour,
+        marker=marker,
+        alpha=alpha,
+        lw=0,
+        label=label,
+        zorder=3,
+    )
     out = shown[~inside]
-    axis.scatter(-out[:, 1], out[:, 0], s=18, facecolor="none", edgecolor=colour, marker=marker, clip_on=False, zorder=3)
+    axis.scatter(
+        -out[:, 1],
+        out[:, 0],
+        s=18,
+        facecolor="none",
+        edgecolor=colour,
+        marker=marker,
+        clip_on=False,
+        zorder=3,
+    )
     if len(points):
         center = points.mean(0)
         axis.plot(-center[1], center[0], marker, color=colour, ms=7, mec="white", mew=1.2, zorder=6)
 
 
 def trades(panels: Sequence[Trade]) -> bytes:
-    """Agility against accuracy, a panel a plant; lines join the settings that no other one beats."""
+    """Agility against accuracy, a panel a plant; lines join the settings that no other
+    one beats.
+    """
     figure, axes = _axes(len(panels), len(panels), WIDTH, 5.2, 0.0, sharex=True)
     labels: dict[str, object] = {}
     for axis, panel in zip(axes[0], panels):
@@ -192,18 +280,50 @@ def trades(panels: Sequence[Trade]) -> bytes:
             labels[label] = axis.plot(*best.T, marker + "-", color=colour, ms=5.5, lw=1.4)[0]
         for label, points in panel.crosses:
             starred = len(points) <= 2
-            look = {"marker": "*", "ms": 11, "ls": "none", "mec": "white"} if starred else {"marker": "x", "ms": 6, "ls": "--"}
+            look = (
+                {"marker": "*", "ms": 11, "ls": "none", "mec": "white"}
+                if starred
+                else {"marker": "x", "ms": 6, "ls": "--"}
+            )
             labels[label] = axis.plot(*points.T, color=style.QUIET, lw=1.1, **look)[0]
         for i, (label, duration, error) in enumerate(panel.stars):
             colour = style.COLOURS[3 + i]
-            axis.plot([duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6)
-            axis.plot([duration.low, duration.high], [error.value] * 2, "-", color=colour, lw=2.0, alpha=0.6)
-            star = {"color": colour, "ms": 14, "mec": "white", "mew": 0.7, "ls": "none", "zorder": 5}
+            axis.plot(
+                [duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6
+            )
+            axis.plot(
+                [duration.low, duration.high],
+                [error.value] * 2,
+                "-",
+                color=colour,
+                lw=2.0,
+                alpha=0.6,
+            )
+            star = {
+                "color": colour,
+                "ms": 14,
+                "mec": "white",
+                "mew": 0.7,
+                "ls": "none",
+                "zorder": 5,
+            }
             labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
         empty = [label for _, label, points in panel.fronts if not len(points)]
         if empty or not panel.fronts:
-            said = "no setting landed all its throws:\n" + "\n".join(empty) if empty else "not swept yet"
-            axis.text(0.03, 0.02, said, transform=axis.transAxes, fontsize=7.5, color=style.QUIET, va="bottom")
+            said = (
+                "no setting landed all its throws:\n" + "\n".join(empty)
+                if empty
+                else "not swept yet"
+            )
+            axis.text(
+                0.03,
+                0.02,
+                said,
+                transform=axis.transAxes,
+                fontsize=7.5,
+                color=style.QUIET,
+                va="bottom",
+            )
         axis.set_title(panel.title, fontsize=10.5)
         axis.set_xlabel("from start to landing [s]")
         _log_axis(axis, "y")
@@ -214,7 +334,9 @@ def trades(panels: Sequence[Trade]) -> bytes:
 
 
 def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
-    """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own value."""
+    """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own
+    value.
+    """
     columns = min(3, len(panels))
     figure, axes = _axes(len(panels), columns, WIDTH if columns > 1 else 0.62 * WIDTH, 2.75, 0.4)
     labels: dict[str, object] = {}
@@ -222,7 +344,15 @@ def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
         for line in panel.lines:
             labels.setdefault(line.label, _curve(axis, line))
         if not panel.lines:
-            axis.text(0.5, 0.5, panel.missing or "no results", transform=axis.transAxes, ha="center", color=style.QUIET, fontsize=9)
+            axis.text(
+                0.5,
+                0.5,
+                panel.missing or "no results",
+                transform=axis.transAxes,
+                ha="center",
+                color=style.QUIET,
+                fontsize=9,
+            )
         axis.set_title(panel.title, fontsize=10.5)
         axis.set_xlabel(panel.xlabel)
         axis.grid(True)
@@ -233,22 +363,46 @@ def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
             axis.set_ylim(bottom=0.0)
     _labelled(axes, None, ylabel)
     if len(labels) > 1:
-        figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=min(len(labels), 4 if columns > 1 else 2))
+        figure.legend(
+            labels.values(),
+            labels.keys(),
+            loc="outside upper center",
+            ncols=min(len(labels), 4 if columns > 1 else 2),
+        )
     return png_of(figure)
 
 
 def _curve(axis, line: Line):
     colour, marker = _look(line.series)
     x = np.asarray(line.x, dtype=float)
-    axis.fill_between(x, [i.low for i in line.intervals], [i.high for i in line.intervals], color=colour, alpha=0.18, lw=0)
-    (drawn,) = axis.plot(x, [i.value for i in line.intervals], marker + "-", color=colour, ms=4.5, lw=1.5)
+    axis.fill_between(
+        x,
+        [i.low for i in line.intervals],
+        [i.high for i in line.intervals],
+        color=colour,
+        alpha=0.18,
+        lw=0,
+    )
+    (drawn,) = axis.plot(
+        x, [i.value for i in line.intervals], marker + "-", color=colour, ms=4.5, lw=1.5
+    )
     if line.own is not None:
-        axis.plot(x[line.own], line.intervals[line.own].value, "o", ms=11, mfc="none", mec=style.INK, mew=1.1)
+        axis.plot(
+            x[line.own],
+            line.intervals[line.own].value,
+            "o",
+            ms=11,
+            mfc="none",
+            mec=style.INK,
+            mew=1.1,
+        )
     return drawn
 
 
 def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:
-    """Landing error over training: a panel a group, each run its environment steps (N,) and errors (N,) as rows."""
+    """Landing error over training: a panel a group, each run its environment steps (N,) and errors
+    (N,) as rows.
+    """
     figure, axes = _axes(len(groups), min(6, len(groups)), WIDTH, 1.5, 0.3, sharex=True)
     for axis, (title, runs) in zip(axes.flat, groups):
         for i, run in enumerate(runs):

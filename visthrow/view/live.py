@@ -12,20 +12,43 @@ from urllib.parse import quote
 from visthrow.common.errors import DeviceError
 
 HOST = "127.0.0.1"
-WEB_PORT, DATA_PORT = 9090, 9876  # ports of the viewer's page and of its data; only this machine is listened to
+WEB_PORT, DATA_PORT = (
+    9090,
+    9876,
+)  # ports of the viewer's page and of its data; only this machine is listened to
 
 
 @contextmanager
 def served(web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[str]:
-    """Serve the viewer and say where; gives the address that streams connect to. DeviceError where a port is taken."""
-    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST, "--port", str(data_port)]
+    """Serve the viewer and say where; gives the address that streams connect to.
+
+    DeviceError where a port is taken.
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "rerun",
+        "--serve-web",
+        "--bind",
+        HOST,
+        "--port",
+        str(data_port),
+    ]
     command += ["--web-viewer-port", str(web_port), "--server-memory-limit", "500MB"]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
+    server = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL
+    )
     data = f"rerun+http://{HOST}:{data_port}/proxy"
     try:
         if not _answers(server, web_port):
-            raise DeviceError(f"the viewer did not start; are ports {web_port} and {data_port} free? name others")
-        print(f"look at http://{HOST}:{web_port}?url={quote(data, safe='')}", file=sys.stderr, flush=True)
+            raise DeviceError(
+                f"the viewer did not start; are ports {web_port} and {data_port} free? name others"
+            )
+        print(
+            f"look at http://{HOST}:{web_port}?url={quote(data, safe='')}",
+            file=sys.stderr,
+            flush=True,
+        )
         yield data
     finally:
         server.terminate()

@@ -25,13 +25,20 @@ def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     import markupsafe
 
     template = resources.files("visthrow.view").joinpath("page.html.j2").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     environment.filters["marked"] = lambda text: markupsafe.Markup(_marked(text))
-    environment.filters["inline"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    environment.filters["inline"] = lambda png: (
+        "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    )
     environment.tests |= {
-        name: lambda part, kind=kind: isinstance(part, kind) for name, kind in (("text", Text), ("grid", Grid), ("picture", Picture))
+        name: lambda part, kind=kind: isinstance(part, kind)
+        for name, kind in (("text", Text), ("grid", Grid), ("picture", Picture))
     }
-    return environment.from_string(template).render(title=title, lead=lead, sections=sections, version=__version__)
+    return environment.from_string(template).render(
+        title=title, lead=lead, sections=sections, version=__version__
+    )
 
 
 def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
@@ -41,7 +48,10 @@ def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
         lines.append(f"## {section.title}")
         for part in section.parts:
             if isinstance(part, Text):
-                lines.append({"missing": "*Missing.* ", "finding": "- ", "why": ""}.get(part.kind, "") + part.text)
+                lines.append(
+                    {"missing": "*Missing.* ", "finding": "- ", "why": ""}.get(part.kind, "")
+                    + part.text
+                )
             elif isinstance(part, Grid):
                 lines.append(part.markdown())
             else:

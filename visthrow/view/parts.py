@@ -8,15 +8,27 @@ DPI = 150.0  # of pictures
 
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
-    """A table as Markdown, columns aligned: the first ``heads`` columns stand left, all of them without it, the others right."""
+    """A table as Markdown, columns aligned: the first ``heads`` columns stand left, all of them
+    without it, the others right.
+    """
     cells = [header, *rows]
     width = [max(len(row[i]) for row in cells) for i in range(len(header))]
     left = len(header) if heads is None else heads
 
     def line(row: Sequence[str]) -> str:
-        return "| " + " | ".join(c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, width))) + " |"
+        return (
+            "| "
+            + " | ".join(
+                c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, width))
+            )
+            + " |"
+        )
 
-    rule = "|" + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(width)) + "|"
+    rule = (
+        "|"
+        + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(width))
+        + "|"
+    )
     return "\n".join([line(header), rule, *map(line, rows)])
 
 
@@ -25,7 +37,9 @@ class Text:
     """A paragraph; ``**bold**`` and ``code`` in backticks are marked in both outputs."""
 
     text: str
-    kind: str = "plain"  # "plain", "finding": said by the figures; "missing": what is not there; "why": written beside the data
+    # "plain", "finding": said by the figures; "missing": what is not there; "why": written beside
+    # the data
+    kind: str = "plain"
 
 
 @dataclass(frozen=True)
@@ -40,7 +54,9 @@ class Grid:
 
     def markdown(self) -> str:
         """Text of the table, columns aligned."""
-        return f"**{self.title}**\n\n{aligned(self.header, self.rows, self.heads)}" + (f"\n\n{self.note}" if self.note else "")
+        return f"**{self.title}**\n\n{aligned(self.header, self.rows, self.heads)}" + (
+            f"\n\n{self.note}" if self.note else ""
+        )
 
 
 @dataclass(frozen=True)
@@ -64,10 +80,20 @@ class Section:
 Part = Text | Grid | Picture
 
 
-def section(name: str, title: str, *parts: Part | None, missing: Sequence[str] = (), head: str = "Not thrown yet") -> Section:
+def section(
+    name: str,
+    title: str,
+    *parts: Part | None,
+    missing: Sequence[str] = (),
+    head: str = "Not thrown yet",
+) -> Section:
     """A section of the parts that there are; at its end what is missing."""
     said = "; ".join(dict.fromkeys(missing))
-    return Section(name, title, (*filter(None, parts), *([Text(f"{head}: {said}.", "missing")] if said else [])))
+    return Section(
+        name,
+        title,
+        (*filter(None, parts), *([Text(f"{head}: {said}.", "missing")] if said else [])),
+    )
 
 
 def png_of(figure) -> bytes:

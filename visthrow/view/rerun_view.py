@@ -1,9 +1,9 @@
-"""A flight for the rerun viewer: the scene in 3D, the image plane, and all signals on one time line. Onboard-safe.
+"""A flight for the rerun viewer: the scene in 3D, the image plane, and all signals on one time
+line. Onboard-safe.
 
 Time zero is the policy's start. What a log does not hold is not shown: a flight on
-motion capture knows no motor speeds, a simulated one no age of its poses. Sizes come from an experiment, or from anything
-with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``.
-"""
+motion capture knows no motor speeds, a simulated one no age of its poses. Sizes come from an
+experiment, or from anything with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``."""
 
 import tempfile
 from collections.abc import Iterator
@@ -31,7 +31,8 @@ FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
-    """Write a flight of :func:`visthrow.throws.recorded.fly` as a ``.rrd`` file with a blueprint that lays out the viewer.
+    """Write a flight of :func:`visthrow.throws.recorded.fly` as a ``.rrd`` file with a blueprint
+    that lays out the viewer.
 
     Raises StorageError: the place cannot be written.
     """
@@ -40,16 +41,23 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 
 def show(address: str, name: str, log: FlightLog, experiment: Any, landings_w: np.ndarray) -> None:
-    """Send a flight to the viewer at an address (:func:`visthrow.view.live.served`) as a recording of its own.
+    """Send a flight to the viewer at an address (:func:`visthrow.view.live.served`) as a recording
+    of its own.
 
     Where other throws came down is drawn with it: ``landings_w`` [m], shape (N, 2).
     """
     stream = rr.RecordingStream("visthrow", recording_id=name)
-    stream.connect_grpc(address, default_blueprint=blueprint(np.array(log.meta["goal_w"]), set(log.channels)))
+    stream.connect_grpc(
+        address, default_blueprint=blueprint(np.array(log.meta["goal_w"]), set(log.channels))
+    )
     stream.send_recording_name(name)
     whole(stream, log, experiment)
     places = np.column_stack((landings_w, np.full(len(landings_w), 0.004))).astype(np.float32)
-    stream.log("world/landings", rr.Points3D(places, radii=0.008, colors=[colour_code(style.PAYLOAD, 150)]), static=True)
+    stream.log(
+        "world/landings",
+        rr.Points3D(places, radii=0.008, colors=[colour_code(style.PAYLOAD, 150)]),
+        static=True,
+    )
     stream.flush()
     stream.disconnect()
 
@@ -65,8 +73,11 @@ def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
 
 
 @contextmanager
-def recording(path: str | Path, layout: rrb.Blueprint | None = None) -> Iterator[rr.RecordingStream]:
-    """Give a stream whose content becomes a ``.rrd`` file, whole or not at all, with the layout of the viewer that opens it.
+def recording(
+    path: str | Path, layout: rrb.Blueprint | None = None
+) -> Iterator[rr.RecordingStream]:
+    """Give a stream whose content becomes a ``.rrd`` file, whole or not at all, with the layout of
+    the viewer that opens it.
 
     Raises StorageError: the place cannot be written.
     """
@@ -93,50 +104,82 @@ def colour_code(hexadecimal: str, alpha: int = 255) -> list[int]:
     return [*(int(hexadecimal[i : i + 2], 16) for i in (1, 3, 5)), alpha]
 
 
-TRAILS = (("payload_pos_w", "world/trail/ball", style.PAYLOAD), ("pos_w", "world/trail/vehicle", style.QUIET))
+TRAILS = (
+    ("payload_pos_w", "world/trail/ball", style.PAYLOAD),
+    ("pos_w", "world/trail/vehicle", style.QUIET),
+)
 """Channel, entity and colour of the lines that grow during a throw."""
 
 
 def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
-    """Send what does not move: ground, shapes, strokes, the camera's field of view; the target is at ``goal_w`` [m], shape (3,)."""
+    """Send what does not move: ground, shapes, strokes, the camera's field of view; the target is
+    at ``goal_w`` [m], shape (3,).
+    """
     goal = np.asarray(goal_w, dtype=float)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     middle, reach = 0.5 * goal[:2], 0.5 * np.abs(goal[:2]) + FIELD
-    floor = rr.Boxes3D(centers=[[*middle, -0.011]], half_sizes=[[*reach, 0.01]], colors=[[232, 230, 224]], fill_mode="solid")
+    floor = rr.Boxes3D(
+        centers=[[*middle, -0.011]],
+        half_sizes=[[*reach, 0.01]],
+        colors=[[232, 230, 224]],
+        fill_mode="solid",
+    )
     stream.log("world/ground", floor, static=True)
     half = experiment.camera.goal_side / 2.0
     corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    square = rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=[colour_code(style.GOAL)])
+    square = rr.LineStrips3D(
+        [corners + [0, 0, 0.003]], radii=0.006, colors=[colour_code(style.GOAL)]
+    )
     stream.log("world/goal", square, rr.Transform3D(translation=goal), static=True)
     centre = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=[colour_code(style.GOAL)])
     stream.log("world/goal/centre", centre, static=True)
     _vehicle(stream, experiment)
     radius = experiment.rope.payload_radius
-    ball = rr.Ellipsoids3D(half_sizes=[[radius] * 3], colors=[colour_code(style.PAYLOAD)], fill_mode="solid")
+    ball = rr.Ellipsoids3D(
+        half_sizes=[[radius] * 3], colors=[colour_code(style.PAYLOAD)], fill_mode="solid"
+    )
     stream.log("world/ball", ball, static=True)
-    stream.log("world/rope", rr.LineStrips3D.from_fields(radii=0.003, colors=[colour_code(style.ROPE)]), static=True)
+    stream.log(
+        "world/rope",
+        rr.LineStrips3D.from_fields(radii=0.003, colors=[colour_code(style.ROPE)]),
+        static=True,
+    )
     for _, entity, colour in TRAILS:
-        stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=[colour_code(colour, 170)]), static=True)
+        stream.log(
+            entity,
+            rr.LineStrips3D.from_fields(radii=0.004, colors=[colour_code(colour, 170)]),
+            static=True,
+        )
     _plane(stream, experiment.camera)
 
 
 def send(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Send all that moves, from a whole flight or from a piece of one; see :func:`still` for the rest."""
+    """Send all that moves, from a whole flight or from a piece of one; see :func:`still` for the
+    rest.
+    """
     if "pos_w" in log and "quat_wb" in log:
-        pose = rr.Transform3D.columns(translation=log["pos_w"].values, quaternion=log["quat_wb"].hold(log["pos_w"].time))
+        pose = rr.Transform3D.columns(
+            translation=log["pos_w"].values, quaternion=log["quat_wb"].hold(log["pos_w"].time)
+        )
         stream.send_columns("world/vehicle", [_times(log, "pos_w")], pose)
     if "cable_points_w" in log:
-        columns = rr.LineStrips3D.columns(strips=list(log["cable_points_w"].values.astype(np.float32)))
+        columns = rr.LineStrips3D.columns(
+            strips=list(log["cable_points_w"].values.astype(np.float32))
+        )
         stream.send_columns("world/rope", [_times(log, "cable_points_w")], columns)
     for name, entity in (("payload_pos_w", "world/ball"), ("goal_w", "world/goal")):
         if name in log:
-            stream.send_columns(entity, [_times(log, name)], rr.Transform3D.columns(translation=log[name].values))
+            stream.send_columns(
+                entity, [_times(log, name)], rr.Transform3D.columns(translation=log[name].values)
+            )
     if "keypoints" in log:
         _image(stream, log)
     _signals(stream, log)
     for time, state, reason in log.meta.get("events", ()):
         stream.set_time(TIMELINE, duration=time - log.meta["times"]["policy_start"])
-        stream.log("events", rr.TextLog(f"{state}: {reason}", level="WARN" if state == "abort" else "INFO"))
+        stream.log(
+            "events", rr.TextLog(f"{state}: {reason}", level="WARN" if state == "abort" else "INFO")
+        )
 
 
 def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
@@ -156,16 +199,22 @@ def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
     body = rr.Boxes3D(half_sizes=[[0.028, 0.018, 0.014]], colors=dark, fill_mode="solid")
     stream.log("world/vehicle/body", body, static=True)
     discs = rr.Ellipsoids3D(
-        centers=hubs + [0, 0, 0.008], half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4, fill_mode="solid",
-        colors=[colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],  # the front ones stand out
-    )  # fmt: skip
+        centers=hubs + [0, 0, 0.008],
+        half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4,
+        fill_mode="solid",
+        colors=[
+            colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs
+        ],  # the front ones stand out
+    )
     stream.log("world/vehicle/rotors", discs, static=True)
 
 
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
     """A line that grows from the policy's start to the landing."""
     times, time = log.meta["times"], log[name].time
-    rows = np.flatnonzero((time >= times["policy_start"] - 1e-9) & (time <= times.get("landing", np.inf) + 0.02))[1:]
+    rows = np.flatnonzero(
+        (time >= times["policy_start"] - 1e-9) & (time <= times.get("landing", np.inf) + 0.02)
+    )[1:]
     if len(rows):
         strips = [log[name].values[rows[0] - 1 : row + 1].astype(np.float32) for row in rows]
         column = rr.TimeColumn(TIMELINE, duration=time[rows] - times["policy_start"])
@@ -175,15 +224,17 @@ def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -
 def trail(stream: rr.RecordingStream, name: str, time: float, points: np.ndarray) -> None:
     """Send the line that a body has left so far, for flights that are still going on.
 
-    Its channel is one of :data:`TRAILS`, its end at a time [s], zero as in the logs sent; points [m], shape (N, 3).
-    """
+    Its channel is one of :data:`TRAILS`, its end at a time [s], zero as in the logs sent; points
+    [m], shape (N, 3)."""
     stream.set_time(TIMELINE, duration=time)
     entity = next(entity for channel, entity, _ in TRAILS if channel == name)
     stream.log(entity, rr.LineStrips3D.from_fields(strips=[points.astype(np.float32)]))
 
 
 def _plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
-    """Field of view and body axes, in normalised image coordinates times 100, so that the viewer's strokes fit."""
+    """Field of view and body axes, in normalised image coordinates times 100, so that the viewer's
+    strokes fit.
+    """
     lens = Fisheye(camera.fisheye)
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     circle = np.column_stack((np.cos(angle), np.sin(angle)))
@@ -191,43 +242,80 @@ def _plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
 
     right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
     rings = rr.LineStrips2D(
-        [100 * circle, 100 * right * circle], colors=[[150, 150, 150], [80, 80, 80]], radii=[0.7, 0.4],
+        [100 * circle, 100 * right * circle],
+        colors=[[150, 150, 150], [80, 80, 80]],
+        radii=[0.7, 0.4],
         show_labels=False,
-    )  # fmt: skip
+    )
     stream.log("camera/field_of_view", rings, static=True)
-    places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]  # a strip's own label would stand in the middle, on the ball
+    places = [
+        [0.0, 95.0],
+        [0.0, 100.0 * right - 4.0],
+    ]  # a strip's own label would stand in the middle, on the ball
     names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
-    stream.log("camera/angles", rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]), static=True)
-    axes = 22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]  # rows: the body's x and y as directions in the image
+    stream.log(
+        "camera/angles",
+        rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]),
+        static=True,
+    )
+    axes = (
+        22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]
+    )  # rows: the body's x and y as directions in the image
     arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=[200, 200, 200], show_labels=False)
     stream.log("camera/body_axes", arrows, static=True)
     labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=[200, 200, 200])
     stream.log("camera/body_axes/names", labels, static=True)
     for name, colour in GROUPS.items():
-        stream.log(f"camera/{name}", rr.Points2D.from_fields(radii=1.8, colors=[colour]), static=True)
-        stream.log(f"camera/{name}/outline", rr.LineStrips2D.from_fields(radii=0.5, colors=[colour]), static=True)
-    stream.log("camera/invalid", rr.Points2D.from_fields(radii=1.2, colors=[[170, 170, 170]]), static=True)
+        stream.log(
+            f"camera/{name}", rr.Points2D.from_fields(radii=1.8, colors=[colour]), static=True
+        )
+        stream.log(
+            f"camera/{name}/outline",
+            rr.LineStrips2D.from_fields(radii=0.5, colors=[colour]),
+            static=True,
+        )
+    stream.log(
+        "camera/invalid", rr.Points2D.from_fields(radii=1.2, colors=[[170, 170, 170]]), static=True
+    )
 
 
 GROUPS = {"goal": [60, 200, 80], "payload": [230, 60, 60]}  # keypoints and their colours
 
 
 def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Keypoints in the plane of :func:`_plane`; those that are not valid stand grey where they read."""
+    """Keypoints in the plane of :func:`_plane`; those that are not valid stand grey where they
+    read.
+    """
     points, valid = 100.0 * log["keypoints"].values, log["keypoints_valid"].values.astype(bool)
-    for name, part in (("goal", slice(0, GOAL_KEYPOINTS)), ("payload", slice(GOAL_KEYPOINTS, None))):
+    for name, part in (
+        ("goal", slice(0, GOAL_KEYPOINTS)),
+        ("payload", slice(GOAL_KEYPOINTS, None)),
+    ):
         _points(stream, log, f"camera/{name}", points[:, part], valid[:, part])
-        _outline(stream, log, f"camera/{name}/outline", points[:, part], valid[:, part], box=name == "payload")
+        _outline(
+            stream,
+            log,
+            f"camera/{name}/outline",
+            points[:, part],
+            valid[:, part],
+            box=name == "payload",
+        )
     _points(stream, log, "camera/invalid", points, ~valid)
 
 
 def _points(stream, log: FlightLog, entity: str, points: np.ndarray, shown: np.ndarray) -> None:
-    columns = rr.Points2D.columns(positions=points[shown].astype(np.float32)).partition(shown.sum(axis=1))
+    columns = rr.Points2D.columns(positions=points[shown].astype(np.float32)).partition(
+        shown.sum(axis=1)
+    )
     stream.send_columns(entity, [_times(log, "keypoints")], columns)
 
 
-def _outline(stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, box: bool) -> None:
-    """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a box's edges."""
+def _outline(
+    stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, box: bool
+) -> None:
+    """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a
+    box's edges.
+    """
     whole = valid.all(axis=1)
     if not whole.any():
         return
@@ -243,11 +331,16 @@ def _outline(stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.
 def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
     """Entity, channel, component, label and colour of each curve that the log has samples for."""
     c = style.COLOURS
-    curves: list[tuple[str, str, int | None, str, str]] = [("thrust", "command", 0, "collective thrust [N]", c[0])]
+    curves: list[tuple[str, str, int | None, str, str]] = [
+        ("thrust", "command", 0, "collective thrust [N]", c[0])
+    ]
     for i, axis in enumerate(AXES):
         curves.append((f"rate_command/{axis}", "command", 1 + i, f"{axis} commanded [rad/s]", c[i]))
         curves.append((f"rate/{axis}", "rate_b", i, f"{axis} flown [rad/s]", _paler(c[i])))
-    curves += [(f"motors/{i}", "motor_speed", i, f"{name} [rad/s]", c[i]) for i, name in enumerate(ROTOR_NAMES)]
+    curves += [
+        (f"motors/{i}", "motor_speed", i, f"{name} [rad/s]", c[i])
+        for i, name in enumerate(ROTOR_NAMES)
+    ]
     curves += [
         ("battery", "battery_voltage", None, "battery [V]", c[2]),
         ("phase/mode", "mode", None, "0 hover controller, 1 policy", c[0]),
@@ -255,9 +348,14 @@ def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
         ("phase/release", "release_command", None, "release command", c[3]),
         ("phase/state", "state", None, "state: " + ", ".join(log.meta.get("states", ())), c[2]),
     ]
-    curves += [(f"age/{body}", f"age_{body}", None, f"{body}'s pose [ms]", c[i]) for i, body in enumerate(BODIES)]
+    curves += [
+        (f"age/{body}", f"age_{body}", None, f"{body}'s pose [ms]", c[i])
+        for i, body in enumerate(BODIES)
+    ]
     names = [name for name in log.channels if name.startswith("tick_")]
-    curves += [(f"tick/{n[5:]}", n, None, f"{n[5:]} [ms]", c[i % len(c)]) for i, n in enumerate(names)]
+    curves += [
+        (f"tick/{n[5:]}", n, None, f"{n[5:]} [ms]", c[i % len(c)]) for i, n in enumerate(names)
+    ]
     return [curve for curve in curves if curve[1] in log]
 
 
@@ -268,7 +366,11 @@ def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
     for entity, name, component, label, colour in _curves(log):
         values = log[name].values if component is None else log[name].values[:, component]
         scale = 1e3 if entity.split("/")[0] in MILLISECONDS else 1.0
-        stream.log(f"signals/{entity}", rr.SeriesLines(names=[label], colors=[colour_code(colour)]), static=True)
+        stream.log(
+            f"signals/{entity}",
+            rr.SeriesLines(names=[label], colors=[colour_code(colour)]),
+            static=True,
+        )
         column = rr.Scalars.columns(scalars=scale * values.astype(float))
         stream.send_columns(f"signals/{entity}", [_times(log, name)], column)
 
@@ -280,21 +382,31 @@ def _paler(colour: str) -> str:
 def blueprint(goal: np.ndarray, channels: set[str]) -> rrb.Blueprint:
     """Layout of the viewer for a target [m], shape (3,), and the channels that there are."""
     middle = np.array([0.5 * goal[0], 0.5 * goal[1], 0.9])
-    eye = rrb.EyeControls3D(position=middle + [0.3, -3.4, 0.9], look_target=middle, eye_up=[0.0, 0.0, 1.0])
+    eye = rrb.EyeControls3D(
+        position=middle + [0.3, -3.4, 0.9], look_target=middle, eye_up=[0.0, 0.0, 1.0]
+    )
     plain = {"background": [245, 246, 248], "line_grid": rrb.LineGrid3D(visible=False)}
     scene = rrb.Spatial3DView(origin="world", name="Throw", eye_controls=eye, **plain)
     bounds = rrb.VisualBounds2D(x_range=[-106, 106], y_range=[-106, 106])
-    image = rrb.Spatial2DView(origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds)
+    image = rrb.Spatial2DView(
+        origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds
+    )
     live = "state" in channels
-    plots = [_plot("Phase", -0.1, 8.1 if live else 1.1, "phase"), _plot("Collective thrust [N]", 0.0, 14.0, "thrust"),
-             _plot("Body rates [rad/s]", -11.0, 11.0, "rate_command", "rate")]  # fmt: skip
+    plots = [
+        _plot("Phase", -0.1, 8.1 if live else 1.1, "phase"),
+        _plot("Collective thrust [N]", 0.0, 14.0, "thrust"),
+        _plot("Body rates [rad/s]", -11.0, 11.0, "rate_command", "rate"),
+    ]
     if "motor_speed" in channels:
         plots.append(_plot("Motor speeds [rad/s]", 0.0, 4000.0, "motors"))
     if "battery_voltage" in channels:
         plots.append(_plot("Battery [V]", 13.0, 17.0, "battery"))
     if live:
-        plots += [_plot("Age of poses [ms]", 0.0, 120.0, "age"), _plot("Tick [ms]", 0.0, 5.0, "tick"),
-                  rrb.TextLogView(origin="events", name="States")]  # fmt: skip
+        plots += [
+            _plot("Age of poses [ms]", 0.0, 120.0, "age"),
+            _plot("Tick [ms]", 0.0, 5.0, "tick"),
+            rrb.TextLogView(origin="events", name="States"),
+        ]
     top = rrb.Horizontal(scene, image, column_shares=[2.2, 1.0])
     below = rrb.Grid(*plots, grid_columns=3)
     return rrb.Blueprint(rrb.Vertical(top, below, row_shares=[1.7, 1.0]), collapse_panels=True)
@@ -302,7 +414,10 @@ def blueprint(goal: np.ndarray, channels: set[str]) -> rrb.Blueprint:
 
 def _plot(name: str, low: float, high: float, *entities: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
-        name=name, origin="signals", contents=[f"/signals/{e}/**" for e in entities],
+        name=name,
+        origin="signals",
+        contents=[f"/signals/{e}/**" for e in entities],
         axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
-        axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False), plot_legend=rrb.PlotLegend(visible=True),
-    )  # fmt: skip
+        axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False),
+        plot_legend=rrb.PlotLegend(visible=True),
+    )

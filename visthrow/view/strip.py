@@ -1,4 +1,6 @@
-"""The picture of one throw: the paper's strip of side views, and what the camera saw at the same instants."""
+"""The picture of one throw: the paper's strip of side views, and what the camera saw at the same
+instants.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -18,7 +20,12 @@ from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
 GROUND = 0.13  # of it seen below z = 0 [m]
-WIDTH, LEFT, PANEL, GAP = 13.6, 0.62, 3.06, 0.22  # widths of the picture, its left margin, a panel, and the gap between two [inch]
+WIDTH, LEFT, PANEL, GAP = (
+    13.6,
+    0.62,
+    3.06,
+    0.22,
+)  # widths of the picture, its left margin, a panel, and the gap between two [inch]
 
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]
@@ -30,14 +37,22 @@ GHOST_EVERY = 0.06  # between the faint earlier poses [s]
 def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     """Draw the strip of a flight, whose keypoints are the camera's, as a PNG file.
 
-    Raises LogError: the flight has no release or landing; StorageError: the place cannot be written.
-    """
+    Raises LogError: the flight has no release or landing; StorageError: the place cannot be
+    written."""
     times = log.meta["times"]
     if "separation" not in times or "landing" not in times:
-        raise LogError(f"the flight has no release and landing to draw: {log.meta['result'].get('failure') or 'it was cut short'}")
+        raise LogError(
+            "the flight has no release and landing to draw:"
+            f" {log.meta['result'].get('failure') or 'it was cut short'}"
+        )
     start, separation = times["policy_start"], times["separation"]
     halfway = start + 0.55 * (separation - start)
-    views = [("Hover", start), ("Accelerate", halfway), ("Release", separation), ("Landing", times["landing"])]
+    views = [
+        ("Hover", start),
+        ("Accelerate", halfway),
+        ("Release", separation),
+        ("Landing", times["landing"]),
+    ]
     style.use()
     import matplotlib.pyplot as plt
 
@@ -49,7 +64,9 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     all_seen = True
     for column, (caption, time) in enumerate(views):
         left = LEFT + column * (PANEL + GAP)
-        axis = figure.add_axes((left / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
+        axis = figure.add_axes(
+            (left / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height)
+        )
         _side_view(axis, log, time, side, column)
         axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - start:.2f} s", loc="left")
         axis = figure.add_axes((left / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
@@ -57,12 +74,19 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
     quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
-    where = f"Flown on {log.meta['plant_meaning']}" if log.meta["plant"] == "poses" else f"Simulated on {log.meta['plant_meaning']}"
+    where = (
+        f"Flown on {log.meta['plant_meaning']}"
+        if log.meta["plant"] == "poses"
+        else f"Simulated on {log.meta['plant_meaning']}"
+    )
     drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
     figure.text(y=1.0 - 0.54 / height, s=f"{where}, seen from the side. {drawn}", **quiet)
     unseen = "" if all_seen else "; a cross: outside the field of view"
     field = f"{camera.fisheye.fov_deg:g}°"
-    note = f"The same instants on the fisheye image ({field}): corners of the target square, box of the ball{unseen}"
+    note = (
+        f"The same instants on the fisheye image ({field}): corners of the target square, box of"
+        f" the ball{unseen}"
+    )
     figure.text(y=(PANEL + 0.42) / height, s=note, **quiet)
     atomic_write(path, png_of(figure))
 
@@ -80,7 +104,12 @@ def drawn_larger(camera: CameraParams) -> CameraParams:
     lens = camera.fisheye
     scale = PIXELS / max(lens.width, lens.height)
     size = {"width": round(scale * lens.width), "height": round(scale * lens.height)}
-    focus = {"fx": scale * lens.fx, "fy": scale * lens.fy, "cx": scale * (lens.cx + 0.5) - 0.5, "cy": scale * (lens.cy + 0.5) - 0.5}
+    focus = {
+        "fx": scale * lens.fx,
+        "fy": scale * lens.fy,
+        "cx": scale * (lens.cx + 0.5) - 0.5,
+        "cy": scale * (lens.cy + 0.5) - 0.5,
+    }
     return dataclasses.replace(camera, fisheye=dataclasses.replace(lens, **size, **focus))
 
 
@@ -88,24 +117,41 @@ def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
     paths = [
-        of.values[(of.time >= times["policy_start"]) & (of.time <= times["landing"] + 0.02)] for of in (log["pos_w"], log["payload_pos_w"])
+        of.values[(of.time >= times["policy_start"]) & (of.time <= times["landing"] + 0.02)]
+        for of in (log["pos_w"], log["payload_pos_w"])
     ]
     x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
     top = max(path[:, 2].max() for path in paths)
     if top <= 0.0:
-        raise LogError(f"vehicle and payload were below the floor all the time, {-top:.1f} m or more: there is nothing to draw")
+        raise LogError(
+            f"vehicle and payload were below the floor all the time, {-top:.1f} m or more: there is"
+            " nothing to draw"
+        )
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 
 
-def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, float], column: int) -> None:
+def _side_view(
+    axis, log: FlightLog, time: float, side: tuple[float, float, float], column: int
+) -> None:
     from matplotlib.patches import Circle, Rectangle
 
     left, right, top = side
     times, goal = log.meta["times"], log.meta["goal_w"]
-    axis.set(xlim=(left, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5))
-    axis.add_patch(Rectangle((left, -GROUND), right - left, GROUND, color="#EFEDE8", lw=0, zorder=0))
+    axis.set(
+        xlim=(left, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5)
+    )
+    axis.add_patch(
+        Rectangle((left, -GROUND), right - left, GROUND, color="#EFEDE8", lw=0, zorder=0)
+    )
     axis.axhline(0.0, color=style.QUIET, lw=1.0, zorder=1)
-    axis.plot([goal[0] - 0.125, goal[0] + 0.125], [0, 0], color=style.GOAL, lw=5, solid_capstyle="butt", zorder=2)
+    axis.plot(
+        [goal[0] - 0.125, goal[0] + 0.125],
+        [0, 0],
+        color=style.GOAL,
+        lw=5,
+        solid_capstyle="butt",
+        zorder=2,
+    )
     if column:
         axis.tick_params(labelleft=False)
     else:
@@ -123,7 +169,9 @@ def _side_view(axis, log: FlightLog, time: float, side: tuple[float, float, floa
     carried, flown = when <= times["separation"] + 1e-6, when >= times["separation"] - 0.02
     axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
     if np.count_nonzero(flown) > 1:
-        axis.plot(path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3)
+        axis.plot(
+            path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3
+        )
     if log["cable_points_w"].time[-1] > time - 0.05:  # poses tell nothing of a rope that has let go
         rope = log["cable_points_w"].at(time)
         axis.plot(rope[:, 0], rope[:, 2], color=style.ROPE, lw=1.3, zorder=4)
@@ -149,7 +197,9 @@ def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
 
 
 def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> bool:
-    """Keypoints of the true poses at a time, named in the first view; returns whether all are seen."""
+    """Keypoints of the true poses at a time, named in the first view; returns whether
+    all are seen.
+    """
 
     def one(name: str) -> torch.Tensor:
         return torch.tensor(log[name].at(time)[None], dtype=torch.float32)
@@ -171,10 +221,24 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     pixels = lens.denormalize(points[0].double()).numpy()
     for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
         right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
-        axis.annotate(name, (right, middle), xytext=(7, 0), textcoords="offset points", color="white", va="center", fontsize=9)
+        axis.annotate(
+            name,
+            (right, middle),
+            xytext=(7, 0),
+            textcoords="offset points",
+            color="white",
+            va="center",
+            fontsize=9,
+        )
     quarter = float(lens.radius_from_angle(torch.tensor(np.pi / 2))) * lens.params.fy
     axis.annotate(
-        "90° off the axis", (lens.params.cx, lens.params.cy + quarter), xytext=(0, 4), textcoords="offset points",
-        color="#B5B5B5", ha="center", va="bottom", fontsize=8,
-    )  # fmt: skip
+        "90° off the axis",
+        (lens.params.cx, lens.params.cy + quarter),
+        xytext=(0, 4),
+        textcoords="offset points",
+        color="#B5B5B5",
+        ha="center",
+        va="bottom",
+        fontsize=8,
+    )
     return seen

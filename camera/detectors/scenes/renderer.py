@@ -17,7 +17,13 @@ class Renderer:
         textures: number of photographs.
     """
 
-    def __init__(self, lens: FisheyeParams, device: str = "cpu", files: list[Path] | None = None, samples: int = 6) -> None:
+    def __init__(
+        self,
+        lens: FisheyeParams,
+        device: str = "cpu",
+        files: list[Path] | None = None,
+        samples: int = 6,
+    ) -> None:
         """Load the photographs. Raises ValueError: samples below 1, or no photographs.
 
         Args:
@@ -49,16 +55,36 @@ class Renderer:
         from camera.detectors.scenes.kernel import render
 
         p = self.lens
-        image = torch.empty(scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device)
+        image = torch.empty(
+            scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device
+        )
         s = scenes.to(self.device)
-        rows = [s.lens, s.pose, s.shutter, s.ball, s.goal, s.ground, s.walls, s.light, s.rope, s.sensor, s.things]
+        rows = [
+            s.lens,
+            s.pose,
+            s.shutter,
+            s.ball,
+            s.goal,
+            s.ground,
+            s.walls,
+            s.light,
+            s.rope,
+            s.sensor,
+            s.things,
+        ]
         arrays = [row.float().contiguous() for row in rows]
 
         def launch(part: slice) -> None:
             inputs = [wp.from_torch(row[part]) for row in arrays]
             out = wp.from_torch(image[part])
             dim = (out.shape[0], p.height, p.width)
-            wp.launch(render, dim=dim, device=self.device, inputs=[seed, self.samples, *inputs, self._pixels], outputs=[out])
+            wp.launch(
+                render,
+                dim=dim,
+                device=self.device,
+                inputs=[seed, self.samples, *inputs, self._pixels],
+                outputs=[out],
+            )
 
         if self.device.startswith("cuda"):
             torch.cuda.synchronize(self.device)  # Warp's stream is not torch's
@@ -66,7 +92,11 @@ class Renderer:
             wp.synchronize_device(self.device)
             return image
         wp.load_module(device=self.device, module="camera.detectors.scenes.kernel")
-        share = -(-scenes.count // torch.get_num_threads())  # Warp runs a launch on the CPU in the thread that asks for it
+        share = -(
+            -scenes.count // torch.get_num_threads()
+        )  # Warp runs a launch on the CPU in the thread that asks for it
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-            list(threads.map(launch, (slice(at, at + share) for at in range(0, scenes.count, share))))
+            list(
+                threads.map(launch, (slice(at, at + share) for at in range(0, scenes.count, share)))
+            )
         return image

@@ -1,4 +1,6 @@
-"""Scenes of a throw: what is drawn, at random or by a flight, and where its keypoints are in the picture."""
+"""Scenes of a throw: what is drawn, at random or by a flight, and where its keypoints are in the
+picture.
+"""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -17,19 +19,28 @@ THINGS = 10  # most things on the ground and about the hall
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch of scenes, a row each, float32; angles [rad], lengths [m], times [s], colours 0 to 1."""
+    """A batch of scenes, a row each, float32; angles [rad], lengths [m], times [s],
+    colours 0 to 1.
+    """
 
-    lens: Tensor  # fx, fy, cx, cy [px], k1 to k4, half field of view, vignetting (power of the cosine of half the angle)
-    pose: Tensor  # of the camera: place 3, world from camera xyzw 4, velocity 3, its rates in the camera frame 3
-    shutter: Tensor  # exposure, readout from the first to the last row, defocus (standard deviation [px])
+    # fx, fy, cx, cy [px], k1 to k4, half field of view, vignetting (power of the cosine of half the
+    # angle)
+    lens: Tensor
+    # of the camera: place 3, world from camera xyzw 4, velocity 3, its rates in the camera frame 3
+    pose: Tensor
+    # exposure, readout from the first to the last row, defocus (standard deviation [px])
+    shutter: Tensor
     ball: Tensor  # centre 3, radius, velocity 3, turn xyzw 4, colour 3, seam 3
-    goal: Tensor  # x, y, side, yaw, rim, mark (0 none, 1 cross, 2 disc, 3 ring), field 3, rim 3, mark 3
+    # x, y, side, yaw, rim, mark (0 none, 1 cross, 2 disc, 3 ring), field 3, rim 3, mark 3
+    goal: Tensor
     ground: Tensor  # texture, side of a tile, yaw, offset 2, tint 3
     walls: Tensor  # texture, half side and height of the hall, side of a tile, brightness
     light: Tensor  # direction towards it 3, ambient share, colour 3, depth of the shadows
     rope: Tensor  # its upper end from the lens 3 (world), radius (0: none), colour 3
     sensor: Tensor  # gain, shot noise, read noise, gamma, free, seed
-    things: Tensor  # shape (E, THINGS, 12): kind (0 none, 1 disc, 2 rectangle, 3 ball), place 3, sizes 2, yaw, colour 3, rim from, rim
+    # shape (E, THINGS, 12): kind (0 none, 1 disc, 2 rectangle, 3 ball), place 3, sizes 2, yaw,
+    # colour 3, rim from, rim
+    things: Tensor
 
     @property
     def count(self) -> int:
@@ -47,7 +58,9 @@ class Scenes:
 
 def lens_row(lens: FisheyeParams, vignetting: float = 0.5) -> Tensor:
     """Row of a lens, shape (10,)."""
-    return torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients, lens.half_fov, vignetting])
+    return torch.tensor(
+        [lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients, lens.half_fov, vignetting]
+    )
 
 
 class Draw:
@@ -93,7 +106,9 @@ class Nuisances:
     parts: float = 1.0  # rope before the lens
 
 
-def random_scenes(params: CameraParams, textures: int, count: int, seed: int, nuisances: Nuisances | None = None) -> Scenes:
+def random_scenes(
+    params: CameraParams, textures: int, count: int, seed: int, nuisances: Nuisances | None = None
+) -> Scenes:
     """Draw moments of throws: hanging or thrown ball, level or steep vehicle, goal within 2.3 m.
 
     Args:
@@ -113,19 +128,30 @@ def random_scenes(params: CameraParams, textures: int, count: int, seed: int, nu
     ball = pos + way * reach
     ball[:, 2].clamp_(min=params.payload_radius)
     scenes = posed_scenes(params, pos, rot_wb, ball, goal, ~thrown[:, 0])
-    scenes = replace(scenes, pose=torch.cat([scenes.pose[:, :7], d.normal(1.2, 3), d.normal(2.5, 3)], -1))
+    scenes = replace(
+        scenes, pose=torch.cat([scenes.pose[:, :7], d.normal(1.2, 3), d.normal(2.5, 3)], -1)
+    )
     scenes.ball[:, 4:7] = scenes.pose[:, 7:10] + d.normal(1.5, 3)
     scenes.goal[:, 3] = d.normal(0.05)
     return dressed(scenes, d, textures, n)
 
 
-def posed_scenes(params: CameraParams, pos_w: Tensor, rot_wb: Tensor, ball_w: Tensor, goal_w: Tensor, hangs: Tensor) -> Scenes:
-    """Plain scenes at poses: grey ground, tennis ball, green square with a white rim, a sharp and quiet picture.
+def posed_scenes(
+    params: CameraParams,
+    pos_w: Tensor,
+    rot_wb: Tensor,
+    ball_w: Tensor,
+    goal_w: Tensor,
+    hangs: Tensor,
+) -> Scenes:
+    """Plain scenes at poses: grey ground, tennis ball, green square with a white rim, a sharp and
+    quiet picture.
 
     Args:
         params: camera.
         pos_w: of the vehicle [m], shape (E, 3). rot_wb: attitude, shape (E, 3, 3).
-        ball_w: [m], shape (E, 3). goal_w: [m], shape (E, 2) or (E, 3). hangs: whether the ball is on its rope, shape (E,).
+        ball_w: [m], shape (E, 3). goal_w: [m], shape (E, 2) or (E, 3). hangs: whether the ball is
+            on its rope, shape (E,).
     """
     from camera.mount import nominal_rot_cb
 
@@ -135,39 +161,90 @@ def posed_scenes(params: CameraParams, pos_w: Tensor, rot_wb: Tensor, ball_w: Te
     rot_wc = rot_wb @ nominal_rot_cb(params.mount).float().T
     mount = rot_wb @ (torch.tensor([0.0, 0.0, -0.02]) - lens_b)
     rope = torch.cat([mount, 0.0012 * hangs.float()[:, None], make([0.2, 0.2, 0.2])], -1)
-    ball = torch.cat([ball_w.float(), make([params.payload_radius, 0, 0, 0, 0, 0, 0, 1.0, 0.80, 0.88, 0.20, 0.95, 0.95, 0.92])], -1)
-    goal = torch.cat([goal_w[:, :2].float(), make([params.goal_side, 0, 0.02, 0, 0.16, 0.55, 0.26, 0.93, 0.93, 0.90, 0.1, 0.1, 0.1])], -1)
+    ball = torch.cat(
+        [
+            ball_w.float(),
+            make(
+                [params.payload_radius, 0, 0, 0, 0, 0, 0, 1.0, 0.80, 0.88, 0.20, 0.95, 0.95, 0.92]
+            ),
+        ],
+        -1,
+    )
+    goal = torch.cat(
+        [
+            goal_w[:, :2].float(),
+            make([params.goal_side, 0, 0.02, 0, 0.16, 0.55, 0.26, 0.93, 0.93, 0.90, 0.1, 0.1, 0.1]),
+        ],
+        -1,
+    )
     light = torch.nn.functional.normalize(torch.tensor([0.35, 0.25, 0.9]), dim=0)
     return Scenes(
-        lens_row(params.fisheye, 0.0).repeat(count, 1), torch.cat([eye, _quat(rot_wc), torch.zeros(count, 6)], -1),
-        torch.zeros(count, 3), ball, goal, make([-1.0, 1.0, 0, 0, 0, 0.55, 0.55, 0.55]), make([-1.0, 8.0, 6.0, 4.0, 0.5]),
-        torch.cat([light.repeat(count, 1), make([0.45, 1, 1, 1, 0.0])], -1), rope, make([1.0, 0, 0, 1.0, 0, 0]),
+        lens_row(params.fisheye, 0.0).repeat(count, 1),
+        torch.cat([eye, _quat(rot_wc), torch.zeros(count, 6)], -1),
+        torch.zeros(count, 3),
+        ball,
+        goal,
+        make([-1.0, 1.0, 0, 0, 0, 0.55, 0.55, 0.55]),
+        make([-1.0, 8.0, 6.0, 4.0, 0.5]),
+        torch.cat([light.repeat(count, 1), make([0.45, 1, 1, 1, 0.0])], -1),
+        rope,
+        make([1.0, 0, 0, 1.0, 0, 0]),
         torch.zeros(count, THINGS, 12),
-    )  # fmt: skip
+    )
 
 
 def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
     count = scenes.count
     flat = lambda *columns: torch.cat([c if c.dim() == 2 else c[:, None] for c in columns], -1)  # noqa: E731
-    ground, walls, ball, goal = scenes.ground.clone(), scenes.walls.clone(), scenes.ball.clone(), scenes.goal.clone()
+    ground, walls, ball, goal = (
+        scenes.ground.clone(),
+        scenes.walls.clone(),
+        scenes.ball.clone(),
+        scenes.goal.clone(),
+    )
     pictured = d.chance(n.ground)
     tint = d.uniform(0.45, 1.1, 1) * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
     ground = torch.where(
-        pictured[:, None], flat(d.one_of(textures), d.uniform(0.4, 3.0), d.uniform(0.0, 6.28), d.uniform(0.0, 2.0, 2), tint), ground
+        pictured[:, None],
+        flat(
+            d.one_of(textures),
+            d.uniform(0.4, 3.0),
+            d.uniform(0.0, 6.28),
+            d.uniform(0.0, 2.0, 2),
+            tint,
+        ),
+        ground,
     )
-    dressed_walls = flat(d.one_of(textures), d.uniform(3.0, 9.0), d.uniform(3.0, 7.0), d.uniform(1.5, 6.0), d.uniform(0.3, 1.0))
+    dressed_walls = flat(
+        d.one_of(textures),
+        d.uniform(3.0, 9.0),
+        d.uniform(3.0, 7.0),
+        d.uniform(1.5, 6.0),
+        d.uniform(0.3, 1.0),
+    )
     walls = torch.where(pictured[:, None], dressed_walls, walls)
     ball[:, 7:11] = torch.nn.functional.normalize(d.normal(1.0, 4), dim=-1)
-    ball[:, 11:14] = (ball[:, 11:14] + n.look * (d.uniform(-0.18, 0.12, 1) + d.uniform(-0.08, 0.08, 3))).clamp(0.02, 1.0)
+    ball[:, 11:14] = (
+        ball[:, 11:14] + n.look * (d.uniform(-0.18, 0.12, 1) + d.uniform(-0.08, 0.08, 3))
+    ).clamp(0.02, 1.0)
     ball[:, 14:17] = (ball[:, 14:17] + n.look * d.uniform(-0.3, 0.05, 1)).clamp(0.02, 1.0)
-    goal[:, 6:9] = (goal[:, 6:9] + n.look * (d.uniform(-0.08, 0.12, 1) + d.uniform(-0.08, 0.08, 3))).clamp(0.02, 1.0)
+    goal[:, 6:9] = (
+        goal[:, 6:9] + n.look * (d.uniform(-0.08, 0.12, 1) + d.uniform(-0.08, 0.08, 3))
+    ).clamp(0.02, 1.0)
     goal[:, 9:12] = (goal[:, 9:12] + n.look * d.uniform(-0.25, 0.07, 1)).clamp(0.02, 1.0)
     goal[:, 4] = goal[:, 4] + n.look * d.uniform(-0.008, 0.012)
     goal[:, 5] = torch.where(d.chance(0.6 * n.look), d.one_of(4), goal[:, 5])
-    direction = torch.nn.functional.normalize(torch.cat([d.normal(0.5, 2), torch.ones(count, 1)], -1), dim=-1)
+    direction = torch.nn.functional.normalize(
+        torch.cat([d.normal(0.5, 2), torch.ones(count, 1)], -1), dim=-1
+    )
     colour = 1.0 + n.light * d.uniform(-0.15, 0.15, 3)
-    light = flat(torch.where(d.chance(n.light)[:, None], direction, scenes.light[:, :3]), d.uniform(0.3, 0.7), colour, d.uniform(0.2, 0.8))
+    light = flat(
+        torch.where(d.chance(n.light)[:, None], direction, scenes.light[:, :3]),
+        d.uniform(0.3, 0.7),
+        colour,
+        d.uniform(0.2, 0.8),
+    )
     rope = scenes.rope.clone()
     rope[:, 3] = rope[:, 3] * d.chance(n.parts) * d.uniform(0.6, 1.5)
     rope[:, 4:7] = d.uniform(0.05, 0.9, 1)
@@ -176,33 +253,75 @@ def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     gain = torch.exp2(n.light * d.uniform(-1.2, 0.9))
     noise = n.noise * d.uniform(0.0, 1.0, 1).square()
     seed = torch.arange(count) * 7919.0 + d.one_of(1000)
-    sensor = flat(gain, 0.06 * noise[:, 0], 0.04 * noise[:, 0], 1.0 + n.light * d.uniform(-0.45, 0.1), torch.zeros(count), seed)
-    shutter = flat(n.motion * d.uniform(0.0, 0.012), n.motion * d.uniform(0.0, 0.012), n.blur * d.uniform(0.0, 1.0).square() * 1.6)
+    sensor = flat(
+        gain,
+        0.06 * noise[:, 0],
+        0.04 * noise[:, 0],
+        1.0 + n.light * d.uniform(-0.45, 0.1),
+        torch.zeros(count),
+        seed,
+    )
+    shutter = flat(
+        n.motion * d.uniform(0.0, 0.012),
+        n.motion * d.uniform(0.0, 0.012),
+        n.blur * d.uniform(0.0, 1.0).square() * 1.6,
+    )
     things = _things(scenes, d, n)
     return replace(
-        scenes, ground=ground, walls=walls, ball=ball, goal=goal, light=light, rope=rope, lens=lens, sensor=sensor, shutter=shutter,
+        scenes,
+        ground=ground,
+        walls=walls,
+        ball=ball,
+        goal=goal,
+        light=light,
+        rope=rope,
+        lens=lens,
+        sensor=sensor,
+        shutter=shutter,
         things=things,
-    )  # fmt: skip
+    )
 
 
 def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
-    """Things of any colour, half of them of one like the ball's or the square's; none on the square or before the ball."""
-    kind = torch.where(d.chance(0.6 * n.clutter, THINGS), 1.0 + d.one_of(3, THINGS), torch.zeros(()))
+    """Things of any colour, half of them of one like the ball's or the square's; none on the square
+    or before the ball.
+    """
+    kind = torch.where(
+        d.chance(0.6 * n.clutter, THINGS), 1.0 + d.one_of(3, THINGS), torch.zeros(())
+    )
     angle = d.uniform(0.0, 6.28, THINGS)
-    place = scenes.pose[:, None, :2] + d.uniform(0.2, 3.5, THINGS)[..., None] * torch.stack([angle.cos(), angle.sin()], -1)
+    place = scenes.pose[:, None, :2] + d.uniform(0.2, 3.5, THINGS)[..., None] * torch.stack(
+        [angle.cos(), angle.sin()], -1
+    )
     size = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), d.uniform(0.02, 0.14, THINGS))
     other = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), size)
-    alike = torch.tensor([[0.75, 0.80, 0.25], [0.20, 0.50, 0.28], [0.85, 0.75, 0.20], [0.9, 0.9, 0.88]])[d.one_of(4, THINGS).long()]
-    colour = torch.where(d.chance(0.5, THINGS)[..., None], alike + d.uniform(-0.08, 0.08, THINGS, 3), d.uniform(0.03, 0.97, THINGS, 3))
+    alike = torch.tensor(
+        [[0.75, 0.80, 0.25], [0.20, 0.50, 0.28], [0.85, 0.75, 0.20], [0.9, 0.9, 0.88]]
+    )[d.one_of(4, THINGS).long()]
+    colour = torch.where(
+        d.chance(0.5, THINGS)[..., None],
+        alike + d.uniform(-0.08, 0.08, THINGS, 3),
+        d.uniform(0.03, 0.97, THINGS, 3),
+    )
     height = torch.where(kind == 3, size + d.uniform(0.0, 0.4, THINGS), torch.zeros(()))
     off = (place - scenes.goal[:, None, :2]).norm(dim=-1)
     near = (place - scenes.ball[:, None, :2]).norm(dim=-1)
     stays = (off > 0.22 + torch.maximum(size, other)) & ((kind != 3) | (near > 0.25 + size))
     rim = torch.where(d.chance(0.3, THINGS), d.uniform(0.6, 0.9, THINGS), torch.full((), 9.0))
     return torch.cat(
-        [(kind * stays)[..., None], place, height[..., None], size[..., None], other[..., None], d.uniform(0.0, 3.14, THINGS, 1),
-         colour.clamp(0.0, 1.0), rim[..., None], d.uniform(0.0, 1.0, THINGS, 1)], -1,
-    )  # fmt: skip
+        [
+            (kind * stays)[..., None],
+            place,
+            height[..., None],
+            size[..., None],
+            other[..., None],
+            d.uniform(0.0, 3.14, THINGS, 1),
+            colour.clamp(0.0, 1.0),
+            rim[..., None],
+            d.uniform(0.0, 1.0, THINGS, 1),
+        ],
+        -1,
+    )
 
 
 def _quat(rot: Tensor) -> Tensor:
@@ -215,7 +334,9 @@ class Truth:
     """Where ball and square are in the pictures, at the instants that their rows were exposed."""
 
     ball_c: Tensor  # centre [m], shape (E, 3), camera frame
-    corners_c: Tensor  # of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
+    corners_c: (
+        Tensor  # of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
+    )
     rot_wc: Tensor  # camera to world, shape (E, 3, 3)
     ball_seen: Tensor  # whole in the field of view, shape (E,), bool
     goal_seen: Tensor  # likewise
@@ -231,8 +352,13 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
     rot = torch.from_numpy(Rotation.from_quat(scenes.pose[:, 3:7].double().numpy()).as_matrix())
     c, s = scenes.goal[:, 3].double().cos(), scenes.goal[:, 3].double().sin()
     turn = torch.stack([c, -s, s, c], -1).unflatten(-1, (2, 2))
-    square = goal_corners_w(torch.zeros(1, 2, dtype=torch.float64), 1.0)[:, :, :2] * scenes.goal[:, 2, None, None].double()
-    corners = torch.nn.functional.pad(square @ turn.transpose(1, 2) + scenes.goal[:, None, :2].double(), (0, 1))
+    square = (
+        goal_corners_w(torch.zeros(1, 2, dtype=torch.float64), 1.0)[:, :, :2]
+        * scenes.goal[:, 2, None, None].double()
+    )
+    corners = torch.nn.functional.pad(
+        square @ turn.transpose(1, 2) + scenes.goal[:, None, :2].double(), (0, 1)
+    )
     points = torch.cat([corners, scenes.ball[:, None, :3].double()], 1)
     speed = torch.cat([torch.zeros_like(corners), scenes.ball[:, None, 4:7].double()], 1)
     eye, vel, rate = (scenes.pose[:, None, a:b].double() for a, b in ((0, 3), (7, 10), (10, 13)))
@@ -242,7 +368,11 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
         still = world @ rot
         seen = torch.einsum("ekji,ekj->eki", rotation_from_vector(rate * time), still)
         pixels, inside = lens.project(seen)
-        time = ((pixels[..., 1:2] + 0.5) / lens.params.height - 0.5) * scenes.shutter[:, None, 1:2].double()
+        time = ((pixels[..., 1:2] + 0.5) / lens.params.height - 0.5) * scenes.shutter[
+            :, None, 1:2
+        ].double()
     inside = inside & lens.on_sensor(pixels)
-    _, sides = lens.project_normalized(ball_extremes_c(lens, seen[:, 4], float(scenes.ball[0, 3])), clip=False)
+    _, sides = lens.project_normalized(
+        ball_extremes_c(lens, seen[:, 4], float(scenes.ball[0, 3])), clip=False
+    )
     return Truth(seen[:, 4], seen[:, :4], rot, sides.all(1) & inside[:, 4], inside[:, :4].all(1))

@@ -1,8 +1,8 @@
 """Photographs as textures: those that scikit-image ships, or a folder of one's own.
 
-scikit-image's wheel holds them with their licences told in ``skimage.data``: brick, grass, gravel and coffee are CC0, rocket and
-astronaut NASA's (public domain), motorcycle of the Middlebury stereo data, chelsea CC0, color and cell of its contributors.
-"""
+scikit-image's wheel holds them with their licences told in ``skimage.data``: brick, grass, gravel
+and coffee are CC0, rocket and astronaut NASA's (public domain), motorcycle of the Middlebury stereo
+data, chelsea CC0, color and cell of its contributors."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,7 +17,9 @@ HELD_OUT = ("grass", "chelsea", "motorcycle_right", "astronaut", "moon")
 
 
 def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAINING) -> list[Path]:
-    """Files of photographs. Raises ValueError: no photograph there, or scikit-image is not installed.
+    """Files of photographs.
+
+    Raises ValueError: no photograph there, or scikit-image is not installed.
 
     Args:
         folder: of one's own, all its PNG and JPEG files; None: scikit-image's.
@@ -26,18 +28,31 @@ def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAIN
     if folder is None:
         found = find_spec("skimage")
         if found is None or found.origin is None:
-            raise ValueError("textures: scikit-image is not installed; install visthrow[detector], or name a folder of photographs")
+            raise ValueError(
+                "textures: scikit-image is not installed; install visthrow[detector], or name a"
+                " folder of photographs"
+            )
         folder = Path(found.origin).parent / "data"
-        files = [path for name in names for path in sorted(folder.glob(f"{name}.*")) if path.suffix in (".png", ".jpg")]
+        files = [
+            path
+            for name in names
+            for path in sorted(folder.glob(f"{name}.*"))
+            if path.suffix in (".png", ".jpg")
+        ]
     else:
-        files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+        files = sorted(
+            path
+            for path in Path(folder).iterdir()
+            if path.suffix.lower() in (".png", ".jpg", ".jpeg")
+        )
     if not files:
         raise ValueError(f"textures: no photograph in {folder}; expected PNG or JPEG files")
     return files
 
 
 def pyramid(files: list[Path]) -> np.ndarray:
-    """Textures with their coarser levels, RGB, uint8, shape (T, bytes of a pyramid): what the renderer reads.
+    """Textures with their coarser levels, RGB, uint8, shape (T, bytes of a pyramid): what the
+    renderer reads.
 
     Raises ValueError: a file that is no picture.
     """
@@ -50,10 +65,16 @@ def pyramid(files: list[Path]) -> np.ndarray:
             raise ValueError(f"{path}: no picture that OpenCV can read")
         side = min(picture.shape[:2])
         top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
-        level = cv2.resize(picture[top : top + side, left : left + side, ::-1], (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+        level = cv2.resize(
+            picture[top : top + side, left : left + side, ::-1],
+            (SIZE, SIZE),
+            interpolation=cv2.INTER_AREA,
+        )
         levels = [level]
         for _ in range(MIPS - 1):
-            level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
+            level = cv2.resize(
+                level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA
+            )
             levels.append(level)
         rows.append(np.concatenate([np.ascontiguousarray(one).reshape(-1) for one in levels]))
     return np.stack(rows) if rows else np.zeros((0, 1), np.uint8)

@@ -1,4 +1,6 @@
-"""Where the time of a tick goes: percentiles and a histogram a stage, in memory that does not grow with the run."""
+"""Where the time of a tick goes: percentiles and a histogram a stage, in memory that does not grow
+with the run.
+"""
 
 import math
 from pathlib import Path
@@ -9,7 +11,9 @@ import numpy as np
 from hil.poses.pose import VEHICLE, Pose
 
 STAGES = {
-    "transport": "from measurement to arrival; beyond the fastest pose where the source's clock is not known",
+    "transport": (
+        "from measurement to arrival; beyond the fastest pose where the source's clock is not known"
+    ),
     "arrival": "from the newest pose's arrival to the tick",
     "late": "how late the tick began",
     "poll": "taking in what came since the last look",
@@ -22,11 +26,24 @@ STAGES = {
 }
 """Stage -> what it is, in the order of the report."""
 OF_CLOCK = ("transport", "arrival", "late", "ack")
-"""Stages between two readings of the run's clock, which ``--speed`` slows; the others are taken in real time."""
+"""Stages between two readings of the run's clock, which ``--speed`` slows; the others are taken in
+real time.
+"""
 
-LEAST, GROWTH, BINS = 1e-6, 1.01, 1640  # lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per cent
+LEAST, GROWTH, BINS = (
+    1e-6,
+    1.01,
+    1640,
+    # lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per
+    # cent
+)
 CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
-_WIDTH, _ROW, _BELOW, _ABOVE = 8.6, 0.88, 0.6, 0.3  # of the picture, of a stage's row, and the margins for axis and title [inch]
+_WIDTH, _ROW, _BELOW, _ABOVE = (
+    8.6,
+    0.88,
+    0.6,
+    0.3,
+)  # of the picture, of a stage's row, and the margins for axis and title [inch]
 _BAR = 0.72  # height of the highest bar, in rows; the rest is for the words above it
 
 
@@ -44,7 +61,9 @@ class Stage:
         self.most = max(self.most, seconds)
 
     def percentile(self, share: float) -> float:
-        """Return the time [s] below which a share of all lie, 0 to 1; to one per cent, and never above the largest."""
+        """Return the time [s] below which a share of all lie, 0 to 1; to one per cent, and never
+        above the largest.
+        """
         reached = np.searchsorted(np.cumsum(self.counts), share * self.counts.sum())
         return min(LEAST * GROWTH ** (float(reached) + 0.5), self.most)
 
@@ -54,7 +73,11 @@ class Stage:
         if not count:
             return {}
         shares = {"p50_ms": 0.5, "p95_ms": 0.95, "p99_ms": 0.99}
-        return {**{k: 1e3 * self.percentile(p) for k, p in shares.items()}, "max_ms": 1e3 * self.most, "count": count}
+        return {
+            **{k: 1e3 * self.percentile(p) for k, p in shares.items()},
+            "max_ms": 1e3 * self.most,
+            "count": count,
+        }
 
 
 class Stages:
@@ -70,10 +93,14 @@ class Stages:
             self.stages[name].add(seconds)
 
     def poses(self, poses: list[Pose], now: float) -> dict[str, float]:
-        """Return times of the vehicle's poses that have come for a tick at ``now`` [s]; transport is counted a pose."""
+        """Return times of the vehicle's poses that have come for a tick at ``now`` [s]; transport
+        is counted a pose.
+        """
         newest = None
         for pose in poses:
-            if pose.body != VEHICLE or not (math.isfinite(pose.stamp) and math.isfinite(pose.arrival)):
+            if pose.body != VEHICLE or not (
+                math.isfinite(pose.stamp) and math.isfinite(pose.arrival)
+            ):
                 continue
             newest = pose.arrival
             if pose.measured is not None:
@@ -93,24 +120,33 @@ class Stages:
 
 def slowed(speed: float) -> str:
     """Return whose milliseconds they are, where the run's clock is not real time; else nothing."""
-    return "" if speed == 1.0 else f"; {', '.join(OF_CLOCK)}: by the run's clock, at {speed:g} of real time"
+    return (
+        ""
+        if speed == 1.0
+        else f"; {', '.join(OF_CLOCK)}: by the run's clock, at {speed:g} of real time"
+    )
 
 
 def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]:
-    """Return lines of a report, a stage a line, of :meth:`Stages.summary` and the speed of the run's clock."""
+    """Return lines of a report, a stage a line, of :meth:`Stages.summary` and the speed of the
+    run's clock.
+    """
     lines = [f"{'stage':11}     p50     p95     p99     max [ms]{slowed(speed)}"]
     for name, values in latency.items():
         if values:
-            numbers = "".join(f" {values[k]:7.3f}" for k in ("p50_ms", "p95_ms", "p99_ms", "max_ms"))
+            numbers = "".join(
+                f" {values[k]:7.3f}" for k in ("p50_ms", "p95_ms", "p99_ms", "max_ms")
+            )
             lines.append(f"{name:11}{numbers}   {STAGES.get(name, '')}")
     return lines
 
 
 def draw(path: str | Path, stages: Stages, title: str) -> None:
-    """Draw a histogram a stage, one below the other over one axis of time, as a PNG file; raises `StorageError` where it cannot be written.
+    """Draw a histogram a stage, one below the other over one axis of time, as a PNG file; raises
+    `StorageError` where it cannot be written.
 
-    A run ends with this: one axis with fixed margins is drawn four times as fast as an axis a stage whose labels are measured.
-    """
+    A run ends with this: one axis with fixed margins is drawn four times as fast as an axis a stage
+    whose labels are measured."""
     from visthrow.common import style
     from visthrow.common.storage import atomic_write
     from visthrow.view.parts import png_of
@@ -122,7 +158,12 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     rows = max(len(shown), 1)
     height = _BELOW + _ROW * rows + _ABOVE
     figure, axis = plt.subplots(figsize=(_WIDTH, height))
-    figure.subplots_adjust(left=1.05 / _WIDTH, right=1.0 - 0.2 / _WIDTH, bottom=_BELOW / height, top=1.0 - _ABOVE / height)
+    figure.subplots_adjust(
+        left=1.05 / _WIDTH,
+        right=1.0 - 0.2 / _WIDTH,
+        bottom=_BELOW / height,
+        top=1.0 - _ABOVE / height,
+    )
     for row, (name, stage) in enumerate(shown.items()):
         _histogram(axis, row, name, stage)
     axis.set_xscale("log")
@@ -145,8 +186,36 @@ def _histogram(axis: Any, row: int, name: str, stage: Stage) -> None:
     used = np.flatnonzero(counts)
     part = slice(used[0], used[-1] + 1)
     heights = row - _BAR * counts[part] / counts.max()
-    axis.stairs(heights, edges[used[0] : used[-1] + 2], baseline=row, fill=True, color=style.COLOURS[0], alpha=0.75)
-    axis.vlines([1e3 * stage.percentile(share) for share in (0.5, 0.95, 0.99)], row, row - _BAR, color=style.INK, lw=0.8)
-    axis.plot(1e3 * max(stage.most, LEAST), row, "v", color=style.COLOURS[1], ms=7, clip_on=False, zorder=4)
+    axis.stairs(
+        heights,
+        edges[used[0] : used[-1] + 2],
+        baseline=row,
+        fill=True,
+        color=style.COLOURS[0],
+        alpha=0.75,
+    )
+    axis.vlines(
+        [1e3 * stage.percentile(share) for share in (0.5, 0.95, 0.99)],
+        row,
+        row - _BAR,
+        color=style.INK,
+        lw=0.8,
+    )
+    axis.plot(
+        1e3 * max(stage.most, LEAST),
+        row,
+        "v",
+        color=style.COLOURS[1],
+        ms=7,
+        clip_on=False,
+        zorder=4,
+    )
     axis.axhline(row, color=style.QUIET, lw=0.8)
-    axis.text(0.0, row - _BAR - 0.02, STAGES[name], transform=axis.get_yaxis_transform(), fontsize=8.0, va="bottom")
+    axis.text(
+        0.0,
+        row - _BAR - 0.02,
+        STAGES[name],
+        transform=axis.get_yaxis_transform(),
+        fontsize=8.0,
+        va="bottom",
+    )

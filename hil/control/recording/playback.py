@@ -1,7 +1,7 @@
 """A recorded run, run again tick by tick: what the runner decided and what it took for true.
 
-The replay, the flight logs and the viewer are all made of this, so that they show what was flown and nothing else.
-"""
+The replay, the flight logs and the viewer are all made of this, so that they show what was flown
+and nothing else."""
 
 import argparse
 import json
@@ -29,7 +29,10 @@ class Sample:
     pose: Pose  # stamp on the source's clock, freed of its steps
     vel_w: Vector  # [m/s]
     rate_b: Vector  # [rad/s]
-    time: float | None = None  # of the measurement on the runner's clock [s], once it was worked out from the whole run
+    time: float | None = (
+        # of the measurement on the runner's clock [s], once it was worked out from the whole run
+        None
+    )
 
 
 @dataclass
@@ -50,7 +53,9 @@ class Playback:
     def __init__(self, params: HilParams, policy: Policy) -> None:
         """Start before the first tick; see `hil.control.recording.record.load_run` for both."""
         self.params, self.runner = params, Runner(params, policy, DryRun())
-        self.runner.watcher = lambda body, track: self._samples.append(Sample(body, *track.sample()))
+        self.runner.watcher = lambda body, track: self._samples.append(
+            Sample(body, *track.sample())
+        )
         self._samples: list[Sample] = []
 
     def feed(self, line: dict[str, Any], poses: list[Pose]) -> Tick:
@@ -60,20 +65,33 @@ class Playback:
             runner.look([Detection.of(line["seen"])])
         if (found := line.get("calibration")) is not None:
             runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
-        decision = runner.tick(now, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"])
+        decision = runner.tick(
+            now, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
+        )
         ages = {name: track.gate.age(now) for name, track in runner.tracks.items()}
-        return Tick(line, decision, self._samples, ages, not runner.latch.separated(now), runner.seen_goal_w)
+        return Tick(
+            line, decision, self._samples, ages, not runner.latch.separated(now), runner.seen_goal_w
+        )
 
 
-COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")  # what a replay must give again, bit for bit
+COMPARED = (
+    "state",
+    "command",
+    "action",
+    "observation",
+    "keypoints",
+    "valid",
+    "release",
+)  # what a replay must give again, bit for bit
 
 
 def replay(folder: str | Path) -> dict[str, Any]:
-    """Run the recorded poses, statuses and words of a run through the runner again; raises `RunError` for a folder that is none.
+    """Run the recorded poses, statuses and words of a run through the runner again; raises
+    `RunError` for a folder that is none.
 
-    Returns the number of ticks and actions compared, the bodies, the differences (tick, name, recorded value, value now), and what is
-    missing of the recording, or None; ``story``: where it went wrong, in a sentence.
-    """
+    Returns the number of ticks and actions compared, the bodies, the differences (tick, name,
+    recorded value, value now), and what is missing of the recording, or None; ``story``: where it
+    went wrong, in a sentence."""
     params, policy, ticks, poses = load_run(folder)
     playback, turn, last = Playback(params, policy), None, None
     differences: list[tuple[int, str, Any, Any]] = []
@@ -81,12 +99,20 @@ def replay(folder: str | Path) -> dict[str, Any]:
     for line in ticks:
         decision = playback.feed(line, poses.get(line["n"], [])).decision
         actions += decision.action is not None
-        seen = {"time": decision.time, "state": decision.state, "reason": decision.reason, "since": decision.time}
+        seen = {
+            "time": decision.time,
+            "state": decision.state,
+            "reason": decision.reason,
+            "since": decision.time,
+        }
         if last is not None and decision.state == last["state"]:
             seen["since"] = last["since"]
         seen["vehicle"] = playback.runner.tracks[VEHICLE].state(decision.time)
         if turn is None and decision.state == State.ABORT.value:
-            turn = {**seen, **({} if last is None else {"state": last["state"], "since": last["since"]})}
+            turn = {
+                **seen,
+                **({} if last is None else {"state": last["state"], "since": last["since"]}),
+            }
         last = seen
         for name in COMPARED:
             was, now = line[name], getattr(decision, name)
@@ -95,9 +121,15 @@ def replay(folder: str | Path) -> dict[str, Any]:
                 differences.append((line["n"], name, was, now))
     cut = _cut(folder, len(ticks))
     return {
-        "ticks": len(ticks), "actions": actions, "differences": differences, "cut": cut, "story": sentence(turn, last, cut),
-        "bodies": sorted({pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)),
-    }  # fmt: skip
+        "ticks": len(ticks),
+        "actions": actions,
+        "differences": differences,
+        "cut": cut,
+        "story": sentence(turn, last, cut),
+        "bodies": sorted(
+            {pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)
+        ),
+    }
 
 
 def _cut(folder: str | Path, ticks: int) -> str | None:
@@ -105,15 +137,20 @@ def _cut(folder: str | Path, ticks: int) -> str | None:
     try:
         flown = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))["ticks"]
     except OSError:
-        return "no summary: the run was killed, or its disk was full; how many ticks it flew on is not known"
+        return (
+            "no summary: the run was killed, or its disk was full; how many ticks it flew on is not"
+            " known"
+        )
     except (ValueError, KeyError, TypeError) as error:
         return f"{SUMMARY} does not say how many ticks there were: {error!r}"
     return None if ticks == flown else f"{flown - ticks} of {flown} ticks are missing"
 
 
 def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str | None) -> str:
-    """Return where a run went wrong, by the first tick in abort (``time`` [s], ``state`` before it, ``since`` when [s], ``reason``,
-    ``vehicle`` as it was seen), the last tick in the same form, and what is missing of the recording."""
+    """Return where a run went wrong, by the first tick in abort (``time`` [s], ``state`` before it,
+    ``since`` when [s], ``reason``, ``vehicle`` as it was seen), the last tick in the same form, and
+    what is missing of the recording.
+    """
     at = turn or (last if cut else None)
     if last is None:
         return "Whether it went wrong is not known: no tick is recorded."
@@ -123,18 +160,30 @@ def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str 
     vehicle: BodyState | None = at["vehicle"]
     where = "had not been seen"
     if vehicle is not None:
-        place, speed = ", ".join(f"{x:.2f}" for x in vehicle.pos), sum(v * v for v in vehicle.vel) ** 0.5
+        place, speed = (
+            ", ".join(f"{x:.2f}" for x in vehicle.pos),
+            sum(v * v for v in vehicle.vel) ** 0.5,
+        )
         where = f"was at ({place}) m with {speed:.1f} m/s, its pose {1e3 * vehicle.age:.0f} ms old"
-    return f"It went wrong {at['time'] - at['since']:.2f} s into '{at['state']}': {why}; the vehicle {where}."
+    return (
+        f"It went wrong {at['time'] - at['since']:.2f} s into '{at['state']}': {why}; the vehicle"
+        f" {where}."
+    )
 
 
 def again(args: argparse.Namespace) -> int:
-    """Run a recorded run again, and compare; 1 where anything differs or the recording was cut, else 0: ``visthrow hil replay``."""
+    """Run a recorded run again, and compare; 1 where anything differs or the recording was cut,
+    else 0: ``visthrow hil replay``.
+    """
     with opened(args.folder) as folder:
         found = replay(folder)
     for n, name, was, now in found["differences"][:10]:
         print(f"tick {n}: {name} was {was}, is {now}")
-    same = "all bit for bit the same" if not found["differences"] else f"{len(found['differences'])} DIFFERENCES"
+    same = (
+        "all bit for bit the same"
+        if not found["differences"]
+        else f"{len(found['differences'])} DIFFERENCES"
+    )
     print(f"{found['ticks']} ticks, {found['actions']} actions of the policy: {same}")
     if found["cut"]:
         print(f"CUT: {found['cut']}")

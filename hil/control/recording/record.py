@@ -1,8 +1,9 @@
-"""One folder a run: config, policy, every raw pose, every tick, the link's .tlog; and what is made of it afterwards.
+"""One folder a run: config, policy, every raw pose, every tick, the link's .tlog; and what is made
+of it afterwards.
 
-``poses.jsonl`` and ``ticks.jsonl`` hold a JSON value a line and survive a kill but for a tenth of a second; floats are written so
-that they read back to the same bits. Lines are written by a thread of their own, so that a slow disk delays no tick.
-"""
+``poses.jsonl`` and ``ticks.jsonl`` hold a JSON value a line and survive a kill but for a tenth of a
+second; floats are written so that they read back to the same bits. Lines are written by a thread of
+their own, so that a slow disk delays no tick."""
 
 import hashlib
 import json
@@ -30,8 +31,13 @@ from visthrow.common.toml_text import dumps
 from visthrow.onboard.policy import Policy, find_policy
 
 POLICY, CONFIG, POSES, TICKS, SUMMARY, PROVENANCE = (
-    "policy.npz", "config.toml", "poses.jsonl", "ticks.jsonl", "summary.json", "provenance.json",
-)  # fmt: skip
+    "policy.npz",
+    "config.toml",
+    "poses.jsonl",
+    "ticks.jsonl",
+    "summary.json",
+    "provenance.json",
+)
 
 
 EXPECTED = f"expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it"
@@ -45,7 +51,8 @@ def check_free(folder: Path) -> None:
 
 @contextmanager
 def begun(folder: Path) -> Iterator[None]:
-    """Keep a new folder only where the run that is to write it begins; raises `StorageError` for one that holds a run already.
+    """Keep a new folder only where the run that is to write it begins; raises `StorageError` for
+    one that holds a run already.
 
     The links write theirs before there is a recorder.
     """
@@ -63,12 +70,19 @@ class Recorder:
     """Writes a run's folder."""
 
     def __init__(self, folder: str | Path, params: HilParams) -> None:
-        """Make the folder with config, policy and provenance; raises `StorageError` where it holds a run already, or cannot be written."""
+        """Make the folder with config, policy and provenance; raises `StorageError` where it holds
+        a run already, or cannot be written.
+        """
         self.folder = Path(folder)
         check_free(self.folder)
         source = find_policy(params.policy)
         data = source.read_bytes()
-        provenance.write_run_folder(self.folder, config.dumps(params), policy=source.stem, policy_sha256=hashlib.sha256(data).hexdigest())
+        provenance.write_run_folder(
+            self.folder,
+            config.dumps(params),
+            policy=source.stem,
+            policy_sha256=hashlib.sha256(data).hexdigest(),
+        )
         atomic_write(self.folder / POLICY, data)
         self._writers = {name: Writer(self.folder / name) for name in (POSES, TICKS)}
 
@@ -78,31 +92,67 @@ class Recorder:
         return next((writer.why for writer in self._writers.values() if writer.why), None)
 
     def tick(
-        self, index: int, poses: list[Pose], status: Status, words: OperatorInput, recording: bool, decision: Decision,
+        self,
+        index: int,
+        poses: list[Pose],
+        status: Status,
+        words: OperatorInput,
+        recording: bool,
+        decision: Decision,
         times: dict[str, float],
-    ) -> None:  # fmt: skip
-        """Record one tick; never raises and never waits. Once something was lost, nothing more is written."""
+    ) -> None:
+        """Record one tick; never raises and never waits.
+
+        Once something was lost, nothing more is written.
+        """
         if self.failed is not None:
             return
         for p in poses:
-            self._put(POSES, (index, p.stamp, p.arrival, p.body, p.pos, p.quat, p.vel, p.rate, p.reset, p.measured))
-        self._put(TICKS, {
-            "n": index, "status": list(vars(status).values()), "words": list(vars(words).values()), "recording": recording,
-            **vars(decision), "times": times, "poses": len(poses),
-        })  # fmt: skip
+            self._put(
+                POSES,
+                (
+                    index,
+                    p.stamp,
+                    p.arrival,
+                    p.body,
+                    p.pos,
+                    p.quat,
+                    p.vel,
+                    p.rate,
+                    p.reset,
+                    p.measured,
+                ),
+            )
+        self._put(
+            TICKS,
+            {
+                "n": index,
+                "status": list(vars(status).values()),
+                "words": list(vars(words).values()),
+                "recording": recording,
+                **vars(decision),
+                "times": times,
+                "poses": len(poses),
+            },
+        )
 
     def _put(self, name: str, values: Any) -> None:
         self._writers[name].put(json.dumps(values).encode() + b"\n")
 
     def close(self, summary: dict[str, Any]) -> None:
-        """Write what is left and the summary; raises `StorageError` where the disk is full, when the run itself is over."""
+        """Write what is left and the summary; raises `StorageError` where the disk is full, when
+        the run itself is over.
+        """
         for writer in self._writers.values():
             writer.close()
         write_json(self.folder / SUMMARY, {**summary, "recording_failed": self.failed})
 
 
 def lines(path: Path) -> Iterator[Any]:
-    """Yield a file's values, a line each; a last line that was cut short is left out. Raises `RunError` for no file, or a damaged line."""
+    """Yield a file's values, a line each; a last line that was cut short is left out.
+
+    Raises `RunError` for no file, or a damaged line.
+    """
     try:
         rows = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -148,36 +198,65 @@ def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
 
 
 def _replayable(path: Path) -> str:
-    """Return config of a run without what only reads the recording's source: its poses are here, and its form has changed before."""
+    """Return config of a run without what only reads the recording's source: its poses are here,
+    and its form has changed before.
+    """
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}; expected the config of a run") from error
+        raise ConfigError(
+            f"{path}: cannot be read: {error}; expected the config of a run"
+        ) from error
     tree.pop("against", None)
-    tree["source"] = {key: value for key, value in tree.get("source", {}).items() if key not in ("columns", "time")}
+    tree["source"] = {
+        key: value
+        for key, value in tree.get("source", {}).items()
+        if key not in ("columns", "time")
+    }
     return dumps(tree)
 
 
-def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
-    """Return config, policy, ticks and raw poses by tick of a run; raises `RunError` for no folder of a run, or a damaged one."""
+def load_run(
+    folder: str | Path,
+) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
+    """Return config, policy, ticks and raw poses by tick of a run; raises `RunError` for no folder
+    of a run, or a damaged one.
+    """
     folder = Path(folder)
     require_run(folder)
-    params, policy = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG)), Policy.load(folder / POLICY)
+    params, policy = (
+        config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG)),
+        Policy.load(folder / POLICY),
+    )
     ticks, poses = list(lines(folder / TICKS)), read_poses(folder)
-    if not (folder / SUMMARY).is_file():  # killed: the two files may end at different ticks, with half of its poses
+    if not (
+        folder / SUMMARY
+    ).is_file():  # killed: the two files may end at different ticks, with half of its poses
         ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
     return params, policy, ticks, poses
 
 
-PARTS = (CONFIG, POLICY, POSES, TICKS, SUMMARY, PROVENANCE)  # files of a bundle, beside the links' own records
+PARTS = (
+    CONFIG,
+    POLICY,
+    POSES,
+    TICKS,
+    SUMMARY,
+    PROVENANCE,
+)  # files of a bundle, beside the links' own records
 
 RECORDS = ("*.tlog", "*.msp")
 
-ENDING, MOST = ".zip", 2 << 30  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
+ENDING, MOST = (
+    ".zip",
+    2 << 30,
+)  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
 
 
 def pack(folder: str | Path) -> Path:
-    """Write the bundle of a run beside its folder and return its path; raises `RunError` where that cannot be."""
+    """Write the bundle of a run beside its folder and return its path; raises `RunError` where that
+    cannot be.
+    """
     folder = Path(folder).resolve()
     require_run(folder)
     path = folder.with_name(folder.name + ENDING)
@@ -197,7 +276,9 @@ def pack(folder: str | Path) -> Path:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[Path]:
-    """Yield the folder of a run: the one that is named, or a bundle's while it is looked at; raises `RunError` for what is no bundle."""
+    """Yield the folder of a run: the one that is named, or a bundle's while it is looked at; raises
+    `RunError` for what is no bundle.
+    """
     path = Path(path)
     if path.is_dir() or not path.exists():
         yield path
@@ -205,13 +286,27 @@ def opened(path: str | Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         try:
             with zipfile.ZipFile(path) as bundle:
-                entries = [entry for entry in bundle.infolist() if Path(entry.filename).name == entry.filename]
+                entries = [
+                    entry
+                    for entry in bundle.infolist()
+                    if Path(entry.filename).name == entry.filename
+                ]
                 if sum(entry.file_size for entry in entries) > MOST:
-                    raise RunError(f"{path}: unpacks to more than {MOST >> 30} GiB; expected the bundle of a run")
+                    raise RunError(
+                        f"{path}: unpacks to more than {MOST >> 30} GiB; expected the bundle of"
+                        " a run"
+                    )
                 for entry in entries:
                     bundle.extract(entry, folder)
-        except (zipfile.BadZipFile, zlib.error, RuntimeError, OSError) as error:  # RuntimeError: locked by a password, an unknown method
-            raise RunError(f"{path}: {error}; expected a folder of a run, or the bundle of one") from error
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            RuntimeError,
+            OSError,
+        ) as error:  # RuntimeError: locked by a password, an unknown method
+            raise RunError(
+                f"{path}: {error}; expected a folder of a run, or the bundle of one"
+            ) from error
         if not is_run(Path(folder)):
             held = ", ".join(entry.filename for entry in entries) or "nothing"
             raise RunError(f"{path}: no bundle of a run, it holds {held}; {EXPECTED}")

@@ -1,4 +1,6 @@
-"""What is made of a run's folder when the run is over: flight logs, pictures, the report of its times."""
+"""What is made of a run's folder when the run is over: flight logs, pictures, the report of its
+times.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -13,30 +15,48 @@ LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
 
 def summary_text(summary: dict[str, Any], folder: Path) -> str:
     """Return a run in a few lines."""
-    lines = [f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}: {summary['reason']}"]
-    lines.append(f"throws {summary['throws']}, released {summary['latches']}, cancelled {summary['cancelled']}")
+    lines = [
+        f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}:"
+        f" {summary['reason']}"
+    ]
+    lines.append(
+        f"throws {summary['throws']}, released {summary['latches']}, cancelled"
+        f" {summary['cancelled']}"
+    )
     if summary.get("calibration"):
         lines.append(f"calibration: {Calibration.of(summary['calibration'])}")
     if summary["stuck"]:
-        lines.append(f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism")
+        lines.append(
+            f"{summary['stuck']} released payload still hung on the vehicle: look at the mechanism"
+        )
     if summary["left_fence"]:
         lines.append(f"after the throw the vehicle left its fence: {summary['left_fence']}")
     for landing in summary["landings"]:
         lines.append(
-            f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by the payload's own poses: "
-            f"{landing['error']:.3f} m from the goal, {landing['duration']:.2f} s after the throw began"
+            f"landing at x {landing['landing_w'][0]:.3f} m, y {landing['landing_w'][1]:+.3f} m by"
+            f" the payload's own poses: {landing['error']:.3f} m from the goal,"
+            f" {landing['duration']:.2f} s after the throw began"
         )
         if landing["separation"] is not None:
             took = landing["separation"] - landing["latch"]
-            lines.append(f"it let go {1e3 * took:.0f} ms after the latch; trained with {1e3 * landing['lag']:.0f} ms")
+            lines.append(
+                f"it let go {1e3 * took:.0f} ms after the latch; trained with"
+                f" {1e3 * landing['lag']:.0f} ms"
+            )
     for name, body in summary["bodies"].items():
         refused = ", ".join(f"{n} {why}" for why, n in body["refused"].items()) or "none"
         lines.append(f"{name}: {body['accepted']} poses taken; refused: {refused}")
     for link in summary["links"]:
         if link["refused"]:
-            lines.append(f"refused on the link: {link['refused']} messages, most often {link['refused_most'][0]['what']}")
+            lines.append(
+                f"refused on the link: {link['refused']} messages, most often"
+                f" {link['refused_most'][0]['what']}"
+            )
     ours = summary["missed_ours"]
-    lines.append(f"ticks {summary['ticks']}, missed {summary['missed']}, {ours} of them by taking too long ourselves")
+    lines.append(
+        f"ticks {summary['ticks']}, missed {summary['missed']}, {ours} of them by taking too long"
+        " ourselves"
+    )
     lines += table(summary["latency"], summary.get("speed", 1.0))
     lines += [f"error: {text.strip().splitlines()[-1]}" for text in summary["errors"]]
     return "\n".join([*lines, f"{folder}  the run; `visthrow hil replay {folder}` runs it again"])
@@ -48,13 +68,19 @@ def throw_path(folder: Path, number: int, ending: str) -> Path:
 
 
 def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
-    """Write latency picture, and a flight log and picture a throw, or one log of all; returns lines that say what was written."""
+    """Write latency picture, and a flight log and picture a throw, or one log of all; returns lines
+    that say what was written.
+    """
     from visthrow.view import strip
 
     folder, said = Path(folder), []
     try:
         if stages is not None:
-            draw(folder / LATENCY_PICTURE, stages, f"Times of each stage, run {folder.name}{slowed(speed)}")
+            draw(
+                folder / LATENCY_PICTURE,
+                stages,
+                f"Times of each stage, run {folder.name}{slowed(speed)}",
+            )
             said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
         played = read(folder)
         if not played.throws:

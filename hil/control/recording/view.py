@@ -1,7 +1,7 @@
 """A run in the rerun viewer: live, or from its folder.
 
-The live view reads the folder that the run writes, in a process of its own: the flying process does nothing for it that it
-would not do without it. Where the viewer falls behind, ticks are left out.
+The live view reads the folder that the run writes, in a process of its own: the flying process does
+nothing for it that it would not do without it. Where the viewer falls behind, ticks are left out.
 """
 
 import argparse
@@ -20,7 +20,16 @@ import numpy as np
 
 from hil.control.recording.flightlogs import Samples, events, meta_of, read
 from hil.control.recording.playback import Playback, Tick
-from hil.control.recording.record import CONFIG, POLICY, POSES, PROVENANCE, SUMMARY, TICKS, pose_of, require_run
+from hil.control.recording.record import (
+    CONFIG,
+    POLICY,
+    POSES,
+    PROVENANCE,
+    SUMMARY,
+    TICKS,
+    pose_of,
+    require_run,
+)
 from hil.errors import RunError
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
@@ -38,7 +47,9 @@ BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
 class Show:
     """Sends ticks to a stream of rerun."""
 
-    def __init__(self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+    def __init__(
+        self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float
+    ) -> None:
         """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 
@@ -74,11 +85,15 @@ def sizes(pilot: Any) -> SimpleNamespace:
     contract = pilot.policy.contract
     rotors = SimpleNamespace(**contract["vehicle"]["rotors"])
     rope = SimpleNamespace(payload_radius=contract["rope"]["payload_radius"])
-    return SimpleNamespace(camera=pilot.camera.params, vehicle=SimpleNamespace(rotors=rotors), rope=rope)
+    return SimpleNamespace(
+        camera=pilot.camera.params, vehicle=SimpleNamespace(rotors=rotors), rope=rope
+    )
 
 
 def tail(path: Path) -> Generator[list[Any], None, None]:
-    """Yield, each time, the values of the lines that were completed since the last one; the file may not be there yet."""
+    """Yield, each time, the values of the lines that were completed since the last one; the file
+    may not be there yet.
+    """
     while not path.is_file():
         yield []
     with path.open(encoding="utf-8") as file:
@@ -92,7 +107,9 @@ class Follower:
     """Plays back a run while it is written."""
 
     def __init__(self, folder: Path) -> None:
-        """Read config, policy and provenance, which a run writes before it waits for poses; raises `RunError` for no folder of a run."""
+        """Read config, policy and provenance, which a run writes before it waits for poses; raises
+        `RunError` for no folder of a run.
+        """
         require_run(folder, (CONFIG, POLICY, PROVENANCE))
         self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
         self.playback = Playback(self.params, Policy.load(folder / POLICY))
@@ -108,7 +125,9 @@ class Follower:
             self._poses.setdefault(index, []).append(pose)
         self._lines.extend(next(self._tails[TICKS]))
         found = []
-        while self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]:
+        while (
+            self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]
+        ):
             line = self._lines.popleft()
             found.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
         return found
@@ -120,7 +139,9 @@ class Follower:
 
 
 def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
-    """Send a run to a stream of rerun while it is written, until it is over; returns the number of ticks that were left out."""
+    """Send a run to a stream of rerun while it is written, until it is over; returns the number of
+    ticks that were left out.
+    """
     follower, show, dropped = Follower(Path(folder)), None, 0
     try:
         while going():
@@ -129,7 +150,9 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:
                 if show is None:
-                    show = Show(stream, follower.playback, follower.provenance, ticks[0].line["time"])
+                    show = Show(
+                        stream, follower.playback, follower.provenance, ticks[0].line["time"]
+                    )
                 show.take(ticks[-MOST_SHOWN:])
             elif over:
                 break
@@ -140,13 +163,17 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
 
 
 def write(folder: str | Path, path: str | Path) -> None:
-    """Write a whole run as a ``.rrd`` or ``.mcap`` file; errors as of :func:`read`, and where the place cannot be written, or a package is
-    missing."""
+    """Write a whole run as a ``.rrd`` or ``.mcap`` file; errors as of :func:`read`, and where the
+    place cannot be written, or a package is missing.
+    """
     from visthrow.view import mcap_view, rerun_view
 
     played = read(folder)
     if Path(path).suffix == ".mcap":
-        samples = Samples(played.playback, meta_of(played.playback, played.provenance, played.ticks[0].line["time"]))
+        samples = Samples(
+            played.playback,
+            meta_of(played.playback, played.provenance, played.ticks[0].line["time"]),
+        )
         for tick in played.ticks:
             samples.add(tick)
         log = samples.flush()
@@ -179,7 +206,11 @@ def run(args: argparse.Namespace) -> int:
         layout = rerun_view.blueprint(np.array(Follower(folder).params.goal_w), {"state"})
         with web_viewer(layout, args.web_port, args.data_port) as stream:
             dropped = follow(folder, stream)
-            print(f"the run is over; {dropped} ticks were left out of the view. Ctrl-C closes the viewer", file=sys.stderr)
+            print(
+                f"the run is over; {dropped} ticks were left out of the view. Ctrl-C closes the"
+                " viewer",
+                file=sys.stderr,
+            )
             while True:
                 time.sleep(1.0)
     path = Path(args.out) if args.out is not None else folder / "run.rrd"

@@ -1,1 +1,3 @@
-"""Real firmware in software with the simulator's vehicle behind it: its process, its set-up, the bridge between the two."""
+"""Real firmware in software with the simulator's vehicle behind it: its process, its set-up, the
+bridge between the two.
+"""

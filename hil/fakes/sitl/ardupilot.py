@@ -1,14 +1,17 @@
-"""The bridge: ArduPilot's software in the loop flies the simulator's vehicle, rope and ball by its JSON interface.
+"""The bridge:
 
-ArduPilot (``sim_vehicle.py -v ArduCopter -f json:127.0.0.1``, or ``arducopter --model json:127.0.0.1``) sends its servo outputs and
-waits for a state, by which its clock goes; so the two are in lock step. The runner speaks MAVLink to it by itself; the release is
-read from the mechanism's output. A frame that comes twice is answered twice and flown once; one with a smaller number says that
-ArduPilot was started again.
+ArduPilot's software in the loop flies the simulator's vehicle, rope and ball by its JSON interface.
+
+ArduPilot (``sim_vehicle.py -v ArduCopter -f json:127.0.0.1``, or ``arducopter --model
+json:127.0.0.1``) sends its servo outputs and waits for a state, by which its clock goes; so the two
+are in lock step. The runner speaks MAVLink to it by itself; the release is read from the
+mechanism's output. A frame that comes twice is answered twice and flown once; one with a smaller
+number says that ArduPilot was started again.
 
 Convention: forward, right, down in the body; north, east, down in the world: our x, -y, -z in both.
 
-Source: ardupilot, libraries/SITL/examples/JSON/readme.md, libraries/SITL/SIM_JSON.h (servo_packet_16, servo_packet_32).
-"""
+Source: ardupilot, libraries/SITL/examples/JSON/readme.md, libraries/SITL/SIM_JSON.h
+(servo_packet_16, servo_packet_32)."""
 
 import json
 import select
@@ -27,20 +30,32 @@ from hil.links.device import LARGEST_DATAGRAM
 from hil.links.mavlink_link import Link
 
 SERVOS = 9002  # UDP port on which ArduPilot finds the simulation
-HEAD = struct.Struct("<HHI")  # magic, frames a second that it would like, number of the frame; outputs [us] follow
+HEAD = struct.Struct(
+    "<HHI"
+)  # magic, frames a second that it would like, number of the frame; outputs [us] follow
 MAGIC = {18458: 16, 29569: 32}  # outputs of a packet by its magic
 
 OURS = (2, 0, 1, 3)
-"""Where front left, front right, rear left, rear right stand among the outputs of a quadrotor X (FRAME_CLASS 1, FRAME_TYPE 1)."""
+"""Where front left, front right, rear left, rear right stand among the outputs of a quadrotor X
+(FRAME_CLASS 1, FRAME_TYPE 1).
+"""
 
-LOW, HIGH, NEAR = 1000.0, 2000.0, 50.0  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
-PATIENCE = 0.05  # for a frame, after which the wall's clock goes on without one [s]: ArduPilot sleeps, or is not there yet
+LOW, HIGH, NEAR = (
+    1000.0,
+    2000.0,
+    50.0,
+)  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
+# for a frame, after which the wall's clock goes on without one [s]: ArduPilot sleeps, or is not
+# there yet
+PATIENCE = 0.05
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
 
 def outputs(packet: bytes) -> tuple[int, np.ndarray] | None:
-    """Number of a frame and its servo outputs [us], shape (16,) or (32,); None where the packet holds none."""
+    """Number of a frame and its servo outputs [us], shape (16,) or (32,); None where the packet
+    holds none.
+    """
     if len(packet) < HEAD.size:
         return None
     magic, _, number = HEAD.unpack_from(packet)
@@ -55,21 +70,36 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
     now, (x, y, z, w) = plant.state, plant.quat_wb.tolist()
     told = {
         "timestamp": time,
-        "imu": {"gyro": (FLIP * plant.rate_b).tolist(), "accel_body": (FLIP * plant.force_b).tolist()},
-        "position": (FLIP * now["pos_w"]).tolist(), "velocity": (FLIP * now["vel_w"]).tolist(), "quaternion": [w, x, -y, -z],
-    }  # fmt: skip
+        "imu": {
+            "gyro": (FLIP * plant.rate_b).tolist(),
+            "accel_body": (FLIP * plant.force_b).tolist(),
+        },
+        "position": (FLIP * now["pos_w"]).tolist(),
+        "velocity": (FLIP * now["vel_w"]).tolist(),
+        "quaternion": [w, x, -y, -z],
+    }
     return b"\n" + json.dumps(told).encode() + b"\n"
 
 
 class ArduPilotSitl(Bridge):
-    """See the head of this module; ``frames`` were flown, ``repeated`` came again, ``restarts`` of ArduPilot."""
+    """See the head of this module; ``frames`` were flown, ``repeated`` came again, ``restarts`` of
+    ArduPilot.
+    """
 
     unknown = (*Bridge.unknown, "armed")
 
     def __init__(
-        self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: ArduPilotParams
-    ) -> None:  # fmt: skip
-        """Listen for ArduPilot; ``params`` of the back-end say which output opens the mechanism. Raises `LinkError`: the port is taken."""
+        self,
+        plant: MotorPlant,
+        link: Link,
+        mocap: MocapParams | None,
+        seed: int,
+        options: Options,
+        params: ArduPilotParams,
+    ) -> None:
+        """Listen for ArduPilot; ``params`` of the back-end say which output opens the mechanism.
+        Raises `LinkError`: the port is taken.
+        """
         super().__init__(plant, link, mocap, seed, options)
         self.params, self._number = params, -1
         self.motors, self.frames, self.repeated, self.restarts = np.zeros(4), 0, 0, 0
@@ -78,12 +108,17 @@ class ArduPilotSitl(Bridge):
             self._socket.bind(("127.0.0.1", SERVOS))
         except OSError as error:
             self._socket.close()
-            raise LinkError(f"cannot listen on udp port {SERVOS}: {error.strerror}; ArduPilot looks for its simulation there") from error
+            raise LinkError(
+                f"cannot listen on udp port {SERVOS}: {error.strerror}; ArduPilot looks for its"
+                " simulation there"
+            ) from error
         self._socket.setblocking(False)
         self.port = self._socket
 
     def fly(self) -> None:
-        """Fly a period by the next frame's outputs, and the state after it in answer; without a frame, a period as it was."""
+        """Fly a period by the next frame's outputs, and the state after it in answer; without a
+        frame, a period as it was.
+        """
         frame, to = self._frame()
         if frame is None:
             super().fly()
@@ -112,7 +147,12 @@ class ArduPilotSitl(Bridge):
         return self.motors
 
     def report(self) -> dict[str, Any]:
-        counts = {"held": self.plant.held, "frames": self.frames, "repeated": self.repeated, "restarts": self.restarts}
+        counts = {
+            "held": self.plant.held,
+            "frames": self.frames,
+            "repeated": self.repeated,
+            "restarts": self.restarts,
+        }
         return super().report() | counts
 
     def close(self) -> None:

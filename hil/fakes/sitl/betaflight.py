@@ -1,9 +1,11 @@
-"""The bridge: Betaflight's firmware flies the simulator's vehicle, rope and ball by its own motor outputs.
+"""The bridge:
 
-Each period of the vehicle the firmware gets gyro, accelerometer and attitude, and answers with four motor commands. The release
-is read from the firmware's own channels by MSP on its second serial port. The runner speaks to the first one; the bridge sends
-the poses of both bodies beside it. Until the rotors carry it the vehicle hangs in a stand.
-"""
+Betaflight's firmware flies the simulator's vehicle, rope and ball by its own motor outputs.
+
+Each period of the vehicle the firmware gets gyro, accelerometer and attitude, and answers with four
+motor commands. The release is read from the firmware's own channels by MSP on its second serial
+port. The runner speaks to the first one; the bridge sends the poses of both bodies beside it. Until
+the rotors carry it the vehicle hangs in a stand."""
 
 import math
 from typing import Any
@@ -22,8 +24,11 @@ from hil.links.mavlink_link import Link
 ASK = {msp.RC: 0.002, msp.STATUS: 0.1}  # what the firmware is asked for, and how often [s]
 
 SAMPLE = 0.0005
-"""Between two samples of the sensors [s]: 2000 a second for loops of 8 kHz. Of one sample in 2 ms, held so long, the firmware's D is a
-spike, and motors taken at the first loop after each sample miss 17 % of it and see the gyro 1.2 ms later."""
+"""Between two samples of the sensors [s]: 2000 a second for loops of 8 kHz.
+
+Of one sample in 2 ms, held so long, the firmware's D is a spike, and motors taken at the first loop
+after each sample miss 17 % of it and see the gyro 1.2 ms later.
+"""
 
 SLOW = 0.01  # share of late periods above which the machine is too slow for real time
 
@@ -38,14 +43,23 @@ class MotorPlant(WirePlant):
 
 
 class BetaflightSitl(Bridge):
-    """See the head of this module; ``motors``: outputs, 0 to 1, mean of the last period, shape (4,), in our order; ``answered``: periods
-    in which the firmware put out motors."""
+    """See the head of this module; ``motors``: outputs, 0 to 1, mean of the last period, shape
+    (4,), in our order; ``answered``: periods in which the firmware put out motors.
+    """
 
     def __init__(
-        self, plant: MotorPlant, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: BetaflightParams,
+        self,
+        plant: MotorPlant,
+        link: Link,
+        mocap: MocapParams | None,
+        seed: int,
+        options: Options,
+        params: BetaflightParams,
         stands: int,
-    ) -> None:  # fmt: skip
-        """Connect to a firmware that runs; ``params`` of the back-end say which channel opens the mechanism, ``stands``: see `Sensors`."""
+    ) -> None:
+        """Connect to a firmware that runs; ``params`` of the back-end say which channel opens the
+        mechanism, ``stands``: see `Sensors`.
+        """
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.armed = params, False
         self.port, self.sensors = TcpPort(Device("tcp", "127.0.0.1", PORTS[1])), Sensors(stands)
@@ -56,12 +70,18 @@ class BetaflightSitl(Bridge):
         self.cycles: list[int] = []
         self._outputs: list[np.ndarray] = []
         self._samples = round(plant.period / SAMPLE)
-        self._rate_b, self._sent = plant.rate_b, 0  # at the beginning of the last period; samples sent in this one
+        self._rate_b, self._sent = (
+            plant.rate_b,
+            0,
+        )  # at the beginning of the last period; samples sent in this one
 
     def run_on(self, when: float) -> None:
         """Send samples by the rates at the period's beginning and their last change."""
         plant, step = self.plant, self.plant.period / self._samples
-        due = np.arange(self._sent, min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), self._samples))
+        due = np.arange(
+            self._sent,
+            min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), self._samples),
+        )
         if len(due):
             rates_b = plant.rate_b + due[:, None] * ((plant.rate_b - self._rate_b) / self._samples)
             self._outputs.append(self.sensors.send(rates_b, plant.force_b, plant.quat_wb, step))
@@ -114,7 +134,11 @@ class BetaflightSitl(Bridge):
 
     def report(self) -> dict[str, Any]:
         loop = float(np.median(self.cycles)) if self.cycles else None
-        return super().report() | {"held": self.plant.held, "motor_packets": self.answered, "loop_us": loop}
+        return super().report() | {
+            "held": self.plant.held,
+            "motor_packets": self.answered,
+            "loop_us": loop,
+        }
 
     def close(self) -> None:
         super().close()

@@ -1,14 +1,15 @@
-"""Betaflight's packets between firmware and simulator: samples of the sensors in, motor outputs out.
+"""Betaflight's packets between firmware and simulator: samples of the sensors in, motor outputs
+out.
 
-Convention: the firmware wants rates forward, right, down; the negative of the specific force forward, left, up; the attitude
-w, x, y, z of forward, left, up in north, west, up. It answers every packet of samples with one of motors, in the order front
-right, rear left, front left, rear right.
+Convention: the firmware wants rates forward, right, down; the negative of the specific force
+forward, left, up; the attitude w, x, y, z of forward, left, up in north, west, up. It answers every
+packet of samples with one of motors, in the order front right, rear left, front left, rear right.
 
-A stamp says up to when the firmware may run. The packets of a datagram are taken one after the other, and answered together
-(``lockstep.c``).
+A stamp says up to when the firmware may run. The packets of a datagram are taken one after the
+other, and answered together (``lockstep.c``).
 
-Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (updateState, micros64, pwmCompleteMotorUpdate) and target/SITL/target.h.
-"""
+Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c (updateState, micros64,
+pwmCompleteMotorUpdate) and target/SITL/target.h."""
 
 import os
 import select
@@ -24,28 +25,58 @@ from hil.errors import RunError
 
 GRAVITY = 9.80665  # of the firmware's accelerometer [m/s^2]
 SENSORS = 9003  # UDP port that samples go to
-FDM = struct.Struct("<18d")  # stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure
-TIME, MOTORS, LARGEST_ANSWER = 8, 4, 4096  # bytes of the firmware's time before its answers; motors in one; bytes of all
+FDM = struct.Struct(
+    "<18d"
+)  # stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure
+TIME, MOTORS, LARGEST_ANSWER = (
+    8,
+    4,
+    4096,
+)  # bytes of the firmware's time before its answers; motors in one; bytes of all
 OURS = (2, 0, 1, 3)  # where front left, front right, rear left, rear right stand in an answer
 SEA_LEVEL = 101325.0  # [Pa]
 
 STILL, CALIBRATION = 0.002, 3.0
-"""Between two packets at rest, and the time that the firmware's gyro takes to be calibrated and its receiver to begin [s]."""
+"""Between two packets at rest, and the time that the firmware's gyro takes to be calibrated and its
+receiver to begin [s].
+"""
 
-PATIENCE = 10.0  # for the firmware to come to a stamp [s], on the wall's clock: a tenth of a millisecond is usual
+# for the firmware to come to a stamp [s], on the wall's clock: a tenth of a millisecond is usual
+PATIENCE = 10.0
 
 
-def sample(stamp: float, rate_b: Sequence[float], force_b: Sequence[float], quat_wb: Sequence[float]) -> bytes:
+def sample(
+    stamp: float, rate_b: Sequence[float], force_b: Sequence[float], quat_wb: Sequence[float]
+) -> bytes:
     """Packet of body rates [rad/s], specific force [m/s^2], body frame, and attitude xyzw."""
     x, y, z, w = quat_wb
     back, right, up = force_b
     return FDM.pack(
-        stamp, rate_b[0], -rate_b[1], -rate_b[2], -back, -right, -up, w, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, SEA_LEVEL
-    )  # fmt: skip
+        stamp,
+        rate_b[0],
+        -rate_b[1],
+        -rate_b[2],
+        -back,
+        -right,
+        -up,
+        w,
+        x,
+        y,
+        z,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        SEA_LEVEL,
+    )
 
 
 def stood(stands: int, most: float) -> bytes:
-    """What a firmware in lock step says on its pipe once it stands still; nothing where it does not within a time [s]."""
+    """What a firmware in lock step says on its pipe once it stands still; nothing where it does not
+    within a time [s].
+    """
     return os.read(stands, LARGEST_ANSWER) if select.select([stands], [], [], most)[0] else b""
 
 
@@ -53,21 +84,31 @@ class Sensors:
     """Where samples are sent to, and the firmware's clock."""
 
     def __init__(self, stands: int) -> None:
-        """Open a socket; ``stands``: pipe on which the firmware says that it has come to a stamp."""
+        """Open a socket; ``stands``: pipe on which the firmware says that it has come
+        to a stamp.
+        """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(("127.0.0.1", SENSORS))
         self._stands, self._stamp = stands, 0.0
-        self._last: tuple[Sequence[float], ...] = ((0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY), (0.0, 0.0, 0.0, 1.0))
+        self._last: tuple[Sequence[float], ...] = (
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, GRAVITY),
+            (0.0, 0.0, 0.0, 1.0),
+        )
 
-    def send(self, rates_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float) -> np.ndarray:
-        """Send samples, let the firmware run for a period [s] with each, and wait until it has; raises `RunError` where it does not run.
+    def send(
+        self, rates_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float
+    ) -> np.ndarray:
+        """Send samples, let the firmware run for a period [s] with each, and wait until it has;
+        raises `RunError` where it does not run.
 
         Args:
             rates_b: [rad/s], shape (N, 3), body frame; N at most 16.
             force_b: specific force [m/s^2], shape (3,), body frame. quat_wb: attitude xyzw.
 
         Returns:
-            Motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the firmware is not ready.
+            Motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the
+            firmware is not ready.
         """
         force, quat, packets = force_b.tolist(), quat_wb.tolist(), []
         for rate in rates_b.tolist():
@@ -79,7 +120,10 @@ class Sensors:
         self._socket.send(packets)
         answer = stood(self._stands, PATIENCE)
         if not answer:
-            raise RunError(f"the firmware has not come to the time {self._stamp:.3f} s of its samples after {PATIENCE:g} s")
+            raise RunError(
+                f"the firmware has not come to the time {self._stamp:.3f} s of its samples after"
+                f" {PATIENCE:g} s"
+            )
         return np.frombuffer(answer, np.float32, offset=TIME).reshape(-1, MOTORS)[:, OURS]
 
     def rest(self, period: float) -> None:
@@ -88,7 +132,10 @@ class Sensors:
         self._run(sample(self._stamp, *self._last))
 
     def start(self) -> None:
-        """Let the firmware calibrate its sensors, the vehicle standing still. Raises `RunError`: see `send`."""
+        """Let the firmware calibrate its sensors, the vehicle standing still.
+
+        Raises `RunError`: see `send`.
+        """
         for _ in range(round(CALIBRATION / STILL)):
             self.rest(STILL)
 
@@ -99,11 +146,15 @@ class Sensors:
 
 @contextmanager
 def at_rest(stands: int) -> Iterator[None]:
-    """Feed a firmware with a vehicle at rest, while nothing flies yet: it calibrates its gyro and answers only with samples."""
+    """Feed a firmware with a vehicle at rest, while nothing flies yet: it calibrates its gyro and
+    answers only with samples.
+    """
     done, sensors = threading.Event(), Sensors(stands)
 
     def feed() -> None:
-        with suppress(RunError):  # the firmware has ended, as it does where it is told to keep its settings
+        with suppress(
+            RunError
+        ):  # the firmware has ended, as it does where it is told to keep its settings
             while not done.wait(STILL / 10.0):
                 sensors.rest(STILL)
 

@@ -1,11 +1,13 @@
-"""The bridge: a ball on a rope below PX4's own simulated vehicle (SIH), and the poses of both bodies.
+"""The bridge: a ball on a rope below PX4's own simulated vehicle (SIH), and the poses of both
+bodies.
 
-PX4 flies the vehicle that its ``sihsim`` holds and tells where it is; the ball hangs below as a point on a massless rope, is
-dragged along, and flies freely once the mechanism's output has moved. The vehicle does not feel it: SIH takes no force from
-outside, so what a throw loses by the ball's pull does not show. The runner speaks to PX4 by itself.
+PX4 flies the vehicle that its ``sihsim`` holds and tells where it is; the ball hangs below as a
+point on a massless rope, is dragged along, and flies freely once the mechanism's output has moved.
+The vehicle does not feel it: SIH takes no force from outside, so what a throw loses by the ball's
+pull does not show. The runner speaks to PX4 by itself.
 
-Source: docs.px4.io, Simulation-In-Hardware; MAVLink LOCAL_POSITION_NED, ATTITUDE_QUATERNION, SERVO_OUTPUT_RAW.
-"""
+Source: docs.px4.io, Simulation-In-Hardware; MAVLink LOCAL_POSITION_NED, ATTITUDE_QUATERNION,
+SERVO_OUTPUT_RAW."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,25 +24,34 @@ from visthrow.onboard.hover import GRAVITY
 
 STEP = 0.001  # time step of the ball [s]
 
-STREAMS = {mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01, mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.01,
-           mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.01}  # fmt: skip
+STREAMS = {
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01,
+    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.01,
+    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.01,
+}
 """Messages that PX4 is asked for, and their periods [s]."""
 
-ASK_AGAIN = 1.0  # between two requests for a stream [s]: an answer may be lost, and PX4 may start again
+ASK_AGAIN = (
+    1.0  # between two requests for a stream [s]: an answer may be lost, and PX4 may start again
+)
 NEAR = 50.0  # an output this near to its target has arrived [us]
 FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down and forward, right, down to ours
 
 
 @dataclass
 class HangingBall:
-    """A ball on a rope below a vehicle that moves as it is told, a `WirePlant`; raises `ValueError` for a rope without length."""
+    """A ball on a rope below a vehicle that moves as it is told, a `WirePlant`; raises `ValueError`
+    for a rope without length.
+    """
 
     mount_b: np.ndarray  # where the rope hangs [m], shape (3,)
     length: float  # from the mount to the ball's centre [m]
     lag: float  # from the trip of the latch to separation [s]
     mass: tuple[float, float]  # with and without the ball [kg]
     max_thrust: float  # [N]
-    ground: float = 0.04  # height of the ball's centre when it has landed, landing_height of the runs [m]
+    ground: float = (
+        0.04  # height of the ball's centre when it has landed, landing_height of the runs [m]
+    )
     period: float = 0.005  # [s]
     home_w: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
@@ -48,14 +59,25 @@ class HangingBall:
         if not self.length > 0.0:
             raise ValueError(f"rope of {self.length} m; expected a length above 0")
         self.time = 0.0
-        self._pos, self._vel, self._quat, self._rate = np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+        self._pos, self._vel, self._quat, self._rate = (
+            np.zeros(3),
+            np.zeros(3),
+            np.array([0.0, 0.0, 0.0, 1.0]),
+            np.zeros(3),
+        )
         self._mount: np.ndarray | None = None
         self._ball, self._speed = np.array([0.0, 0.0, -self.length]), np.zeros(3)
         self._trip: float | None = None
         self.attached = True
-        self.landing: dict[str, Any] = {"landing_w": None, "landing_time": None, "separation_time": None}
+        self.landing: dict[str, Any] = {
+            "landing_w": None,
+            "landing_time": None,
+            "separation_time": None,
+        }
 
-    def follow(self, pos_w: np.ndarray, vel_w: np.ndarray, quat_wb: np.ndarray, rate_b: np.ndarray) -> None:
+    def follow(
+        self, pos_w: np.ndarray, vel_w: np.ndarray, quat_wb: np.ndarray, rate_b: np.ndarray
+    ) -> None:
         """Where the vehicle is now [m], how fast [m/s], attitude xyzw and body rates [rad/s]."""
         self._pos, self._vel, self._quat, self._rate = pos_w, vel_w, quat_wb, rate_b
 
@@ -68,11 +90,15 @@ class HangingBall:
             self._trip = self.time + after
         count = round(self.period / STEP)
         for k in range(count):
-            self._advance(self._mount + (k + 1) / count * (mount - self._mount), self.time + (k + 1) * STEP)
+            self._advance(
+                self._mount + (k + 1) / count * (mount - self._mount), self.time + (k + 1) * STEP
+            )
         self._mount, self.time = mount, self.time + self.period
 
     def _advance(self, mount: np.ndarray, time: float) -> None:
-        """One step of the ball: free flight, then back onto the rope where it is taut (position-based, after Mueller et al. 2007)."""
+        """One step of the ball: free flight, then back onto the rope where it is taut
+        (position-based, after Mueller et al. 2007).
+        """
         if self.landing["landing_time"] is not None:
             return
         before = self._ball
@@ -90,28 +116,50 @@ class HangingBall:
         elif self._ball[2] <= self.ground:
             share = (before[2] - self.ground) / max(before[2] - self._ball[2], 1e-9)
             landed = before + share * (self._ball - before)
-            self.landing |= {"landing_w": landed.tolist(), "landing_time": time - (1.0 - share) * STEP}
+            self.landing |= {
+                "landing_w": landed.tolist(),
+                "landing_time": time - (1.0 - share) * STEP,
+            }
 
     @property
     def state(self) -> dict[str, np.ndarray]:
         return {
-            "pos_w": self._pos, "quat_wb": self._quat, "vel_w": self._vel, "rate_b": self._rate, "payload_pos_w": self._ball,
+            "pos_w": self._pos,
+            "quat_wb": self._quat,
+            "vel_w": self._vel,
+            "rate_b": self._rate,
+            "payload_pos_w": self._ball,
             "attached": np.array(self.attached),
-        }  # fmt: skip
+        }
 
 
 class Px4Sih(Bridge):
-    """See the head of this module; ``heard_of``: positions that came, ``last_output``: of the mechanism [us]."""
+    """See the head of this module; ``heard_of``: positions that came, ``last_output``: of the
+    mechanism [us].
+    """
 
     plant: HangingBall
 
     def __init__(
-        self, plant: HangingBall, link: Link, mocap: MocapParams | None, seed: int, options: Options, params: Px4Params, autopilot: Link
-    ) -> None:  # fmt: skip
-        """Listen to PX4 by a link of the bridge's own; ``params`` of the back-end say which output opens the mechanism."""
+        self,
+        plant: HangingBall,
+        link: Link,
+        mocap: MocapParams | None,
+        seed: int,
+        options: Options,
+        params: Px4Params,
+        autopilot: Link,
+    ) -> None:
+        """Listen to PX4 by a link of the bridge's own; ``params`` of the back-end say which output
+        opens the mechanism.
+        """
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.autopilot, self.port = params, autopilot, autopilot.port
-        self._pos, self._vel, self._asked = np.zeros(3), np.zeros(3), dict.fromkeys(STREAMS, -np.inf)
+        self._pos, self._vel, self._asked = (
+            np.zeros(3),
+            np.zeros(3),
+            dict.fromkeys(STREAMS, -np.inf),
+        )
         self.heard_of, self.last_output = 0, None
         autopilot.listen(self._hear)
 
@@ -125,7 +173,15 @@ class Px4Sih(Bridge):
         kind = message.get_type()
         if kind == "LOCAL_POSITION_NED":
             self.heard_of += 1
-            self._pos, self._vel = FLIP * (message.x, message.y, message.z), FLIP * (message.vx, message.vy, message.vz)
+            self._pos, self._vel = (
+                FLIP * (message.x, message.y, message.z),
+                FLIP
+                * (
+                    message.vx,
+                    message.vy,
+                    message.vz,
+                ),
+            )
         elif kind == "ATTITUDE_QUATERNION" and self.heard_of:
             quat = np.array([message.q2, -message.q3, -message.q4, message.q1], dtype=float)
             rate = FLIP * (message.rollspeed, message.pitchspeed, message.yawspeed)
@@ -152,9 +208,21 @@ class Px4Sih(Bridge):
         for number, period in STREAMS.items():
             if now - self._asked[number] >= ASK_AGAIN:
                 self._asked[number] = now
-                self.autopilot.send(mav.MAVLink_command_long_message(
-                    self.params.system, self.params.component, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, 1e6 * period, 0, 0, 0, 0, 0
-                ))  # fmt: skip
+                self.autopilot.send(
+                    mav.MAVLink_command_long_message(
+                        self.params.system,
+                        self.params.component,
+                        mav.MAV_CMD_SET_MESSAGE_INTERVAL,
+                        0,
+                        number,
+                        1e6 * period,
+                        0,
+                        0,
+                        0,
+                        0,
+                        0,
+                    )
+                )
 
     def close(self) -> None:
         super().close()

@@ -1,5 +1,8 @@
-"""Back-ends: where commands go. ``dry-run`` (the default) sends nothing, ``ardupilot`` and ``px4`` speak MAVLink on the link
-that the poses may share, ``betaflight`` speaks MSP and ``crazyflie`` CRTP on a port of its own."""
+"""Back-ends: where commands go.
+
+``dry-run`` (the default) sends nothing, ``ardupilot`` and ``px4`` speak MAVLink on the link that
+the poses may share, ``betaflight`` speaks MSP and ``crazyflie`` CRTP on a port of its own.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,23 +20,37 @@ from hil.links.crtp import open_crtp
 from hil.links.device import check_device, open_port
 from hil.links.writer import MSP_LOG, LoggedPort
 
-AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {"ardupilot": ArduPilot, "px4": Px4}  # back-ends that speak MAVLink
-THRUST_SHORT = 0.98  # shares of the thrust, and of the rates, that the policy was trained with: what a vehicle must reach at least
+AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {
+    "ardupilot": ArduPilot,
+    "px4": Px4,
+}  # back-ends that speak MAVLink
+# shares of the thrust, and of the rates, that the policy was trained with: what a vehicle must
+# reach at least
+THRUST_SHORT = 0.98
 
 
 def mechanism_lag(params: Any) -> float:
-    """Return the time from the release command to separation [s] of the mechanism of a run's back-end; 0 for a dry run."""
+    """Return the time from the release command to separation [s] of the mechanism of a run's
+    back-end; 0 for a dry run.
+    """
     return 0.0 if params.backend == "dry-run" else getattr(params, params.backend).mechanism_lag
 
 
 def make_backend(
-    params: Any, link: Any = None, write: bool = False, tell: Callable[[str], None] | None = None, folder: Path | None = None
+    params: Any,
+    link: Any = None,
+    write: bool = False,
+    tell: Callable[[str], None] | None = None,
+    folder: Path | None = None,
 ) -> Backend | Held:
-    """Return the back-end of a run; raises `LinkError` or `RunError` where there is no link or port for it.
+    """Return the back-end of a run; raises `LinkError` or `RunError` where there is no link or port
+    for it.
 
     Args:
-        params: `hil.params.HilParams`. link: MAVLink link of the run; None where poses are recorded ones.
-        write: whether wrong parameters of the autopilot are written. tell: is handed the audit's table.
+        params: `hil.params.HilParams`. link: MAVLink link of the run; None where poses are recorded
+            ones.
+        write: whether wrong parameters of the autopilot are written. tell: is handed the audit's
+            table.
         folder: of the run, where MSP is written down as the link's messages are in its .tlog.
     """
     name, vehicle = params.backend, getattr(params, params.backend.replace("-", "_"), None)
@@ -43,9 +60,14 @@ def make_backend(
     elif name == "betaflight":
         device = check_device(vehicle.device, remote=vehicle.remote)
         if device.kind not in ("tcp", "serial"):
-            raise RunError(f"betaflight.device {vehicle.device}: MSP is a stream; expected tcp:... or serial:...")
+            raise RunError(
+                f"betaflight.device {vehicle.device}: MSP is a stream; expected tcp:... or"
+                " serial:..."
+            )
         port = open_port(device, "--set betaflight.device=...")
-        backend = Betaflight(port if folder is None else LoggedPort(port, folder / MSP_LOG), vehicle, write, tell)
+        backend = Betaflight(
+            port if folder is None else LoggedPort(port, folder / MSP_LOG), vehicle, write, tell
+        )
     elif name == "crazyflie":
         backend = Crazyflie(open_crtp(vehicle.device, vehicle.remote), vehicle)
     elif link is None:
@@ -56,25 +78,41 @@ def make_backend(
 
 
 def require_reach(params: Any, contract: dict[str, Any]) -> None:
-    """Raise `RunError` for a vehicle that by its calibration and rate profile cannot do what the policy was trained to command."""
+    """Raise `RunError` for a vehicle that by its calibration and rate profile cannot do what the
+    policy was trained to command.
+    """
     if params.backend == "dry-run":
         return
     vehicle, action = getattr(params, params.backend), contract["action"]
     most, wanted = vehicle.thrust.most, float(action["max_thrust"])
     if most < THRUST_SHORT * wanted:
         raise RunError(
-            f"{params.backend}.thrust gives {most:.2f} N at most, the policy was trained with {wanted:g} N; check weight, hover "
-            "and slope, or train a policy for this vehicle"
+            f"{params.backend}.thrust gives {most:.2f} N at most, the policy was trained with"
+            f" {wanted:g} N; check weight, hover and slope, or train a policy for this vehicle"
         )
     ends = Sticks(vehicle.rates).most if params.backend == "betaflight" else action["max_rate"]
     if any(end < THRUST_SHORT * rate for end, rate in zip(ends, action["max_rate"])):
         raise RunError(
-            f"betaflight.rates reach {', '.join(f'{r:.1f}' for r in ends)} rad/s on roll, pitch, yaw, the policy was trained "
-            f"with {', '.join(f'{r:g}' for r in action['max_rate'])}; raise rates"
+            f"betaflight.rates reach {', '.join(f'{r:.1f}' for r in ends)} rad/s on roll, pitch,"
+            f" yaw, the policy was trained with {', '.join(f'{r:g}' for r in action['max_rate'])};"
+            " raise rates"
         )
 
 
 __all__ = [
-    "AUTOPILOTS", "ArduPilot", "ArduPilotParams", "Backend", "Betaflight", "BetaflightParams", "Crazyflie", "CrazyflieParams",
-    "DryRun", "Px4", "Px4Params", "Status", "make_backend", "mechanism_lag", "require_reach",
-]  # fmt: skip
+    "AUTOPILOTS",
+    "ArduPilot",
+    "ArduPilotParams",
+    "Backend",
+    "Betaflight",
+    "BetaflightParams",
+    "Crazyflie",
+    "CrazyflieParams",
+    "DryRun",
+    "Px4",
+    "Px4Params",
+    "Status",
+    "make_backend",
+    "mechanism_lag",
+    "require_reach",
+]

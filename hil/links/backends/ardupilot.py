@@ -1,11 +1,15 @@
-"""ArduPilot: SET_ATTITUDE_TARGET in GUIDED or GUIDED_NOGPS, DO_GRIPPER or DO_SET_SERVO, LOITER or BRAKE to hold, LAND.
+"""ArduPilot:
 
-Without bit 3 of GUID_OPTIONS thrust is read as a climb rate; with ATC_ANGLE_BOOST it grows with tilt; DO_SET_SERVO is
-accepted on an output that has a function and moves nothing; the last set-point is flown until GUID_TIMEOUT.
+SET_ATTITUDE_TARGET in GUIDED or GUIDED_NOGPS, DO_GRIPPER or DO_SET_SERVO, LOITER or BRAKE to hold,
+LAND.
 
-Source: ArduCopter/Parameters.cpp (GUID_OPTIONS, GUID_TIMEOUT), AC_AttitudeControl.cpp (ANGLE_BOOST), AP_Gripper (GRIP_),
-SRV_Channel (SERVOn_FUNCTION 28 is Gripper), AP_NavEKF_Source.cpp (EK3_SRC1_POSXY 6 is ExternalNav).
-"""
+Without bit 3 of GUID_OPTIONS thrust is read as a climb rate; with ATC_ANGLE_BOOST it grows with
+tilt; DO_SET_SERVO is accepted on an output that has a function and moves nothing; the last
+set-point is flown until GUID_TIMEOUT.
+
+Source: ArduCopter/Parameters.cpp (GUID_OPTIONS, GUID_TIMEOUT), AC_AttitudeControl.cpp
+(ANGLE_BOOST), AP_Gripper (GRIP_), SRV_Channel (SERVOn_FUNCTION 28 is Gripper), AP_NavEKF_Source.cpp
+(EK3_SRC1_POSXY 6 is ExternalNav)."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -34,11 +38,14 @@ class ArduPilotParams(AutopilotParams):
         super().__post_init__()
         if self.follow_mode not in (GUIDED, GUIDED_NOGPS) or self.hold_mode not in (LOITER, BRAKE):
             raise ConfigError(
-                f"follow_mode {self.follow_mode}, hold_mode {self.hold_mode}; expected GUIDED (4) or GUIDED_NOGPS (20), and "
-                "LOITER (5) or BRAKE (17)"
+                f"follow_mode {self.follow_mode}, hold_mode {self.hold_mode}; expected GUIDED (4)"
+                " or GUIDED_NOGPS (20), and LOITER (5) or BRAKE (17)"
             )
         if self.release == "servo" and not self.servo_output:
-            raise ConfigError("release 'servo' with servo_output 0; expected the output that the mechanism hangs on")
+            raise ConfigError(
+                "release 'servo' with servo_output 0; expected the output that the mechanism"
+                " hangs on"
+            )
 
 
 class ArduPilot(MavlinkAutopilot):
@@ -57,7 +64,9 @@ class ArduPilot(MavlinkAutopilot):
         return {FOLLOW: p.follow_mode, HOLD: p.hold_mode, LAND: LAND_MODE}[mode], 0.0
 
     def _expected_modes(self) -> str:
-        return "GUIDED (4) or GUIDED_NOGPS (20)" + (f", or {self.params.hold_mode} to take it" if self.params.take else "")
+        return "GUIDED (4) or GUIDED_NOGPS (20)" + (
+            f", or {self.params.hold_mode} to take it" if self.params.take else ""
+        )
 
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
         p = self.params
@@ -70,14 +79,32 @@ class ArduPilot(MavlinkAutopilot):
         rules = [
             bits("GUID_OPTIONS", THRUST_AS_THRUST, "else thrust is read as a climb rate"),
             equal("ATC_ANGLE_BOOST", 0.0, "else thrust grows with tilt"),
-            within("GUID_TIMEOUT", 0.0, 1.0, 0.5, "so long the last rates are flown when the runner is gone [s]"),
-            equal("EK3_SRC1_POSXY", 6.0, "holding after the throw needs an external position (ExternalNav)"),
+            within(
+                "GUID_TIMEOUT",
+                0.0,
+                1.0,
+                0.5,
+                "so long the last rates are flown when the runner is gone [s]",
+            ),
+            equal(
+                "EK3_SRC1_POSXY",
+                6.0,
+                "holding after the throw needs an external position (ExternalNav)",
+            ),
         ]
         function = f"SERVO{p.servo_output}_FUNCTION"
         if p.release == "servo":
-            rules.append(equal(function, SERVO_DISABLED, "DO_SET_SERVO is accepted on a used output and moves nothing"))
+            rules.append(
+                equal(
+                    function,
+                    SERVO_DISABLED,
+                    "DO_SET_SERVO is accepted on a used output and moves nothing",
+                )
+            )
         else:
             rules.append(equal("GRIP_ENABLE", 1.0, "DO_GRIPPER is refused without it"))
             if p.servo_output:
-                rules.append(equal(function, SERVO_GRIPPER, "the gripper's output, which is read back"))
+                rules.append(
+                    equal(function, SERVO_GRIPPER, "the gripper's output, which is read back")
+                )
         return rules

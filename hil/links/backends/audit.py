@@ -1,11 +1,14 @@
-"""Audit of an autopilot's parameters at connect, whose rules each back-end holds; a mismatch refuses to fly, and nothing is
-written unless the operator said so."""
+"""Audit of an autopilot's parameters at connect, whose rules each back-end holds; a mismatch
+refuses to fly, and nothing is written unless the operator said so.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
-SETTLE = 0.5  # after a value was written, answers may still be on their way that were given before; then it is read back [s]
+# after a value was written, answers may still be on their way that were given before; then it is
+# read back [s]
+SETTLE = 0.5
 GIVE_UP, GIVE_UP_OPTIONAL = 5.0, 1.0  # a value that has not come within this time is missing [s]
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 MOST_NAMED = 4  # parameters that a fault names; the table has all
@@ -19,42 +22,71 @@ class Rule:
     expected: str  # in words
     why: str
     good: Callable[[float], bool]
-    value: Callable[[float], float] | None = None  # what is written where the operator asked for it; None: nothing can be
+    value: Callable[[float], float] | None = (
+        None  # what is written where the operator asked for it; None: nothing can be
+    )
     optional: bool = False  # firmware without it is right as well
 
 
 def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
     """Return the rule of a parameter that must have a value."""
-    return Rule(name, f"{value:g}", why, lambda v: abs(v - value) < 1e-6, (lambda _: value) if writable else None)
+    return Rule(
+        name,
+        f"{value:g}",
+        why,
+        lambda v: abs(v - value) < 1e-6,
+        (lambda _: value) if writable else None,
+    )
 
 
 def bits(name: str, mask: int, why: str) -> Rule:
     """Return the rule of a parameter some of whose bits must be set."""
-    return Rule(name, f"with the bits of {mask} set", why, lambda v: int(v) & mask == mask, lambda v: int(v) | mask)
+    return Rule(
+        name,
+        f"with the bits of {mask} set",
+        why,
+        lambda v: int(v) & mask == mask,
+        lambda v: int(v) | mask,
+    )
 
 
 def within(name: str, low: float, high: float, value: float, why: str) -> Rule:
     """Return the rule of a parameter above ``low`` and not above ``high``; ``value`` is written."""
-    return Rule(name, f"above {low:g}, at most {high:g}", why, lambda v: low < v <= high + 1e-6, lambda _: value)
+    return Rule(
+        name,
+        f"above {low:g}, at most {high:g}",
+        why,
+        lambda v: low < v <= high + 1e-6,
+        lambda _: value,
+    )
 
 
 class Audit:
     """Asks for parameters one by one and judges them.
 
     Attributes:
-        found: values by name. refused: why a value is not told, by name. written: names that were changed.
+        found: values by name. refused: why a value is not told, by name. written: names that were
+            changed.
         problems: mismatches in words, once the audit is done.
     """
 
     def __init__(
-        self, rules: Iterable[Rule] = (), ask: Callable[[str], None] = lambda name: None,
-        write: Callable[[str, float], None] | None = None, tell: Callable[[str], None] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        rules: Iterable[Rule] = (),
+        ask: Callable[[str], None] = lambda name: None,
+        write: Callable[[str, float], None] | None = None,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
         """Begin with nothing asked; without rules the audit is done.
 
-        ``ask`` sends a question for a parameter, ``write`` a new value (None: nothing is ever written), ``tell`` is handed the table, once.
-        """
-        self.rules, self._ask, self._write, self._tell = {rule.name: rule for rule in rules}, ask, write, tell
+        ``ask`` sends a question for a parameter, ``write`` a new value (None: nothing is ever
+        written), ``tell`` is handed the table, once."""
+        self.rules, self._ask, self._write, self._tell = (
+            {rule.name: rule for rule in rules},
+            ask,
+            write,
+            tell,
+        )
         self.found: dict[str, float] = {}
         self.refused: dict[str, str] = {}
         self.written: list[str] = []
@@ -68,7 +100,9 @@ class Audit:
     def refuse(self, name: str, error: int) -> None:
         """Take an answer that there is no value: a MAV_PARAM_ERROR."""
         if not self.done and name in self.rules:
-            self.refused[name] = "no such parameter" if error == NO_SUCH_PARAMETER else f"refused with error {error}"
+            self.refused[name] = (
+                "no such parameter" if error == NO_SUCH_PARAMETER else f"refused with error {error}"
+            )
 
     def feed(self, name: str, value: float) -> None:
         """Take an answer."""
@@ -76,7 +110,12 @@ class Audit:
         if self.done or rule is None or self._settling(name):
             return
         self.found[name] = value
-        if not rule.good(value) and self._write is not None and rule.value is not None and name not in self.written:
+        if (
+            not rule.good(value)
+            and self._write is not None
+            and rule.value is not None
+            and name not in self.written
+        ):
             self.written.append(name)
             self._written_at[name] = self._now
             del self.found[name]  # it counts when it was read back
@@ -93,12 +132,19 @@ class Audit:
         self._begun = now if self._begun is None else self._begun
         waited = now - self._begun
         told = self.found.keys() | self.refused.keys()
-        missing = [r.name for r in self.rules.values() if r.name not in told and not (r.optional and waited > GIVE_UP_OPTIONAL)]
+        missing = [
+            r.name
+            for r in self.rules.values()
+            if r.name not in told and not (r.optional and waited > GIVE_UP_OPTIONAL)
+        ]
         if not missing or waited > GIVE_UP:
             self.done = True
             found = {name: f" is {value:g}" for name, value in self.found.items()}
             found |= {name: f": {why}" for name, why in self.refused.items() if name not in found}
-            self.problems = [f"{r.name}{found.get(r.name, ' was not told')}; expected {r.expected}" for r in self._wrong()]
+            self.problems = [
+                f"{r.name}{found.get(r.name, ' was not told')}; expected {r.expected}"
+                for r in self._wrong()
+            ]
             if self._tell is not None:
                 self._tell(self.table())
             return
@@ -109,7 +155,11 @@ class Audit:
 
     def _wrong(self) -> list[Rule]:
         found = self.found
-        return [r for r in self.rules.values() if not (r.good(found[r.name]) if r.name in found else r.optional)]
+        return [
+            r
+            for r in self.rules.values()
+            if not (r.good(found[r.name]) if r.name in found else r.optional)
+        ]
 
     def fault(self) -> str | None:
         """Return what ends the run, in short; the table has it in full."""
@@ -123,11 +173,21 @@ class Audit:
         """Return parameter, found, expected, why, a line each."""
         rows, wrong = [("", "parameter", "found", "expected", "why")], self._wrong()
         for name, rule in self.rules.items():
-            shown = f"{self.found[name]:g}" if name in self.found else self.refused.get(name, "no answer")
+            shown = (
+                f"{self.found[name]:g}"
+                if name in self.found
+                else self.refused.get(name, "no answer")
+            )
             shown += " (written)" if name in self.written else ""
             rows.append(("WRONG" if rule in wrong else "ok", name, shown, rule.expected, rule.why))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
-        lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip() for row in rows]
+        lines = [
+            "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip()
+            for row in rows
+        ]
         if wrong:
-            lines.append("The runner does not fly with these; set them, or let it write them with --write-parameters.")
+            lines.append(
+                "The runner does not fly with these; set them, or let it write them with"
+                " --write-parameters."
+            )
         return "\n".join(lines)

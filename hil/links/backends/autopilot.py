@@ -1,8 +1,8 @@
-"""What ArduPilot and PX4 share: heartbeat, modes, set-points, release, parameters, over one MAVLink link.
+"""What ArduPilot and PX4 share: heartbeat, modes, set-points, release, parameters, over one MAVLink
+link.
 
-Who flies is decided by the pilot. A mode that the runner did not ask for counts as a pilot who has taken over: the runner
-stops commanding and asks for nothing any more, an abort included.
-"""
+Who flies is decided by the pilot. A mode that the runner did not ask for counts as a pilot who has
+taken over: the runner stops commanding and asks for nothing any more, an abort included."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -20,11 +20,13 @@ from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
 
 STREAM = (
-    (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000), (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
+    (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000),
+    (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
     (mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000),
-)  # fmt: skip
-"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust in hover, and the mode, which a
-heartbeat of 1 Hz tells up to a second late."""
+)
+"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust
+in hover, and the mode, which a heartbeat of 1 Hz tells up to a second late.
+"""
 
 SERVO_NEAR = 50  # an output this near to where the mechanism is open counts as open [us]
 
@@ -42,21 +44,35 @@ class AutopilotParams(Bounded):
     mechanism_lag: NotNegative  # from the release command to separation [s]
     release_timeout: Positive  # without a final answer the release has failed [s]
     heartbeat_timeout: Positive  # silence after which the autopilot counts as lost [s]
-    take: bool  # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it over
+    # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it
+    # over
+    take: bool
     arm: bool  # arm it when it is taken: bench and software only; else the pilot arms
     audit: bool  # read parameters at connect and refuse to fly on a mismatch
-    servo_output: Annotated[int, Bound(0, 16)]  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    servo_output: Annotated[
+        int, Bound(0, 16)
+    ]  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
     servo_open_us: Annotated[int, Bound(500, 2500)]  # there, with the mechanism open [us]
 
 
 class MavlinkAutopilot(Autopilot, ABC):
-    """An autopilot on a MAVLink link; the children say which modes there are and what the parameters must be."""
+    """An autopilot on a MAVLink link; the children say which modes there are and what the
+    parameters must be.
+    """
 
     autopilot = mav.MAV_AUTOPILOT_GENERIC
     holds = True
 
-    def __init__(self, link: Link, params: AutopilotParams, write: bool = False, tell: Callable[[str], None] | None = None) -> None:
-        """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table. Wrong parameters are written or not."""
+    def __init__(
+        self,
+        link: Link,
+        params: AutopilotParams,
+        write: bool = False,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
+        """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table.
+        Wrong parameters are written or not.
+        """
         super().__init__()
         self.params, self._link, self._write, self._tell = params, link, write, tell
         self._heartbeat: Any = None
@@ -70,7 +86,9 @@ class MavlinkAutopilot(Autopilot, ABC):
         self._arm_refused = ""
         self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
-        self._servo = f"servo{params.servo_output}_raw"  # one string for good: Python's cache of attributes keeps each new one
+        self._servo = (  # one string for good: Python's cache of attributes keeps each new one
+            f"servo{params.servo_output}_raw"
+        )
         self._begin_audit()
         self._exact = False  # of the share
         link.listen(self._hear)
@@ -78,10 +96,14 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     def _begin_audit(self) -> None:
         rules = self._rules() if self.params.audit else ()
-        self.audit = Audit(rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell)
+        self.audit = Audit(
+            rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell
+        )
 
     def _came_back(self, party: Party) -> None:
-        """Begin anew with what speaks from another address: it may be another vehicle of the same ids."""
+        """Begin anew with what speaks from another address: it may be another vehicle of the same
+        ids.
+        """
         if party.name == "autopilot":
             self._heartbeat = None
             self._streamed = -1e9
@@ -159,13 +181,20 @@ class MavlinkAutopilot(Autopilot, ABC):
                 self.release_record.answer(None)
             elif result != mav.MAV_RESULT_TEMPORARILY_REJECTED:
                 self.release_record.answer(False, f"refused with result {result}")
-        elif message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM and result != mav.MAV_RESULT_ACCEPTED:
-            self._arm_refused = f"arming refused with result {result}" + (f": {self.texts[-1]}" if self.texts else "")
+        elif (
+            message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM
+            and result != mav.MAV_RESULT_ACCEPTED
+        ):
+            self._arm_refused = f"arming refused with result {result}" + (
+                f": {self.texts[-1]}" if self.texts else ""
+            )
 
     def _note(self, now: float) -> tuple[str, str]:
         p, beat = self.params, self._heartbeat
         if beat is None or now - self._heard > p.heartbeat_timeout:
-            return "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s", WAIT
+            return (
+                "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s"
+            ), WAIT
         if not self.audit.done:
             return "parameters are being read", WAIT
         role, armed = self._role(beat.custom_mode), bool(beat.base_mode & ARMED)
@@ -173,9 +202,25 @@ class MavlinkAutopilot(Autopilot, ABC):
             if not armed and not p.arm:
                 return "disarmed", WAIT
             ready = role == FOLLOW or (p.take and role == HOLD)
-            return ("", role) if ready else (f"in mode {self._mode_text(beat.custom_mode)}; expected {self._expected_modes()}", WAIT)
+            return (
+                ("", role)
+                if ready
+                else (
+                    (
+                        f"in mode {self._mode_text(beat.custom_mode)}; expected"
+                        f" {self._expected_modes()}"
+                    ),
+                    WAIT,
+                )
+            )
         if self._taken_over:
-            return f"in mode {self._mode_text(beat.custom_mode)}, which the runner did not ask for: pilot or failsafe has it", WAIT
+            return (
+                (
+                    f"in mode {self._mode_text(beat.custom_mode)}, which the runner did not ask"
+                    " for: pilot or failsafe has it"
+                ),
+                WAIT,
+            )
         if armed or self._wanted == LAND:  # on the ground it disarms itself
             return "", role or WAIT
         if self._was_armed or self._arm_refused or not p.arm:
@@ -198,7 +243,9 @@ class MavlinkAutopilot(Autopilot, ABC):
     def ask(self, mode: str, now: float) -> None:
         """Ask until the heartbeat shows the mode."""
         if mode != self._wanted:
-            if self._wanted is None and self._heartbeat is not None:  # the first one that is ours was the pilot's
+            if (
+                self._wanted is None and self._heartbeat is not None
+            ):  # the first one that is ours was the pilot's
                 self._may.add(self._role(self._heartbeat.custom_mode))
             self._may.add(mode)
             self._wanted, self._reached, self._asked_at = mode, False, -1e9
@@ -218,7 +265,9 @@ class MavlinkAutopilot(Autopilot, ABC):
     def service(self, now: float) -> None:
         if now - self._beat_at >= 1.0:
             self._beat_at = now
-            self._link.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3))
+            self._link.send(
+                mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3)
+            )
         if self._heartbeat is not None:
             self.audit.service(now)
             if now - self._streamed > 10.0 and self._wanted is None:
@@ -235,12 +284,22 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _command(self, number: int, confirmation: int, *values: float) -> None:
         p = self.params
         seven = [*map(float, values), *([0.0] * (7 - len(values)))]
-        self._link.send(mav.MAVLink_command_long_message(p.system, p.component, number, min(confirmation, 255), *seven))
+        self._link.send(
+            mav.MAVLink_command_long_message(
+                p.system, p.component, number, min(confirmation, 255), *seven
+            )
+        )
 
     def _ask_parameter(self, name: str) -> None:
         p = self.params
-        self._link.send(mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1))
+        self._link.send(
+            mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1)
+        )
 
     def _write_parameter(self, name: str, value: float) -> None:
         p, kind = self.params, self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
-        self._link.send(mav.MAVLink_param_set_message(p.system, p.component, name.encode(), self._field(value, kind), kind))
+        self._link.send(
+            mav.MAVLink_param_set_message(
+                p.system, p.component, name.encode(), self._field(value, kind), kind
+            )
+        )

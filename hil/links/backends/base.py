@@ -8,23 +8,35 @@ from typing import Any
 from hil.links.backends.audit import Audit
 from hil.links.device import Port
 
-IDLE, PENDING, ACCEPTED, FAILED = "idle", "pending", "accepted", "failed"  # how far a release has come
+IDLE, PENDING, ACCEPTED, FAILED = (
+    "idle",
+    "pending",
+    "accepted",
+    "failed",
+)  # how far a release has come
 
 WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
-"""What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands by itself."""
+"""What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands
+by itself.
+"""
 
 ROUNDING = 1e-6  # tolerance of times that are sums [s]: a microsecond early is in time
 
 
 @dataclass(frozen=True)
 class Status:
-    """What a back-end knows of its autopilot at a tick; recorded, so that a replay decides alike."""
+    """What a back-end knows of its autopilot at a tick; recorded, so that a replay
+    decides alike.
+    """
 
-    connected: bool  # heard from lately, armed, audited, and in a mode that it was asked for or may be taken from
+    # heard from lately, armed, audited, and in a mode that it was asked for or may be taken from
+    connected: bool
     note: str = ""  # why not, for people
     release: str = IDLE  # IDLE, PENDING, ACCEPTED or FAILED
     mode: str = FOLLOW  # WAIT, FOLLOW, HOLD or LAND
-    fault: str | None = None  # what ends the run, whatever else is well: a parameter audit that failed
+    fault: str | None = (
+        None  # what ends the run, whatever else is well: a parameter audit that failed
+    )
 
 
 class Backend:
@@ -38,7 +50,9 @@ class Backend:
         raise NotImplementedError
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
-        """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up; whether it was taken."""
+        """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up;
+        whether it was taken.
+        """
         raise NotImplementedError
 
     def ask(self, mode: str, now: float) -> None:
@@ -61,7 +75,10 @@ class Backend:
         return None
 
     def abort(self, now: float) -> None:
-        """Ask the autopilot to land; called at every tick of an aborted run. A pilot who has taken over is left alone."""
+        """Ask the autopilot to land; called at every tick of an aborted run.
+
+        A pilot who has taken over is left alone.
+        """
 
     def finish(self, now: float) -> None:
         """Put the autopilot at rest, as far as that is ours: the run is over."""
@@ -95,17 +112,23 @@ class DryRun(Backend):
 
 
 class Release:
-    """One release: sent at its time, repeated until it is answered, never again once it was answered or stopped.
+    """One release: sent at its time, repeated until it is answered, never again once it was
+    answered or stopped.
 
     Attributes:
-        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended. at: of the next send [s].
+        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended. at: of
+            the next send [s].
         answers: of all throws, from the first send to the first answer [s].
     """
 
     REPEAT = 0.04  # between two sends that have no answer yet [s]; answers take 1 to 3 ms
 
     def __init__(self, timeout: float, read_back: bool = False) -> None:
-        """Start at rest. Without a final answer within the time-out [s], and a movement where it is read back, it has failed."""
+        """Start at rest.
+
+        Without a final answer within the time-out [s], and a movement where it is read back, it has
+        failed.
+        """
         self.timeout, self.read_back = timeout, read_back
         self.answers: list[float] = []
         self.reset()
@@ -144,7 +167,9 @@ class Release:
             self._judge()
 
     def output(self, is_open: bool) -> None:
-        """Note where the mechanism's output is; it has moved when it is open, and was seen closed in this throw before."""
+        """Note where the mechanism's output is; it has moved when it is open, and was seen closed
+        in this throw before.
+        """
         self._closed |= not is_open
         if is_open and self._closed and self.state == PENDING and self.sends:
             self._moved = True
@@ -155,7 +180,11 @@ class Release:
         if self.state != PENDING:
             return False
         if now - self._first > self.timeout:
-            stood = "the output was not seen closed before" if self.read_back and not self._closed else "nothing moved"
+            stood = (
+                "the output was not seen closed before"
+                if self.read_back and not self._closed
+                else "nothing moved"
+            )
             why = f"accepted, but {stood}" if self._answered else "no final answer"
             self._end(FAILED, f"{why} within {self.timeout:g} s")
         elif self.at is not None and now >= self.at - ROUNDING:
@@ -174,7 +203,8 @@ class Release:
 
 
 class Autopilot(Backend):
-    """An autopilot with a release that is answered and settings that are audited; the children speak its protocol.
+    """An autopilot with a release that is answered and settings that are audited; the children
+    speak its protocol.
 
     Attributes:
         audit: of its settings. release_record: of this throw. texts: that it said, the newest last.
@@ -217,11 +247,11 @@ class Autopilot(Backend):
 
 
 class OnPort(Autopilot):
-    """A flight controller on a port of its own that neither holds nor lands by itself: it is taken, and given up by silence.
+    """A flight controller on a port of its own that neither holds nor lands by itself: it is taken,
+    and given up by silence.
 
-    Where the runner falls silent its own failsafe or watchdog acts; so an abort has nothing to ask for. ``dropped`` counts packets that
-    could not be sent.
-    """
+    Where the runner falls silent its own failsafe or watchdog acts; so an abort has nothing to ask
+    for. ``dropped`` counts packets that could not be sent."""
 
     protocol = ""
 
@@ -235,7 +265,11 @@ class OnPort(Autopilot):
         silence = now - self._heard
         if silence <= self._silence:
             return self._known()
-        return f"no answer by {self.protocol}" + (f" for {silence:.1f} s" if self._heard >= 0.0 else ""), WAIT
+        return (
+            f"no answer by {self.protocol}"
+            + (f" for {silence:.1f} s" if self._heard >= 0.0 else ""),
+            WAIT,
+        )
 
     def _known(self) -> tuple[str, str]:
         """Return the same as `_note`, of one that is heard."""
@@ -254,11 +288,12 @@ class OnPort(Autopilot):
 
 
 class Held:
-    """A back-end whose commands go out a fixed time later; everything else is its own, the release with its own lag too.
+    """A back-end whose commands go out a fixed time later; everything else is its own, the release
+    with its own lag too.
 
-    A policy has learnt what its commands do after the trained delay. Poses can be carried forward to a slower vehicle's time; for one that
-    acts sooner than the vehicle of the training each command waits for the difference.
-    """
+    A policy has learnt what its commands do after the trained delay. Poses can be carried forward
+    to a slower vehicle's time; for one that acts sooner than the vehicle of the training each
+    command waits for the difference."""
 
     def __init__(self, backend: Backend, hold: float) -> None:
         """Hold the commands of a back-end back by a time [s]."""
@@ -279,7 +314,11 @@ class Held:
         self._backend.service(now)
 
     def due(self) -> float | None:
-        times = [time for time in (self._backend.due(), self._waiting[0][0] if self._waiting else None) if time is not None]
+        times = [
+            time
+            for time in (self._backend.due(), self._waiting[0][0] if self._waiting else None)
+            if time is not None
+        ]
         return min(times, default=None)
 
     def finish(self, now: float) -> None:

@@ -1,17 +1,19 @@
 """Betaflight over MSP: rates and thrust as stick positions, release on an AUX channel.
 
-The flight controller has no hold of its own and hears no poses; the runner's hover controller flies before and after the
-throw. Two ways to be heard: MSP OVERRIDE (``arm_channel = 0``): a real receiver supplies all channels, and while the pilot
-holds a switch the four sticks and the release channel are ours; after 0.3 s of silence the pilot's own sticks count again. And RX_MSP
-(``arm_channel`` an AUX): all channels are ours, for benches and software only; after 0.36 s of silence the motors idle, disarming
-follows at 1.6 s.
+The flight controller has no hold of its own and hears no poses; the runner's hover controller flies
+before and after the throw. Two ways to be heard: MSP OVERRIDE (``arm_channel = 0``): a real
+receiver supplies all channels, and while the pilot holds a switch the four sticks and the release
+channel are ours; after 0.3 s of silence the pilot's own sticks count again. And RX_MSP
+(``arm_channel`` an AUX): all channels are ours, for benches and software only; after 0.36 s of
+silence the motors idle, disarming follows at 1.6 s.
 
-MSP_SERVO does not show what CHANNEL_FORWARDING puts out: then the release is read back from its channel alone. ARM that is raised
-while the receiver is in failsafe has to go low again before the firmware arms.
+MSP_SERVO does not show what CHANNEL_FORWARDING puts out: then the release is read back from its
+channel alone. ARM that is raised while the receiver is in failsafe has to go low again before the
+firmware arms.
 
-Source: betaflight.com, Controlling Betaflight From a Companion Computer Over MSP; src/main/msp/msp.c (payloads), rx.c, rc.c,
-msp_box.c (permanent ids); src/main/fc/runtime_config.c (armingDisableFlagNames).
-"""
+Source: betaflight.com, Controlling Betaflight From a Companion Computer Over MSP;
+src/main/msp/msp.c (payloads), rx.c, rc.c, msp_box.c (permanent ids); src/main/fc/runtime_config.c
+(armingDisableFlagNames)."""
 
 import struct
 from collections.abc import Callable
@@ -31,25 +33,62 @@ BOX_ARM, BOX_OVERRIDE = 0, 50  # permanent ids of flight modes
 STICKS = 4  # channels before the first AUX
 LOW, HIGH = 1000, 2000  # ends of a channel [us]
 NEAR = 50  # a channel or output this near to its target has arrived [us]
-KEEP_ALIVE = 0.02  # between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
-OPEN_TIME = 2.0  # after which the mechanism closes again, so that the next payload can be hung on [s]
-ARM_LOW = 0.5  # for which nothing may speak against arming before ARM is raised, or raised again [s]
+# between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
+KEEP_ALIVE = 0.02
+OPEN_TIME = (
+    2.0  # after which the mechanism closes again, so that the next payload can be hung on [s]
+)
+ARM_LOW = (
+    0.5  # for which nothing may speak against arming before ARM is raised, or raised again [s]
+)
 FORWARDING = 1 << 20  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
 
 BLOCKS = (
-    "no gyro", "failsafe", "receiver lost", "the receiver is back: ARM must go low first", "failsafe switch", "runaway take-off",
-    "crash", "throttle not low", "tilted more than small_angle", "just booted", "prearm", "processor load", "calibrating",
-    "CLI is open", "CMS menu", "BST", "MSP asked", "paralyze", "GPS rescue", "rescue switch", "RPM filter", "reboot required",
-    "DSHOT bitbang", "accelerometer not calibrated", "motor protocol", "crash flip",
-)  # fmt: skip
-"""Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM switch itself, which is raised while
-another one is set."""
+    "no gyro",
+    "failsafe",
+    "receiver lost",
+    "the receiver is back: ARM must go low first",
+    "failsafe switch",
+    "runaway take-off",
+    "crash",
+    "throttle not low",
+    "tilted more than small_angle",
+    "just booted",
+    "prearm",
+    "processor load",
+    "calibrating",
+    "CLI is open",
+    "CMS menu",
+    "BST",
+    "MSP asked",
+    "paralyze",
+    "GPS rescue",
+    "rescue switch",
+    "RPM filter",
+    "reboot required",
+    "DSHOT bitbang",
+    "accelerometer not calibrated",
+    "motor protocol",
+    "crash flip",
+)
+"""Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM
+switch itself, which is raised while another one is set.
+"""
 
-POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}  # what is asked for all the time, and how often [s]
+POLLS = {
+    msp.STATUS: 0.1,
+    msp.RC: 0.1,
+    msp.SERVO: 0.1,
+    msp.ANALOG: 1.0,
+}  # what is asked for all the time, and how often [s]
 
 READ_BACK = 0.04
-"""Between two questions for the release [s]. The firmware takes one command in a turn of its serial ports, 100 turns a second by its
-default: with a question or two beside every frame the frames queued up, and came 0.1 to 0.3 s late just after a release."""
+"""Between two questions for the release [s].
+
+The firmware takes one command in a turn of its serial ports, 100 turns a second by its default:
+with a question or two beside every frame the frames queued up, and came 0.1 to 0.3 s late just
+after a release.
+"""
 
 AXES = ("roll", "pitch", "yaw")
 
@@ -63,7 +102,9 @@ class BetaflightParams(Bounded):
     thrust: ThrustParams
     rates: RatesParams
     minimum_us: Annotated[int, Bound(900, 1200)]  # min_check: throttle that counts as 0 [us]
-    arm_channel: Annotated[int, Bound(0, 12)]  # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
+    arm_channel: Annotated[
+        int, Bound(0, 12)
+    ]  # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
     release_channel: Annotated[int, Bound(1, 12)]  # AUX that opens the mechanism, from 1
     servo_output: int  # of MSP_SERVO that the mechanism hangs on, from 1; 0: not read back
     servo_open_us: int  # there, with the mechanism open [us]
@@ -75,7 +116,9 @@ class BetaflightParams(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.arm_channel == self.release_channel:
-            raise ConfigError(f"arm_channel and release_channel are both AUX {self.arm_channel}; expected two")
+            raise ConfigError(
+                f"arm_channel and release_channel are both AUX {self.arm_channel}; expected two"
+            )
 
 
 class Betaflight(OnPort):
@@ -83,23 +126,37 @@ class Betaflight(OnPort):
 
     name, protocol = "betaflight", "MSP"
 
-    def __init__(self, port: Port, params: BetaflightParams, write: bool = False, tell: Callable[[str], None] | None = None) -> None:
-        """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are written or not."""
+    def __init__(
+        self,
+        port: Port,
+        params: BetaflightParams,
+        write: bool = False,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
+        """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are
+        written or not.
+        """
         super().__init__(port, params.silence)
         self.params, self.parser = params, msp.Parser()
         self.sticks = Sticks(params.rates)
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         self.audit = Audit(
-            self._rules() if params.audit else (), lambda name: self._write(SETTINGS[name].command),
-            self._write_setting if write else None, tell,
-        )  # fmt: skip
-        self._order: list[int] = []  # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not told yet
+            self._rules() if params.audit else (),
+            lambda name: self._write(SETTINGS[name].command),
+            self._write_setting if write else None,
+            tell,
+        )
+        self._order: list[
+            int
+        ] = []  # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not told yet
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
         self._framed = self._boxed = self._read_back = -1e9
         self._flags = self._blocks = 0
-        self._free_since: float | None = None  # since when nothing speaks against arming, with ARM low
+        self._free_since: float | None = (
+            None  # since when nothing speaks against arming, with ARM low
+        )
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
         self._opened: float | None = None
         self.refused = 0
@@ -107,11 +164,20 @@ class Betaflight(OnPort):
     def _rules(self) -> list[Rule]:
         p = self.params
         rules = [
-            Rule("api_version", "1.43 or newer", "older ones do not tell their rates type", lambda v: v >= 1.43),
+            Rule(
+                "api_version",
+                "1.43 or newer",
+                "older ones do not tell their rates type",
+                lambda v: v >= 1.43,
+            ),
             equal("rates_type", RATES_TYPES[p.rates.type], "the curve that sticks are computed by"),
         ]
         curves = {"rc_rate": p.rates.rc_rates, "rate": p.rates.rates, "expo": p.rates.expo}
-        rules += [equal(f"{axis}_{name}", values[i], "as above") for i, axis in enumerate(AXES) for name, values in curves.items()]
+        rules += [
+            equal(f"{axis}_{name}", values[i], "as above")
+            for i, axis in enumerate(AXES)
+            for name, values in curves.items()
+        ]
         rules += [
             equal("throttle_limit_type", 0.0, "else full throttle is not full", False),
             equal("throttle_expo", 0.0, "thrust is computed for a straight line", False),
@@ -119,23 +185,42 @@ class Betaflight(OnPort):
             equal("yaw_deadband", 0.0, "as above", False),
             equal("min_check", p.minimum_us, "throttle that counts as 0 [us]", False),
             equal("mid_rc", MIDDLE, "middle of the sticks [us]", False),
-            Rule("failsafe_delay", "above 0, at most 1.5 s", "motors stop so late when the runner is gone",
-                 lambda v: 0.0 < v <= 1.5),
-        ]  # fmt: skip
+            Rule(
+                "failsafe_delay",
+                "above 0, at most 1.5 s",
+                "motors stop so late when the runner is gone",
+                lambda v: 0.0 < v <= 1.5,
+            ),
+        ]
         if p.servo_output:
-            rules.append(Rule("channel_forwarding", "0, or 1", "1: MSP_SERVO does not show the output, its channel is read back",
-                              lambda v: v in (0.0, 1.0)))  # fmt: skip
+            rules.append(
+                Rule(
+                    "channel_forwarding",
+                    "0, or 1",
+                    "1: MSP_SERVO does not show the output, its channel is read back",
+                    lambda v: v in (0.0, 1.0),
+                )
+            )
         if p.arm_channel:
             rules.append(equal("arm_aux", p.arm_channel, "AUX of the ARM mode", False))
         else:
-            rules.append(Rule("override_aux", "any AUX", "the pilot's switch of MSP OVERRIDE", lambda v: v > 0.0))
+            rules.append(
+                Rule(
+                    "override_aux",
+                    "any AUX",
+                    "the pilot's switch of MSP OVERRIDE",
+                    lambda v: v > 0.0,
+                )
+            )
         return rules
 
     def _hint(self) -> str:
         if not self._taken or self._raised:
             return ""
         if self.params.arm_channel:
-            return f"arming disabled: {blocked(self._blocks)}" if self._blocks else "it is being armed"
+            return (
+                f"arming disabled: {blocked(self._blocks)}" if self._blocks else "it is being armed"
+            )
         return "" if self._box(BOX_OVERRIDE) else "MSP OVERRIDE is off: switch it on to hand over"
 
     def _known(self) -> tuple[str, str]:
@@ -149,10 +234,18 @@ class Betaflight(OnPort):
         if self._taken and self._raised:
             return ("disarmed" if not armed else "MSP OVERRIDE is off: the pilot has it"), WAIT
         if p.arm_channel:
-            return (f"arming disabled: {blocked(self._blocks)}" if self._blocks and not self._taken else ""), WAIT
+            return (
+                f"arming disabled: {blocked(self._blocks)}"
+                if self._blocks and not self._taken
+                else ""
+            ), WAIT
         if not armed:
             return "disarmed", WAIT
-        return ("MSP OVERRIDE is on before the runner is ready: switch it off" if ours and not self._taken else ""), WAIT
+        return (
+            "MSP OVERRIDE is on before the runner is ready: switch it off"
+            if ours and not self._taken
+            else ""
+        ), WAIT
 
     def _box(self, number: int) -> bool:
         return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
@@ -161,7 +254,9 @@ class Betaflight(OnPort):
         thrust, *rates = command
         share = self.params.thrust.share(thrust, self.voltage)
         low = self.params.minimum_us
-        waiting = self.params.arm_channel and not self._box(BOX_ARM)  # arming wants the throttle low
+        waiting = self.params.arm_channel and not self._box(
+            BOX_ARM
+        )  # arming wants the throttle low
         throttle = LOW if waiting else round(low + share * (HIGH - low))
         self._sticks_us = (*(self.sticks.position(i, r) for i, r in enumerate(rates)), throttle)
         return self._frame(now)
@@ -180,13 +275,19 @@ class Betaflight(OnPort):
         return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
 
     def _arms(self, now: float) -> bool:
-        """Return whether ARM is to be high: not before nothing has spoken against it for a while, and low again where something does."""
+        """Return whether ARM is to be high: not before nothing has spoken against it for a while,
+        and low again where something does.
+        """
         if not self._taken or self._over:
             return False
-        return self._box(BOX_ARM) or (self._free_since is not None and now - self._free_since >= ARM_LOW)
+        return self._box(BOX_ARM) or (
+            self._free_since is not None and now - self._free_since >= ARM_LOW
+        )
 
     def stop_release(self) -> None:
-        """Send no release any more; a channel that was not read back goes back, so that nothing opens later."""
+        """Send no release any more; a channel that was not read back goes back, so that nothing
+        opens later.
+        """
         super().stop_release()
         if self.release_record.state != ACCEPTED:
             self._opened = None
@@ -203,14 +304,18 @@ class Betaflight(OnPort):
                 elif frame.direction == msp.REFUSAL:
                     self.refused += 1
         for command, period in POLLS.items():
-            if now - self._polled[command] >= period and (command != msp.SERVO or self.release_record.read_back):
+            if now - self._polled[command] >= period and (
+                command != msp.SERVO or self.release_record.read_back
+            ):
                 self._polled[command] = now
                 self._write(command)
         if not (self._boxes and self._order) and now - self._boxed >= 0.5:
             self._boxed = now
             self._write(msp.BOXIDS)
             self._write(msp.RX_MAP)
-        if self._boxes and self._heard > 0.0:  # whether it is armed must be known: then nothing is written
+        if (
+            self._boxes and self._heard > 0.0
+        ):  # whether it is armed must be known: then nothing is written
             self.audit.service(now)
         if self.release_record.due(now) and self._opened is None:
             self._opened = now
@@ -223,7 +328,12 @@ class Betaflight(OnPort):
             self._write(msp.RC)
         if self._opened is not None and now - self._opened > OPEN_TIME:
             self._opened = None
-        if self.params.arm_channel and not self._taken and not self._over and now - self._framed >= KEEP_ALIVE:
+        if (
+            self.params.arm_channel
+            and not self._taken
+            and not self._over
+            and now - self._framed >= KEEP_ALIVE
+        ):
             self._frame(now)
 
     def finish(self, now: float) -> None:
@@ -241,7 +351,9 @@ class Betaflight(OnPort):
         if frame.command == msp.STATUS:
             self._heard = now
             self._hear_status(frame)
-            self._free_since = None if self._blocks else now if self._free_since is None else self._free_since
+            self._free_since = (
+                None if self._blocks else now if self._free_since is None else self._free_since
+            )
         elif frame.command == msp.RC:
             self._hear_channels(frame.words())
         elif frame.command == msp.ANALOG and (volts := frame.number("<H", 7)):
@@ -250,7 +362,9 @@ class Betaflight(OnPort):
             self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
         elif frame.command == msp.BOXIDS:
             self._boxes = tuple(frame.payload)
-        elif frame.command == msp.RX_MAP and sorted(first := list(frame.payload[:STICKS])) == list(range(STICKS)):
+        elif frame.command == msp.RX_MAP and sorted(first := list(frame.payload[:STICKS])) == list(
+            range(STICKS)
+        ):
             self._order = first
         elif frame.command == msp.RC_TUNING and not self.audit.written:
             self._tuning = frame.payload
@@ -260,7 +374,10 @@ class Betaflight(OnPort):
                 self.release_record.read_back = False
 
     def _hear_status(self, frame: msp.Frame) -> None:
-        flags, count = frame.number("<I", 6), frame.number("B", 15)  # bytes of further flags, in the low half
+        flags, count = (
+            frame.number("<I", 6),
+            frame.number("B", 15),
+        )  # bytes of further flags, in the low half
         if flags is None or count is None:
             return
         more = frame.payload[16 : 16 + (count & 15)]
@@ -300,15 +417,33 @@ class Told:
 
 
 SETTINGS = {
-    "api_version": Told(msp.API_VERSION, 1), "deadband": Told(msp.RC_DEADBAND, 0), "yaw_deadband": Told(msp.RC_DEADBAND, 1),
-    "mid_rc": Told(msp.RX_CONFIG, 3, "<H"), "min_check": Told(msp.RX_CONFIG, 5, "<H"),
-    "failsafe_delay": Told(msp.FAILSAFE_CONFIG, 0, "B", 0.1), "channel_forwarding": Told(msp.FEATURE_CONFIG, 0, "<I"),
-    "arm_aux": Told(msp.MODE_RANGES, 0), "override_aux": Told(msp.MODE_RANGES, 0),
-    **{name: Told(msp.RC_TUNING, at) for name, at in {
-        "roll_rc_rate": 0, "roll_expo": 1, "roll_rate": 2, "pitch_rate": 3, "yaw_rate": 4, "throttle_expo": 7, "yaw_expo": 10,
-        "yaw_rc_rate": 11, "pitch_rc_rate": 12, "pitch_expo": 13, "throttle_limit_type": 14, "rates_type": 22,
-    }.items()},
-}  # fmt: skip
+    "api_version": Told(msp.API_VERSION, 1),
+    "deadband": Told(msp.RC_DEADBAND, 0),
+    "yaw_deadband": Told(msp.RC_DEADBAND, 1),
+    "mid_rc": Told(msp.RX_CONFIG, 3, "<H"),
+    "min_check": Told(msp.RX_CONFIG, 5, "<H"),
+    "failsafe_delay": Told(msp.FAILSAFE_CONFIG, 0, "B", 0.1),
+    "channel_forwarding": Told(msp.FEATURE_CONFIG, 0, "<I"),
+    "arm_aux": Told(msp.MODE_RANGES, 0),
+    "override_aux": Told(msp.MODE_RANGES, 0),
+    **{
+        name: Told(msp.RC_TUNING, at)
+        for name, at in {
+            "roll_rc_rate": 0,
+            "roll_expo": 1,
+            "roll_rate": 2,
+            "pitch_rate": 3,
+            "yaw_rate": 4,
+            "throttle_expo": 7,
+            "yaw_expo": 10,
+            "yaw_rc_rate": 11,
+            "pitch_rc_rate": 12,
+            "pitch_expo": 13,
+            "throttle_limit_type": 14,
+            "rates_type": 22,
+        }.items()
+    },
+}
 """Which answer tells which setting. Four hold more than a number: see :func:`settings`."""
 
 
@@ -321,19 +456,28 @@ def blocked(flags: int) -> str:
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     """Return settings that an answer tells; what is cut short tells nothing."""
     mine = {name: told for name, told in SETTINGS.items() if told.command == frame.command}
-    found = {name: float(told.scale * n) for name, told in mine.items() if (n := frame.number(told.code, told.at)) is not None}
+    found = {
+        name: float(told.scale * n)
+        for name, told in mine.items()
+        if (n := frame.number(told.code, told.at)) is not None
+    }
     if "api_version" in found:
         minor = frame.number("B", 2)
         found = {} if minor is None else {"api_version": found["api_version"] + 0.01 * minor}
     if "channel_forwarding" in found:
         found["channel_forwarding"] = float(bool(int(found["channel_forwarding"]) & FORWARDING))
     if frame.command == msp.MODE_RANGES:
-        found = {"arm_aux": _aux(frame, BOX_ARM, params.arm_channel), "override_aux": _aux(frame, BOX_OVERRIDE, 0)}
+        found = {
+            "arm_aux": _aux(frame, BOX_ARM, params.arm_channel),
+            "override_aux": _aux(frame, BOX_OVERRIDE, 0),
+        }
     return found
 
 
 def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
-    """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of 25 us; 0: none."""
+    """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of
+    25 us; 0: none.
+    """
     entries = [frame.payload[i : i + 4] for i in range(0, len(frame.payload) - 3, 4)]
     found = [channel + 1 for of, channel, first, last in entries if of == box and first < last]
     return float(preferred if preferred in found else found[0] if found else 0)

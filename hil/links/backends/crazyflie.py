@@ -1,12 +1,14 @@
-"""Crazyflie over CRTP: body rates and thrust as legacy set-points in rate mode, the release as a parameter, poses to its estimator.
+"""Crazyflie over CRTP: body rates and thrust as legacy set-points in rate mode, the release as a
+parameter, poses to its estimator.
 
-It has no hold of its own that takes over in mid flight here: the runner's hover controller flies before and after the throw. Silence
-of 0.5 s levels it, of 2 s stops the motors (its commander's watchdog). Thrust stays locked until a set-point without thrust came. A
-set-point means rates only after ``flightmode.stabModeRoll`` and ``stabModePitch`` were set to 0, which is done, and answered, before
-anything is armed.
+It has no hold of its own that takes over in mid flight here: the runner's hover controller flies
+before and after the throw. Silence of 0.5 s levels it, of 2 s stops the motors (its commander's
+watchdog). Thrust stays locked until a set-point without thrust came. A set-point means rates only
+after ``flightmode.stabModeRoll`` and ``stabModePitch`` were set to 0, which is done, and answered,
+before anything is armed.
 
-Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TIMEOUT), supervisor.c, param_logic.c (paramSetByName).
-"""
+Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TIMEOUT),
+supervisor.c, param_logic.c (paramSetByName)."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ FULL = 60000  # most of 65535 that the firmware takes (MAX_THRUST)
 MODES = ("flightmode.stabModeRoll", "flightmode.stabModePitch")  # parameters that are 0 for rates
 
 ASK, KEEP_ALIVE, SET_AGAIN = 0.1, 0.02, 0.2
-"""Between two questions for its state, two set-points before it is flown, two tries of a parameter [s]."""
+"""Between two questions for its state, two set-points before it is flown, two tries of a parameter
+[s].
+"""
 
 BLOCKS = {crtp.TUMBLED: "tumbled", crtp.LOCKED: "locked: restart it"}
 
@@ -33,10 +37,13 @@ BLOCKS = {crtp.TUMBLED: "tumbled", crtp.LOCKED: "locked: restart it"}
 class CrazyflieParams(Bounded):
     """The vehicle on the other side."""
 
-    device: str  # radio://0/80/2M/E7E7E7E7E7, usb://0, or udpout:127.0.0.1:19850 of its software in the loop
+    # radio://0/80/2M/E7E7E7E7E7, usb://0, or udpout:127.0.0.1:19850 of its software in the loop
+    device: str
     remote: bool  # whether a network device may leave this machine
     thrust: ThrustParams
-    release_parameter: str  # of eight bits that opens the mechanism at 1: group.name of an app or a deck
+    release_parameter: (
+        str  # of eight bits that opens the mechanism at 1: group.name of an app or a deck
+    )
     mechanism_lag: NotNegative  # from the parameter's change to separation [s]
     release_timeout: Positive  # without an answer the release has failed [s]
     silence: Positive  # after which it counts as lost [s]
@@ -44,8 +51,14 @@ class CrazyflieParams(Bounded):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not all(self.release_parameter.partition(".")[::2]) or len(crtp.set_parameter(self.release_parameter, 1)) > crtp.MOST:
-            raise ConfigError(f"crazyflie.release_parameter '{self.release_parameter}'; expected group.name of at most 25 letters")
+        if (
+            not all(self.release_parameter.partition(".")[::2])
+            or len(crtp.set_parameter(self.release_parameter, 1)) > crtp.MOST
+        ):
+            raise ConfigError(
+                f"crazyflie.release_parameter '{self.release_parameter}'; expected group.name of at"
+                " most 25 letters"
+            )
 
 
 class Crazyflie(OnPort):
@@ -89,10 +102,14 @@ class Crazyflie(OnPort):
         share = self.params.thrust.share(thrust) if armed else 0.0
         x, y, z = (math.degrees(rate) for rate in rates)
         self._sent = now
-        return self._put(crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0)))
+        return self._put(
+            crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0))
+        )
 
     def rearm(self) -> None:
-        """Forget the last release; the mechanism closes, so that the next payload can be hung on."""
+        """Forget the last release; the mechanism closes, so that the next payload can
+        be hung on.
+        """
         super().rearm()
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
@@ -123,11 +140,20 @@ class Crazyflie(OnPort):
         self._put(crtp.arm(False))
 
     def _hear(self, packet: crtp.Packet, now: float) -> None:
-        if (packet.port, packet.channel) == (crtp.SUPERVISOR, crtp.INFO) and packet.data[:1] == bytes([crtp.STATE | crtp.ANSWER]):
+        if (packet.port, packet.channel) == (crtp.SUPERVISOR, crtp.INFO) and packet.data[
+            :1
+        ] == bytes([crtp.STATE | crtp.ANSWER]):
             self._heard, self._state = now, int.from_bytes(packet.data[1:5], "little")
-        elif (packet.port, packet.channel) == (crtp.PARAM, crtp.BY_NAME) and packet.data[:1] == bytes([crtp.SET_BY_NAME]):
+        elif (packet.port, packet.channel) == (crtp.PARAM, crtp.BY_NAME) and packet.data[
+            :1
+        ] == bytes([crtp.SET_BY_NAME]):
             known, refused = packet.data[1:-1], packet.data[-1] != 0
             for mode in MODES:
                 self._told[mode] |= known == crtp.named(mode) and not refused
-            if known == crtp.named(self.params.release_parameter) and self.release_record.state in (PENDING, ACCEPTED):
-                self.release_record.answer(not refused, "the parameter is not known to the firmware")
+            if known == crtp.named(self.params.release_parameter) and self.release_record.state in (
+                PENDING,
+                ACCEPTED,
+            ):
+                self.release_record.answer(
+                    not refused, "the parameter is not known to the firmware"
+                )

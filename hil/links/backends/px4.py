@@ -1,12 +1,17 @@
-"""PX4: SET_ATTITUDE_TARGET in OFFBOARD, DO_GRIPPER or DO_SET_ACTUATOR, Hold (AUTO.LOITER), Land (AUTO.LAND).
+"""PX4:
 
-OFFBOARD is refused until set-points have come for a second, and left when they cease for COM_OF_LOSS_T; so the runner streams
-first and asks then. DO_GRIPPER is answered IN_PROGRESS first, and ACCEPTED after PD_GRIPPER_TO whatever moves: the read-back of the
-output is what says that it did. A gripper opens at the minimum of its output. Integer parameters travel as bytes in a float field.
+SET_ATTITUDE_TARGET in OFFBOARD, DO_GRIPPER or DO_SET_ACTUATOR, Hold (AUTO.LOITER), Land
+(AUTO.LAND).
 
-Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_OBL_RC_ACT, EKF2_EV_CTRL, PD_GRIPPER_TO, PWM_AUX_MIN1;
-PD_GRIPPER_EN up to 1.16); the output functions (Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration.
-"""
+OFFBOARD is refused until set-points have come for a second, and left when they cease for
+COM_OF_LOSS_T; so the runner streams first and asks then. DO_GRIPPER is answered IN_PROGRESS first,
+and ACCEPTED after PD_GRIPPER_TO whatever moves: the read-back of the output is what says that it
+did. A gripper opens at the minimum of its output. Integer parameters travel as bytes in a float
+field.
+
+Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_OBL_RC_ACT,
+EKF2_EV_CTRL, PD_GRIPPER_TO, PWM_AUX_MIN1; PD_GRIPPER_EN up to 1.16); the output functions
+(Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration."""
 
 import struct
 from dataclasses import dataclass
@@ -18,9 +23,14 @@ from hil.links.backends.base import FOLLOW, HOLD, LAND
 from hil.links.pymav import mav
 from visthrow.config.bounds import Bound
 
-MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = 3, 4, 6  # main modes, bits 16 to 23 of a heartbeat's custom mode
+MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = (
+    3,
+    4,
+    6,
+)  # main modes, bits 16 to 23 of a heartbeat's custom mode
 AUTO_LOITER, AUTO_LAND = 3, 6  # sub-modes of AUTO, bits 24 to 31
-STREAM_FIRST = 1.2  # set-points are streamed for this long before OFFBOARD is asked for; PX4 wants more than 1 s [s]
+# set-points are streamed for this long before OFFBOARD is asked for; PX4 wants more than 1 s [s]
+STREAM_FIRST = 1.2
 STREAM_GAP = 0.3  # a longer pause begins the stream anew: PX4 counts on at least 2 Hz [s]
 LAND_OR_HOLD = (4.0, 5.0)  # values of COM_OBL_RC_ACT: Land, Hold
 POSITION_BITS = 3  # bits of EKF2_EV_CTRL: horizontal and vertical position
@@ -30,11 +40,16 @@ POSITION_BITS = 3  # bits of EKF2_EV_CTRL: horizontal and vertical position
 class Px4Params(AutopilotParams):
     """The vehicle on the other side."""
 
-    hold: Literal["hold", "position"]  # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
+    hold: Literal[
+        "hold", "position"
+    ]  # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
     release: Literal["gripper", "actuator"]  # DO_GRIPPER or DO_SET_ACTUATOR
-    gripper: Annotated[int, Bound(1, 6)]  # number of the gripper, or of the actuator set from 1 to 6
+    gripper: Annotated[
+        int, Bound(1, 6)
+    ]  # number of the gripper, or of the actuator set from 1 to 6
     actuator_open: Annotated[float, Bound(-1.0, 1.0)]  # value of DO_SET_ACTUATOR that opens
-    output_parameter: str  # that says what drives the mechanism's output, such as PWM_AUX_FUNC1; "" to leave it unread
+    # that says what drives the mechanism's output, such as PWM_AUX_FUNC1; "" to leave it unread
+    output_parameter: str
 
 
 class Px4(MavlinkAutopilot):
@@ -60,7 +75,9 @@ class Px4(MavlinkAutopilot):
         return {FOLLOW: (MAIN_OFFBOARD, 0), HOLD: hold, LAND: (MAIN_AUTO, AUTO_LAND)}[mode]
 
     def _expected_modes(self) -> str:
-        return "OFFBOARD (6.0)" + (", or Hold (4.3) or Position (3.0) to take it" if self.params.take else "")
+        return "OFFBOARD (6.0)" + (
+            ", or Hold (4.3) or Position (3.0) to take it" if self.params.take else ""
+        )
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         if now - self._sent_at > STREAM_GAP:
@@ -92,25 +109,67 @@ class Px4(MavlinkAutopilot):
     def _rules(self) -> list[Rule]:
         p = self.params
         rules = [
-            within("COM_OF_LOSS_T", 0.0, 1.0, 0.5, "so long the last rates are flown when the runner is gone [s]"),
-            Rule("COM_OBL_RC_ACT", "4 (Land) or 5 (Hold)", "what follows when the runner is gone",
-                 lambda v: v in LAND_OR_HOLD, lambda _: LAND_OR_HOLD[0]),
-            bits("EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs an external position"),
-        ]  # fmt: skip
+            within(
+                "COM_OF_LOSS_T",
+                0.0,
+                1.0,
+                0.5,
+                "so long the last rates are flown when the runner is gone [s]",
+            ),
+            Rule(
+                "COM_OBL_RC_ACT",
+                "4 (Land) or 5 (Hold)",
+                "what follows when the runner is gone",
+                lambda v: v in LAND_OR_HOLD,
+                lambda _: LAND_OR_HOLD[0],
+            ),
+            bits(
+                "EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs an external position"
+            ),
+        ]
         if p.release == "gripper":
             rules += [
-                Rule("PD_GRIPPER_EN", "1, or none since 1.17", "DO_GRIPPER is not answered without it", lambda v: v == 1.0,
-                     lambda _: 1.0, optional=True),
-                Rule("PD_GRIPPER_TO", f"below {p.release_timeout:g}", "ACCEPTED comes so late [s]", lambda v: v < p.release_timeout,
-                     optional=True),
-            ]  # fmt: skip
+                Rule(
+                    "PD_GRIPPER_EN",
+                    "1, or none since 1.17",
+                    "DO_GRIPPER is not answered without it",
+                    lambda v: v == 1.0,
+                    lambda _: 1.0,
+                    optional=True,
+                ),
+                Rule(
+                    "PD_GRIPPER_TO",
+                    f"below {p.release_timeout:g}",
+                    "ACCEPTED comes so late [s]",
+                    lambda v: v < p.release_timeout,
+                    optional=True,
+                ),
+            ]
         if p.output_parameter:
             function = 430.0 if p.release == "gripper" else 300.0 + p.gripper
-            rules.append(equal(p.output_parameter, function, "what drives the output that the mechanism hangs on"))
-        open_end = {-1.0: "MIN", 1.0: "MAX"}.get(-1.0 if p.release == "gripper" else p.actuator_open)
+            rules.append(
+                equal(
+                    p.output_parameter,
+                    function,
+                    "what drives the output that the mechanism hangs on",
+                )
+            )
+        open_end = {-1.0: "MIN", 1.0: "MAX"}.get(
+            -1.0 if p.release == "gripper" else p.actuator_open
+        )
         if p.servo_output and open_end is not None and "FUNC" in p.output_parameter:
-            name, why = p.output_parameter.replace("FUNC", open_end), "the output with the mechanism open, which is read back [us]"
-            rules.append(Rule(name, f"{p.servo_open_us} (servo_open_us)", why, lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR))
+            name, why = (
+                p.output_parameter.replace("FUNC", open_end),
+                "the output with the mechanism open, which is read back [us]",
+            )
+            rules.append(
+                Rule(
+                    name,
+                    f"{p.servo_open_us} (servo_open_us)",
+                    why,
+                    lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR,
+                )
+            )
         return rules
 
 

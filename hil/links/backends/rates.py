@@ -1,7 +1,7 @@
 """Betaflight's rate curves and their inverse: which stick gives a body rate.
 
-Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates; RC_RATE_INCREMENTAL, SETPOINT_RATE_LIMIT.
-"""
+Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates;
+RC_RATE_INCREMENTAL, SETPOINT_RATE_LIMIT."""
 
 import math
 from bisect import bisect_left
@@ -10,13 +10,20 @@ from typing import Annotated, Literal
 
 from visthrow.config.bounds import Bound, Bounded
 
-RATES_TYPES = {"betaflight": 0, "actual": 3}  # numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here
+RATES_TYPES = {
+    "betaflight": 0,
+    "actual": 3,
+}  # numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here
 RATE_LIMIT = 1998.0  # largest rate of any set-point [deg/s]
 TRAVEL = 500  # from the middle of a stick to its end [us]
 MIDDLE = 1500  # middle of a stick [us]
 
 
-Steep, Byte, Percent = Annotated[int, Bound(1, 255)], Annotated[int, Bound(0, 255)], Annotated[int, Bound(0, 100)]
+Steep, Byte, Percent = (
+    Annotated[int, Bound(1, 255)],
+    Annotated[int, Bound(0, 255)],
+    Annotated[int, Bound(0, 100)],
+)
 
 
 @dataclass(frozen=True)
@@ -24,13 +31,18 @@ class RatesParams(Bounded):
     """A rate profile, in the numbers that the flight controller stores; roll, pitch, yaw."""
 
     type: Literal["betaflight", "actual"]
-    # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s. At 0 the curve would be flat there.
+    # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s. At 0 the curve
+    # would be flat there.
     rc_rates: tuple[Steep, Steep, Steep]
-    rates: tuple[Byte, Byte, Byte]  # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
+    rates: tuple[
+        Byte, Byte, Byte
+    ]  # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
     expo: tuple[Percent, Percent, Percent]  # in hundredths
 
     def rate(self, axis: int, stick: float) -> float:
-        """Return the body rate [rad/s] in the stick's direction; axis 0 roll, 1 pitch, 2 yaw, stick -1 to 1."""
+        """Return the body rate [rad/s] in the stick's direction; axis 0 roll, 1 pitch, 2 yaw, stick
+        -1 to 1.
+        """
         size = abs(stick)
         curve = self._betaflight if self.type == "betaflight" else self._actual
         return math.copysign(math.radians(min(curve(axis, size), RATE_LIMIT)), stick)
@@ -51,14 +63,16 @@ class RatesParams(Bounded):
 class Sticks:
     """Body rates to stick positions, by the curve at every microsecond.
 
-    Convention: ours are x forward, y left, z up; a stick to the right rolls right (+x), one pushed forward pitches the nose
-    down (+y), one to the right yaws right (-z). So pitch keeps its sign, unlike in forward, right, down axes.
-    """
+    Convention: ours are x forward, y left, z up; a stick to the right rolls right (+x), one pushed
+    forward pitches the nose down (+y), one to the right yaws right (-z). So pitch keeps its sign,
+    unlike in forward, right, down axes."""
 
     SIGNS = (1.0, 1.0, -1.0)
 
     def __init__(self, params: RatesParams) -> None:
-        self._tables = [[params.rate(axis, us / TRAVEL) for us in range(TRAVEL + 1)] for axis in range(3)]
+        self._tables = [
+            [params.rate(axis, us / TRAVEL) for us in range(TRAVEL + 1)] for axis in range(3)
+        ]
 
     @property
     def most(self) -> tuple[float, float, float]:
@@ -66,13 +80,19 @@ class Sticks:
         return tuple(table[-1] for table in self._tables)
 
     def position(self, axis: int, rate: float) -> int:
-        """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole microseconds allow."""
+        """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole
+        microseconds allow.
+        """
         table, wanted = self._tables[axis], abs(rate)
         above = min(bisect_left(table, wanted), TRAVEL)
-        near = above if above == 0 or table[above] - wanted <= wanted - table[above - 1] else above - 1
+        near = (
+            above if above == 0 or table[above] - wanted <= wanted - table[above - 1] else above - 1
+        )
         return MIDDLE + int(math.copysign(near, self.SIGNS[axis] * rate))
 
     def rate(self, axis: int, us: float) -> float:
         """Return the body rate [rad/s] about our axis at a position [us]."""
         stick = min(max((us - MIDDLE) / TRAVEL, -1.0), 1.0)
-        return self.SIGNS[axis] * math.copysign(self._tables[axis][round(abs(stick) * TRAVEL)], stick)
+        return self.SIGNS[axis] * math.copysign(
+            self._tables[axis][round(abs(stick) * TRAVEL)], stick
+        )

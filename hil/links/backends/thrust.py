@@ -1,14 +1,17 @@
-"""Thrust calibration: from newtons to the share of full thrust that an autopilot takes, and its measurement in hover.
+"""Thrust calibration: from newtons to the share of full thrust that an autopilot takes, and its
+measurement in hover.
 
-Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h, with a slope s relative
-to a straight line through the origin. Vehicles in software hovered at shares of 0.37 and 0.49, with slopes of 0.70 to 0.92.
+Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h,
+with a slope s relative to a straight line through the origin. Vehicles in software hovered at
+shares of 0.37 and 0.49, with slopes of 0.70 to 0.92.
 
-Where the autopilot does not straighten the rotors' curve (Betaflight: its ``thrust_linear`` acts on what the controller puts
-out, and takes it off the pilot's throttle again) it is ``T = W (1 + s ((z / z_h)^n - 1))`` with the motors' command
-``z = idle + (1 - idle) u``; n is 2 where thrust goes with the square of that command.
+Where the autopilot does not straighten the rotors' curve (Betaflight: its ``thrust_linear`` acts on
+what the controller puts out, and takes it off the pilot's throttle again) it is ``T = W (1 + s ((z
+/ z_h)^n - 1))`` with the motors' command ``z = idle + (1 - idle) u``; n is 2 where thrust goes with
+the square of that command.
 
-Source: betaflight 4.6, src/main/flight/pid.c, pidApplyThrustLinearization and pidCompensateThrustLinearization.
-"""
+Source: betaflight 4.6, src/main/flight/pid.c, pidApplyThrustLinearization and
+pidCompensateThrustLinearization."""
 
 import math
 from collections import deque
@@ -21,7 +24,12 @@ from visthrow.onboard.hover import GRAVITY
 Inside = Annotated[float, Bound(0.0, 1.0, "()")]
 
 LEAST_SHARES = 50  # values that a mean share of hover is taken over: 5 s at 10 Hz
-VOLTAGE_RANGE = (0.8, 1.25)  # voltages further from the calibration's are no battery's, but a wrong reading; the correction stops there
+VOLTAGE_RANGE = (
+    0.8,
+    1.25,
+    # voltages further from the calibration's are no battery's, but a wrong reading; the correction
+    # stops there
+)
 
 
 @dataclass(frozen=True)
@@ -30,15 +38,23 @@ class ThrustParams(Bounded):
 
     weight: Positive  # thrust of the hover that was measured [N]
     hover: Inside  # share of full thrust in that hover, 0 to 1
-    slope: Annotated[float, Bound(0.3, 2.0)]  # of the thrust over the share around hover, relative to weight / hover
+    slope: Annotated[
+        float, Bound(0.3, 2.0)
+    ]  # of the thrust over the share around hover, relative to weight / hover
     tolerance: Inside  # of a measured share of hover, relative; beyond it the runner does not fly
     voltage: NotNegative  # of the battery in that hover [V]; 0: no correction for its voltage
-    exponent: Annotated[float, Bound(1.0, 3.0)] = 1.0  # of thrust over the motors' command, where the autopilot does not straighten it
+    exponent: Annotated[float, Bound(1.0, 3.0)] = (
+        1.0  # of thrust over the motors' command, where the autopilot does not straighten it
+    )
     idle: Annotated[float, Bound(0.0, 0.5, "[)")] = 0.0  # motors' command at share 0, 0 to 1
 
     def share(self, thrust: float, voltage: float | None = None) -> float:
-        """Return the share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V] where it is known."""
-        relative = max(0.0, 1.0 + (thrust / self.weight - 1.0) / self.slope) ** (1.0 / self.exponent)
+        """Return the share of full thrust, 0 to 1, for a thrust [N], at the battery's voltage [V]
+        where it is known.
+        """
+        relative = max(0.0, 1.0 + (thrust / self.weight - 1.0) / self.slope) ** (
+            1.0 / self.exponent
+        )
         share = (relative * self._command(self.hover) - self.idle) / (1.0 - self.idle)
         if self.voltage > 0.0 and voltage is not None:
             low, high = VOLTAGE_RANGE
@@ -68,7 +84,9 @@ class HoverMeter:
         self._shares: deque[float] = deque(maxlen=20 * LEAST_SHARES)
 
     def add(self, share: float | None) -> None:
-        """Take a share of a still vehicle; None where the autopilot has said none since the last call."""
+        """Take a share of a still vehicle; None where the autopilot has said none since the last
+        call.
+        """
         if share is not None and math.isfinite(share):
             self._shares.append(share)
 
@@ -78,9 +96,17 @@ class HoverMeter:
         return sum(self._shares) / len(self._shares) if len(self._shares) >= LEAST_SHARES else None
 
     def summary_text(self, mass: float) -> tuple[bool, str]:
-        """Compare with the calibration for a mass that hovered [kg]: whether it agrees, or was not measured, and that in words."""
+        """Compare with the calibration for a mass that hovered [kg]: whether it agrees, or was not
+        measured, and that in words.
+        """
         if self.share is None:
-            return True, f"hover share not measured: {len(self._shares)} of {LEAST_SHARES} values in steady hover"
+            return (
+                True,
+                (
+                    f"hover share not measured: {len(self._shares)} of {LEAST_SHARES} values in"
+                    " steady hover"
+                ),
+            )
         want = self.params.share(mass * GRAVITY)
         off = self.share / want - 1.0
         text = (
@@ -88,4 +114,6 @@ class HoverMeter:
             f"{100 * self.params.tolerance:g} % allowed)"
         )
         good = abs(off) <= self.params.tolerance
-        return good, text if good else f"{text}; calibrate thrust.hover, or look at battery and propellers"
+        return good, (
+            text if good else f"{text}; calibrate thrust.hover, or look at battery and propellers"
+        )

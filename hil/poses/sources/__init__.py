@@ -1,4 +1,6 @@
-"""Sources of poses behind one face, live and replayed alike: MAVLink, .tlog, .BIN, .ulg, CSV, motion-capture systems.
+"""Sources of poses behind one face, live and replayed alike:
+
+MAVLink, .tlog, .BIN, .ulg, CSV, motion-capture systems.
 
 A source hands on raw poses, in its own frames; `hil.poses.frames` converts them.
 """

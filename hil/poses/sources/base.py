@@ -1,4 +1,6 @@
-"""Source of poses: what the runner needs of it, what it may raise, and the one that plays recorded poses."""
+"""Source of poses: what the runner needs of it, what it may raise, and the one that plays recorded
+poses.
+"""
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable
@@ -14,16 +16,22 @@ class Source:
 
     ended: bool = False  # nothing will come any more
 
-    def __init__(self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0) -> None:
+    def __init__(
+        self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0
+    ) -> None:
         """Serve links while it is polled; ``clock`` gives the arrivals [s]."""
         self.links, self._clock = links, clock
 
     def poll(self, now: float) -> list[Pose]:
-        """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of arrival."""
+        """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of
+        arrival.
+        """
         raise NotImplementedError
 
     def wait(self, clock: Clock, until: float) -> None:
-        """Wait until a time [s], taking in what comes in the meantime, so that its arrival is known."""
+        """Wait until a time [s], taking in what comes in the meantime, so that its arrival is
+        known.
+        """
         while self.links and clock.now() < until:
             clock.wait_for([link.port for link in self.links], until)
             if not self.pump():
@@ -31,11 +39,15 @@ class Source:
         clock.sleep_until(until)
 
     def pump(self) -> int:
-        """Hand on all that has arrived on the links; returns the number of chunks that were read."""
+        """Hand on all that has arrived on the links; returns the number of chunks that
+        were read.
+        """
         return sum([link.pump(self._clock) for link in self.links])
 
     def hold(self, flying: bool) -> None:
-        """Say whether the vehicle is ours in flight: then nobody's address on the links may change."""
+        """Say whether the vehicle is ours in flight: then nobody's address on the links
+        may change.
+        """
         for link in self.links:
             link.roster.flying = flying
 
@@ -49,7 +61,10 @@ class Recorded(Source):
     """Recorded poses, each handed on when the runner's clock has reached its arrival."""
 
     def __init__(self, poses: Iterable[Pose]) -> None:
-        """Sort by arrival; poses that arrived together keep their order. Raises `SourceError` where there is none."""
+        """Sort by arrival; poses that arrived together keep their order.
+
+        Raises `SourceError` where there is none.
+        """
         super().__init__()
         self.poses = sorted(poses, key=lambda pose: pose.arrival)
         if not self.poses:
@@ -66,5 +81,8 @@ class Recorded(Source):
         return self.poses[0].arrival
 
     def poll(self, now: float) -> list[Pose]:
-        first, self._next = self._next, bisect_right(self.poses, now, self._next, key=lambda pose: pose.arrival)
+        first, self._next = (
+            self._next,
+            bisect_right(self.poses, now, self._next, key=lambda pose: pose.arrival),
+        )
         return self.poses[first : self._next]

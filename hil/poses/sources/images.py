@@ -1,8 +1,9 @@
-"""Pictures of a real camera as a source of keypoints: a folder, a video or a live camera, looked at by one of `camera.detectors`.
+"""Pictures of a real camera as a source of keypoints: a folder, a video or a live camera, looked at
+by one of `camera.detectors`.
 
-Times of recorded pictures are on the clock of the recorded poses, counted from their first arrival. Frames wait for no tick: of
-those that have come the newest is looked at, live ones in a thread of their own.
-"""
+Times of recorded pictures are on the clock of the recorded poses, counted from their first arrival.
+Frames wait for no tick: of those that have come the newest is looked at, live ones in a thread of
+their own."""
 
 import csv
 import math
@@ -29,12 +30,16 @@ from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bound, Bounded
 
 STAMPS = "stamps.csv"
-"""Beside the pictures of a folder, or named as a video is with this ending: a line ``file,time_s`` (``frame,time_s``) each."""
+"""Beside the pictures of a folder, or named as a video is with this ending: a line ``file,time_s``
+(``frame,time_s``) each.
+"""
 
 DETECTORS: dict[str, type[Detector]] = {"contours": Detector, "learnt": LearntDetector}
 """Name -> what looks at a picture. A program adds its own before it calls `visthrow.cli.main`."""
 
-SAME_PLACE = 0.01  # between the lens of the pictures and that of training [m]: directions of near things would differ by more than a degree
+# between the lens of the pictures and that of training [m]: directions of near things would differ
+# by more than a degree
+SAME_PLACE = 0.01
 
 
 @dataclass(frozen=True)
@@ -44,12 +49,15 @@ class ImageParams(Bounded):
     kind: Literal["folder", "video", "camera"]
     path: str | None = None  # of the folder or video
     device: int = 0  # number of a live camera
-    delay: Annotated[float, Bound(0.0, 0.5)] = 0.0  # from the exposure to the arrival of a picture [s]
+    delay: Annotated[float, Bound(0.0, 0.5)] = (
+        0.0  # from the exposure to the arrival of a picture [s]
+    )
     hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts [s]
     fisheye: FisheyeParams | None = None  # the lens; left out, that of training
     mount: MountParams | None = None  # left out, that of training
     detector: DetectorParams = field(default_factory=DetectorParams)
-    by: str = "contours"  # of DETECTORS: colour and shape with OpenCV, the learnt networks, or one that a program added
+    # of DETECTORS: colour and shape with OpenCV, the learnt networks, or one that a program added
+    by: str = "contours"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,7 +80,9 @@ class Eyes:
     hint: Hint | None = None
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
-        """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a lens that is not at training's place."""
+        """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a
+        lens that is not at training's place.
+        """
         if params.by not in DETECTORS:
             raise ConfigError(f"images.by '{params.by}'; {suggest(params.by, DETECTORS)}")
         self._params = params
@@ -80,10 +90,13 @@ class Eyes:
         apart = math.dist(mount.position_b, training.mount.position_b)
         if apart > SAME_PLACE:
             raise ConfigError(
-                f"images.mount.position_b is {1e3 * apart:.0f} mm from that of training; expected {1e3 * SAME_PLACE:g} at most: "
-                "another lens at the same place can be converted, another place cannot"
+                f"images.mount.position_b is {1e3 * apart:.0f} mm from that of training; expected"
+                f" {1e3 * SAME_PLACE:g} at most: another lens at the same place can be converted,"
+                " another place cannot"
             )
-        self.detector = DETECTORS[params.by](Fisheye(lens), training.payload_radius, training.goal_side, params.detector)
+        self.detector = DETECTORS[params.by](
+            Fisheye(lens), training.payload_radius, training.goal_side, params.detector
+        )
         self._rot_cb = nominal_rot_cb(mount).numpy()
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
@@ -91,7 +104,9 @@ class Eyes:
         self._followed = Following(training.payload_radius, training.goal_side)
 
     def look(self, picture: np.ndarray, stamp: float) -> Detection:
-        """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of another size."""
+        """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of
+        another size.
+        """
         known, rot_wc, hint = Known(), None, self.hint
         if hint is not None:
             rot_wb = rotation_of(hint.quat)
@@ -101,9 +116,19 @@ class Eyes:
         try:
             seen = self._followed.take(self.detector.detect(picture, known), rot_wc, stamp)
         except ValueError as error:
-            raise SourceError(f"{error}: the pictures' size is not that of images.fisheye") from error
-        corners = None if seen.goal is None else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
-        ball = None if seen.ball is None else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
+            raise SourceError(
+                f"{error}: the pictures' size is not that of images.fisheye"
+            ) from error
+        corners = (
+            None
+            if seen.goal is None
+            else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
+        )
+        ball = (
+            None
+            if seen.ball is None
+            else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
+        )
         return Detection(stamp, corners, ball)
 
     def poll(self, now: float) -> list[Detection]:
@@ -115,17 +140,25 @@ class Eyes:
 
 
 class RecordedImages(Eyes):
-    """Pictures of a folder or a video, each looked at when the runner's clock has reached its arrival."""
+    """Pictures of a folder or a video, each looked at when the runner's clock has reached its
+    arrival.
+    """
 
     def __init__(self, params: ImageParams, training: CameraParams) -> None:
-        """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that cannot be opened."""
+        """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that
+        cannot be opened.
+        """
         super().__init__(params, training)
-        self._read, times = (_folder if params.kind == "folder" else _video)(Path(params.path or ""))
+        self._read, times = (_folder if params.kind == "folder" else _video)(
+            Path(params.path or "")
+        )
         self._times = [time + params.delay for time in times]
         self._next = 0
 
     def poll(self, now: float) -> list[Detection]:
-        """Return detections that have come, of several pictures the newest; raises `SourceError` for one that cannot be read."""
+        """Return detections that have come, of several pictures the newest; raises `SourceError`
+        for one that cannot be read.
+        """
         first, self._next = self._next, bisect_right(self._times, now, self._next)
         if self._next == first:
             return []
@@ -134,17 +167,30 @@ class RecordedImages(Eyes):
 
 
 class LiveImages(Eyes):
-    """A camera, read and looked at in a thread of its own; ``failure`` is what ended it, and the keypoints go stale then."""
+    """A camera, read and looked at in a thread of its own; ``failure`` is what ended it, and the
+    keypoints go stale then.
+    """
 
-    def __init__(self, params: ImageParams, training: CameraParams, clock: Callable[[], float], capture: Any = None) -> None:
-        """Open the camera, or take anything with OpenCV's ``read``; raises `SourceError` where there is none of this number."""
+    def __init__(
+        self,
+        params: ImageParams,
+        training: CameraParams,
+        clock: Callable[[], float],
+        capture: Any = None,
+    ) -> None:
+        """Open the camera, or take anything with OpenCV's ``read``; raises `SourceError` where
+        there is none of this number.
+        """
         import cv2
 
         super().__init__(params, training)
         self._clock = clock
         self._capture = cv2.VideoCapture(params.device) if capture is None else capture
         if not self._capture.isOpened():
-            raise SourceError(f"camera {params.device} cannot be opened; expected the number of a camera, such as 0")
+            raise SourceError(
+                f"camera {params.device} cannot be opened; expected the number of a camera, such"
+                " as 0"
+            )
         self._newest: Detection | None = None
         self.failure: str | None = None
         self._stop = threading.Event()
@@ -175,7 +221,11 @@ class LiveImages(Eyes):
 
 def open_images(params: ImageParams, training: CameraParams, clock: Callable[[], float]) -> Eyes:
     """Open pictures; see the classes for what is refused."""
-    return LiveImages(params, training, clock) if params.kind == "camera" else RecordedImages(params, training)
+    return (
+        LiveImages(params, training, clock)
+        if params.kind == "camera"
+        else RecordedImages(params, training)
+    )
 
 
 def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
@@ -197,7 +247,9 @@ def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
-    """Return the reader of the frames of a video, and their times [s]; by its own rate where no stamps stand beside it."""
+    """Return the reader of the frames of a video, and their times [s]; by its own rate where no
+    stamps stand beside it.
+    """
     import cv2
 
     video = cv2.VideoCapture(str(path))
@@ -209,7 +261,9 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
     else:
         rate = video.get(cv2.CAP_PROP_FPS)
         if not rate > 0.0:
-            raise SourceError(f"{path}: the video names no rate; expected one, or {stamps.name} beside it")
+            raise SourceError(
+                f"{path}: the video names no rate; expected one, or {stamps.name} beside it"
+            )
         times = [i / rate for i in range(int(video.get(cv2.CAP_PROP_FRAME_COUNT)))]
     at = -1
 
@@ -227,13 +281,20 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
 
 def _stamps(path: Path, header: tuple[str, str]) -> list[tuple[str, float]]:
-    """Return rows of a file of stamps, times ascending; raises `SourceError` where it is missing, empty, or not as it must be."""
+    """Return rows of a file of stamps, times ascending; raises `SourceError` where it is missing,
+    empty, or not as it must be.
+    """
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
         found = [(name.strip(), float(time)) for name, time in rows[1:]]
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise SourceError(f"{path}: cannot be read: {error}; expected lines of {','.join(header)}") from error
+        raise SourceError(
+            f"{path}: cannot be read: {error}; expected lines of {','.join(header)}"
+        ) from error
     times = [time for _, time in found]
     if not found or [cell.strip() for cell in rows[0]] != list(header) or times != sorted(times):
-        raise SourceError(f"{path}; expected a first line {','.join(header)}, then a picture a line, times [s] ascending")
+        raise SourceError(
+            f"{path}; expected a first line {','.join(header)}, then a picture a line, times [s]"
+            " ascending"
+        )
     return found

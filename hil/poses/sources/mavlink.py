@@ -1,4 +1,6 @@
-"""Poses from MAVLink messages, over a link or out of a .tlog (see ``hil.poses.sources.player``): one decoder for both."""
+"""Poses from MAVLink messages, over a link or out of a .tlog (see ``hil.poses.sources.player``):
+one decoder for both.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +17,8 @@ from visthrow.config.bounds import Bound, Bounded
 COMPANIONS = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")}
 """Messages that make up a pose, where it is more than one."""
 
-PAIR_AGE = 0.05  # an attitude older than this against the position that it is to be paired with is none [s]
+# an attitude older than this against the position that it is to be paired with is none [s]
+PAIR_AGE = 0.05
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,17 @@ class MavlinkDecoder:
     """Messages to poses; bodies told apart by their senders."""
 
     def __init__(self, bodies: tuple[BodyIds, ...]) -> None:
-        """Take the senders; raises `SourceError` for none, or the same sender and message for two bodies."""
+        """Take the senders; raises `SourceError` for none, or the same sender and message for two
+        bodies.
+        """
         keys = [(ids.message, ids.system, ids.component) for ids in bodies]
-        if not bodies or any(a[:2] == b[:2] and (a[2] == b[2] or 0 in (a[2], b[2])) for a, b in combinations(keys, 2)):
-            raise SourceError(f"senders {keys}; expected at least one, and no two bodies with the same message, system and component")
+        if not bodies or any(
+            a[:2] == b[:2] and (a[2] == b[2] or 0 in (a[2], b[2])) for a, b in combinations(keys, 2)
+        ):
+            raise SourceError(
+                f"senders {keys}; expected at least one, and no two bodies with the same message,"
+                " system and component"
+            )
         self._bodies = bodies
         self._attitudes: dict[tuple[int, int], Any] = {}
 
@@ -49,24 +59,44 @@ class MavlinkDecoder:
         for ids in self._bodies:
             if ids.message == kind and ids.system == sender[0] and ids.component in (0, sender[1]):
                 paired = kind == "LOCAL_POSITION_NED"
-                return self._paired(message, sender, ids.body, arrival) if paired else pose_from_message(message, ids.body, arrival)
+                return (
+                    self._paired(message, sender, ids.body, arrival)
+                    if paired
+                    else pose_from_message(message, ids.body, arrival)
+                )
         return None
 
-    def _paired(self, message: Any, sender: tuple[int, int], body: str, arrival: float) -> Pose | None:
+    def _paired(
+        self, message: Any, sender: tuple[int, int], body: str, arrival: float
+    ) -> Pose | None:
         attitude = self._attitudes.get(sender)
         if attitude is None or abs(message.time_boot_ms - attitude.time_boot_ms) > 1e3 * PAIR_AGE:
             return None
         return Pose(
-            message.time_boot_ms / 1e3, arrival, body, (message.x, message.y, message.z),
-            (attitude.q1, attitude.q2, attitude.q3, attitude.q4), (message.vx, message.vy, message.vz),
+            message.time_boot_ms / 1e3,
+            arrival,
+            body,
+            (message.x, message.y, message.z),
+            (attitude.q1, attitude.q2, attitude.q3, attitude.q4),
+            (message.vx, message.vy, message.vz),
             (attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed),
-        )  # fmt: skip
+        )
 
 
 class MavlinkSource(Source):
-    """Poses of a link. Polling it also serves the link's other listeners, and the autopilot's link where that is another one."""
+    """Poses of a link.
 
-    def __init__(self, link: Link, bodies: tuple[BodyIds, ...], clock: Callable[[], float], beside: Link | None = None) -> None:
+    Polling it also serves the link's other listeners, and the autopilot's link where that is
+    another one.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        bodies: tuple[BodyIds, ...],
+        clock: Callable[[], float],
+        beside: Link | None = None,
+    ) -> None:
         """Listen to a link; ``clock`` gives the arrivals. ``beside`` is another link to serve."""
         super().__init__((link,) if beside is None else (link, beside), clock)
         self._link, self._decoder = link, MavlinkDecoder(bodies)
@@ -77,7 +107,9 @@ class MavlinkSource(Source):
         pose = self._decoder.feed(message, arrival)
         if pose is not None:
             sync = self._link.sync
-            self._waiting.append(pose if sync is None else sync.dated(pose, message.get_srcSystem()))
+            self._waiting.append(
+                pose if sync is None else sync.dated(pose, message.get_srcSystem())
+            )
 
     def poll(self, now: float) -> list[Pose]:
         self.pump()

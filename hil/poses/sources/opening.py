@@ -18,7 +18,13 @@ from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import Pose
 from hil.poses.sources.base import Recorded
 from hil.poses.sources.mavlink import COMPANIONS, MavlinkSource
-from hil.poses.sources.mocap import MocapParams, MocapSource, MotionCaptureSource, NatNetSource, RigidBody
+from hil.poses.sources.mocap import (
+    MocapParams,
+    MocapSource,
+    MotionCaptureSource,
+    NatNetSource,
+    RigidBody,
+)
 from hil.poses.sources.player import CHANNELS, read_autopilot, read_table, read_tlog
 from hil.poses.sources.ros2 import Ros2Source
 from visthrow.logs.check import physics
@@ -26,7 +32,9 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 
 def read_poses(params: HilParams) -> list[Pose]:
-    """Return all raw poses of the recording that a config names; raises `SourceError` where the file cannot be read."""
+    """Return all raw poses of the recording that a config names; raises `SourceError` where the
+    file cannot be read.
+    """
     source = params.source
     if source.kind == "tlog":
         return read_tlog(source.file, source.senders)
@@ -36,7 +44,9 @@ def read_poses(params: HilParams) -> list[Pose]:
 
 
 def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
-    """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks MAVLink, or both."""
+    """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks
+    MAVLink, or both.
+    """
     found = []
     if poses:
         for ids in params.source.senders:
@@ -44,14 +54,26 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
             found.append(Party(ids.body, ids.system, ids.component, kinds))
     if autopilot and params.backend in AUTOPILOTS:
         vehicle = getattr(params, params.backend)
-        found.append(Party("autopilot", vehicle.system, vehicle.component, autopilot=AUTOPILOTS[params.backend].autopilot))
+        found.append(
+            Party(
+                "autopilot",
+                vehicle.system,
+                vehicle.component,
+                autopilot=AUTOPILOTS[params.backend].autopilot,
+            )
+        )
     return found
 
 
 def open_source(
-    params: HilParams, folder: Path, clock: Clock, key: bytes | None = None, tell: Callable[[str], None] | None = None
-) -> tuple[Any, Link | None, bool]:  # fmt: skip
-    """Open a source: it, the autopilot's link where there is one, and whether its poses are recorded; raises `SourceError`, `LinkError`.
+    params: HilParams,
+    folder: Path,
+    clock: Clock,
+    key: bytes | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[Any, Link | None, bool]:
+    """Open a source: it, the autopilot's link where there is one, and whether its poses are
+    recorded; raises `SourceError`, `LinkError`.
 
     ``key`` signs the links' messages, ``tell`` is handed who is refused and never waits.
     """
@@ -60,23 +82,39 @@ def open_source(
         poses = read_poses(params)
         problems = unit_problems(poses, params.frames) if source.check_units else []
         if problems:
-            raise SourceError(f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)")
+            raise SourceError(
+                f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)"
+            )
         return Recorded(poses), None, True
     own = source.kind == "mavlink" and source.device is not None
 
     def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
-        port = open_port(check_device(device, remote=params.link.remote), f"--set {named}=udp:127.0.0.1:PORT, {SENDER}")
+        port = open_port(
+            check_device(device, remote=params.link.remote),
+            f"--set {named}=udp:127.0.0.1:PORT, {SENDER}",
+        )
         roster = Roster(who, params.link.allow, tell)
-        link = Link(port, params.link.system, params.link.component, TlogWriter(folder / tlog), roster, key)
+        link = Link(
+            port, params.link.system, params.link.component, TlogWriter(folder / tlog), roster, key
+        )
         if params.delay.synchronise:
             LinkSync(link)
         return link
 
     link = None
     if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
-        link = opened("link.device", params.link.device, TLOG, parties(params, source.kind == "mavlink" and not own, True))
+        link = opened(
+            "link.device",
+            params.link.device,
+            TLOG,
+            parties(params, source.kind == "mavlink" and not own, True),
+        )
     if source.kind == "mocap":
-        return open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link), link, False
+        return (
+            open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link),
+            link,
+            False,
+        )
     if not own:
         return MavlinkSource(link, source.senders, clock.now), link, False
     poses = opened("source.device", source.device, POSES_TLOG, parties(params, True, False))
@@ -84,33 +122,64 @@ def open_source(
 
 
 def open_mocap(
-    params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], remote: bool, link: Link | None = None
+    params: MocapParams,
+    bodies: tuple[RigidBody, ...],
+    clock: Callable[[], float],
+    remote: bool,
+    link: Link | None = None,
 ) -> MocapSource:
-    """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this machine without the config's leave."""
+    """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this
+    machine without the config's leave.
+    """
     check_device(f"tcp:{params.host}:1", remote=remote)
-    return {"natnet": NatNetSource, "ros2": Ros2Source}.get(params.system, MotionCaptureSource)(params, bodies, clock, link)
+    return {"natnet": NatNetSource, "ros2": Ros2Source}.get(params.system, MotionCaptureSource)(
+        params, bodies, clock, link
+    )
 
 
-SENDER = "and that port in what sends the poses (visthrow hil fake --device udpout:127.0.0.1:PORT)"  # of a port that is taken
+SENDER = (  # of a port that is taken
+    "and that port in what sends the poses (visthrow hil fake --device udpout:127.0.0.1:PORT)"
+)
 LEAST = 50  # poses below which nothing is said
-_KINDS = {"pos": ("m", "world"), "quat": ("1", "world"), "vel": ("m/s", "world"), "rate": ("rad/s", "body")}
+_KINDS = {
+    "pos": ("m", "world"),
+    "quat": ("1", "world"),
+    "vel": ("m/s", "world"),
+    "rate": ("rad/s", "body"),
+}
 
 
 def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list[str]:
-    """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says which unit would make sense of it."""
+    """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says
+    which unit would make sense of it.
+    """
     poses, channels = list(poses), {}
     for body, params in frames.items():
-        channels |= _channels([pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body])
-    return [f"{row.channel}: {row.text}" for row in physics.look(FlightLog(channels)) if (row.topic, row.verdict) == ("units", "bad")]
+        channels |= _channels(
+            [pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body]
+        )
+    return [
+        f"{row.channel}: {row.text}"
+        for row in physics.look(FlightLog(channels))
+        if (row.topic, row.verdict) == ("units", "bad")
+    ]
 
 
 def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict[str, Channel]:
     """Return poses of one body as channels in our frames; what some of them lack is left out."""
-    ours = [frames.pose_from_source(p) for p in poses if np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))]
+    ours = [
+        frames.pose_from_source(p)
+        for p in poses
+        if np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))
+    ]
     # A clock may be set in between: stamps that do not ascend are left to the gate.
     ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]
     times = np.array([p.stamp for p in ours])
-    ahead = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0 if len(times) else np.zeros(0, bool)
+    ahead = (
+        np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
+        if len(times)
+        else np.zeros(0, bool)
+    )
     if np.sum(ahead) < LEAST:
         return {}
     found = {}

@@ -1,7 +1,9 @@
-"""Poses of recordings: tables and flight logs by their channels, autopilots' logs by their messages.
+"""Poses of recordings: tables and flight logs by their channels, autopilots' logs by their
+messages.
 
-All files are read by ``visthrow.logs``. Autopilots write world north, east, down (or forward, right, down where PX4 was told
-so), body forward, right, down, quaternions wxyz; poses keep that, so that ``hil.poses.frames`` converts them as it does live ones.
+All files are read by ``visthrow.logs``. Autopilots write world north, east, down (or forward,
+right, down where PX4 was told so), body forward, right, down, quaternions wxyz; poses keep that, so
+that ``hil.poses.frames`` converts them as it does live ones.
 
 | log | message | what it is |
 |---|---|---|
@@ -12,9 +14,9 @@ so), body forward, right, down, quaternions wxyz; poses keep that, so that ``hil
 | .ulg | vehicle_odometry | estimate |
 | .ulg | vehicle_visual_odometry, vehicle_mocap_odometry | external pose as received |
 
-Source: ArduPilot, AP_VisualOdom/LogStructure.h, AP_NavEKF3/LogStructure.h, AP_AHRS/LogStructure.h; PX4 message definitions
-VehicleOdometry, VehicleLocalPosition, VehicleAttitude (names of fields before 1.14 too).
-"""
+Source: ArduPilot, AP_VisualOdom/LogStructure.h, AP_NavEKF3/LogStructure.h, AP_AHRS/LogStructure.h;
+PX4 message definitions VehicleOdometry, VehicleLocalPosition, VehicleAttitude (names of fields
+before 1.14 too)."""
 
 import math
 from collections.abc import Iterator
@@ -70,25 +72,37 @@ def _index(name: str, count: int = 3) -> tuple[str, ...]:
 ANGLES, QUAT = (("Roll", "Pitch", "Yaw"), ("R", "P", "Y")), (_index("q", 4),)
 EKF = PoseMessage((("PN", "PE", "PD"),), angles=ANGLES, vel=(("VN", "VE", "VD"),))
 ODOMETRY = PoseMessage(
-    (_index("position"), ("x", "y", "z")), QUAT, vel=(_index("velocity"), ("vx", "vy", "vz")),
-    rate=(_index("angular_velocity"), ("rollspeed", "pitchspeed", "yawspeed")), resets=("reset_counter",),
-)  # fmt: skip
+    (_index("position"), ("x", "y", "z")),
+    QUAT,
+    vel=(_index("velocity"), ("vx", "vy", "vz")),
+    rate=(_index("angular_velocity"), ("rollspeed", "pitchspeed", "yawspeed")),
+    resets=("reset_counter",),
+)
 LOCAL_RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "vxy", "z", "vz", "heading"))
 DATAFLASH = {
-    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt")), "XKF1": EKF, "NKF1": EKF,
+    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt")),
+    "XKF1": EKF,
+    "NKF1": EKF,
     "POS": PoseMessage((("N", "E", "D"),), attitude="ATT"),
-}  # fmt: skip
+}
 ULOG = {
     "vehicle_local_position": PoseMessage(
-        (("x", "y", "z"),), vel=(("vx", "vy", "vz"),), resets=LOCAL_RESETS,
-        attitude="vehicle_attitude", rates="vehicle_angular_velocity",
+        (("x", "y", "z"),),
+        vel=(("vx", "vy", "vz"),),
+        resets=LOCAL_RESETS,
+        attitude="vehicle_attitude",
+        rates="vehicle_angular_velocity",
     ),
-    "vehicle_odometry": ODOMETRY, "vehicle_visual_odometry": ODOMETRY, "vehicle_mocap_odometry": ODOMETRY,
-}  # fmt: skip
+    "vehicle_odometry": ODOMETRY,
+    "vehicle_visual_odometry": ODOMETRY,
+    "vehicle_mocap_odometry": ODOMETRY,
+}
 _COMPANIONS = {
-    "ATT": PoseMessage(angles=ANGLES), "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
-    "vehicle_attitude": PoseMessage(quat=QUAT), "vehicle_angular_velocity": PoseMessage(rate=(_index("xyz"),)),
-}  # fmt: skip
+    "ATT": PoseMessage(angles=ANGLES),
+    "ORGN": PoseMessage((("Lat", "Lng", "Alt"),)),
+    "vehicle_attitude": PoseMessage(quat=QUAT),
+    "vehicle_angular_velocity": PoseMessage(rate=(_index("xyz"),)),
+}
 
 
 @dataclass(frozen=True)
@@ -113,15 +127,20 @@ def _as_source() -> Iterator[None]:
 
 @_as_source()
 def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
-    """Return poses of a table, or of any file that ``visthrow.logs`` reads, arrivals as the stamps, counted from the first; raises
-    `SourceError` where it cannot be read, lacks a column, or holds no position."""
+    """Return poses of a table, or of any file that ``visthrow.logs`` reads, arrivals as the stamps,
+    counted from the first; raises `SourceError` where it cannot be read, lacks a column, or holds
+    no position.
+    """
     logs = read(path, mapping)
     if len(logs) > 1:
         raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
     poses = [pose for body in BODIES for pose in _of_channels(logs[0], body)]
     if not poses:
         known = ", ".join(names[0] for names in CHANNELS.values())
-        raise LogError(f"{path}: no position of a body; expected one of the channels {known}; it has {', '.join(logs[0].channels)}")
+        raise LogError(
+            f"{path}: no position of a body; expected one of the channels {known}; it has"
+            f" {', '.join(logs[0].channels)}"
+        )
     return poses
 
 
@@ -133,7 +152,9 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
     for name in CHANNELS[body]:
         found: list[tuple | None] = [None] * len(times)
         if name in log:
-            values = np.where(log[name].valid[:, None], log[name].values.astype(float), np.nan).tolist()
+            values = np.where(
+                log[name].valid[:, None], log[name].values.astype(float), np.nan
+            ).tolist()
             found = [tuple(values[i]) if i >= 0 else None for i in _before(log[name].time, times)]
         rows.append(found)
     start = min(float(channel.time[0]) for channel in log.channels.values() if len(channel.time))
@@ -141,14 +162,19 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
 
 
 def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Return the index of the last time at or before each stamp; -1 where there is none, or an old one."""
+    """Return the index of the last time at or before each stamp; -1 where there is none, or an old
+    one.
+    """
     index = np.searchsorted(times, stamps, side="right") - 1
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
 
 
 @_as_source()
 def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
-    """Return poses of a .tlog; arrivals are seconds from its first message. Raises `SourceError` where nothing in it is a message."""
+    """Return poses of a .tlog; arrivals are seconds from its first message.
+
+    Raises `SourceError` where nothing in it is a message.
+    """
     decoder, poses, first = MavlinkDecoder(bodies), [], None
     for arrival, message in messages.telemetry(path):
         first = arrival if first is None else first
@@ -160,18 +186,31 @@ def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
 
 @_as_source()
 def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
-    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first; raises `SourceError` for no such file,
-    a missing package, or a message that carries no pose or is not in the log."""
-    known, reader = {"bin": (DATAFLASH, messages.read_dataflash), "ulg": (ULOG, messages.read_ulog)}[kind]
+    """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first;
+    raises `SourceError` for no such file, a missing package, or a message that carries no pose or
+    is not in the log.
+    """
+    known, reader = {
+        "bin": (DATAFLASH, messages.read_dataflash),
+        "ulg": (ULOG, messages.read_ulog),
+    }[kind]
     if not bodies:
-        raise SourceError(f"source.logs is empty; expected a body and one of the messages {', '.join(known)}")
+        raise SourceError(
+            f"source.logs is empty; expected a body and one of the messages {', '.join(known)}"
+        )
     poses: list[Pose] = []
     for body in bodies:
         if body.message not in known:
-            raise SourceError(f"message '{body.message}' of the {body.body} carries no pose; {suggest(body.message, known)}")
+            raise SourceError(
+                f"message '{body.message}' of the {body.body} carries no pose;"
+                f" {suggest(body.message, known)}"
+            )
         found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
         if not found:
-            raise SourceError(f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of the {body.body}")
+            raise SourceError(
+                f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of"
+                f" the {body.body}"
+            )
         poses += [replace(pose, arrival=pose.arrival + body.time_offset) for pose in found]
     start = min(pose.arrival for pose in poses)
     return [replace(pose, arrival=pose.arrival - start) for pose in poses]
@@ -180,7 +219,9 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
 def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) -> list[Pose]:
     if body.message not in log.names:
         names = ", ".join(name for name in known if name in log.names) or "none"
-        raise LogError(f"{log.path}: no {body.message} in this log; of the messages with poses it has: {names}")
+        raise LogError(
+            f"{log.path}: no {body.message} in this log; of the messages with poses it has: {names}"
+        )
     data = log.fields.get((body.message, body.instance))
     if data is None:
         return []
@@ -188,12 +229,17 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
     if body.message == "POS":
         data = data | _from_globe(data, log.first("ORGN"))
     try:
-        pos, quat, vel, rate = (_columns_of(data, kind, name) for name in ("pos", "quat", "vel", "rate"))
+        pos, quat, vel, rate = (
+            _columns_of(data, kind, name) for name in ("pos", "quat", "vel", "rate")
+        )
         count, arrivals, stamps = len(pos), data["arrival"], data["time"]
         if kind.attitude:
             other = log.first(kind.attitude)
             if other is None:
-                raise LogError(f"{log.path}: {body.message} gives no attitude, and the log holds no {kind.attitude}")
+                raise LogError(
+                    f"{log.path}: {body.message} gives no attitude, and the log holds no"
+                    f" {kind.attitude}"
+                )
             quat = _paired(other, _COMPANIONS[kind.attitude], "quat", stamps)
         if kind.rates and (other := log.first(kind.rates)) is not None:
             rate = _paired(other, _COMPANIONS[kind.rates], "rate", stamps)
@@ -204,14 +250,25 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
     counters = [data[name].astype(int) for name in kind.resets if name in data]
     resets = sum(counters) if counters else np.zeros(count, int)
     return [
-        Pose(float(stamps[i]), float(arrivals[i]), body.body, tuple(pos[i].tolist()), _known(quat, i), _known(vel, i),
-             _known(rate, i), int(resets[i]))
-        for i in range(count) if not kind.attitude or _known(quat, i) is not None
-    ]  # fmt: skip
+        Pose(
+            float(stamps[i]),
+            float(arrivals[i]),
+            body.body,
+            tuple(pos[i].tolist()),
+            _known(quat, i),
+            _known(vel, i),
+            _known(rate, i),
+            int(resets[i]),
+        )
+        for i in range(count)
+        if not kind.attitude or _known(quat, i) is not None
+    ]
 
 
 def _columns_of(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
-    """Return columns of what a message tells, shape (T, 3 or 4); None where it tells nothing of it."""
+    """Return columns of what a message tells, shape (T, 3 or 4); None where it tells
+    nothing of it.
+    """
     if what == "quat" and message.angles:
         from scipy.spatial.transform import Rotation
 
@@ -227,15 +284,21 @@ def _columns(data: Fields, choices: tuple[tuple[str, ...], ...]) -> np.ndarray:
 
 
 def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
-    """Return another message's last value at or before each stamp, NaN where there is none or an old one."""
+    """Return another message's last value at or before each stamp, NaN where there is none or an
+    old one.
+    """
     index = _before(other["time"], stamps)
     values = _columns_of(other, message, what)[np.maximum(index, 0)]
     values[index < 0] = np.nan
     return values
 
 
-def _in_world(vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray | None) -> np.ndarray | None:
-    """Return velocities in the world, those of the body turned; NaN where the attitude is not known."""
+def _in_world(
+    vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray | None
+) -> np.ndarray | None:
+    """Return velocities in the world, those of the body turned; NaN where the attitude is not
+    known.
+    """
     if vel is None or frame is None:
         return vel
     from scipy.spatial.transform import Rotation

@@ -1,13 +1,17 @@
-"""Poses of ROS 2 topics without an installation of ROS: PoseStamped, Odometry and TF over DDS, by Eclipse Cyclone DDS.
+"""Poses of ROS 2 topics without an installation of ROS:
 
-A body's name is ``TYPE:TOPIC``: ``geometry_msgs/PoseStamped:/vrpn/quad/pose``, ``nav_msgs/Odometry:/quad/odom``, or
-``tf2_msgs/TFMessage:/tf:world/quad`` for the transform of frame quad in frame world. Positions are metres, z up, quaternions
-xyzw (REP 103); stamps are those of the header.
+PoseStamped, Odometry and TF over DDS, by Eclipse Cyclone DDS.
 
-On a loopback ``host`` nothing leaves this machine: multicast is off there, and peers are looked for on it alone.
+A body's name is ``TYPE:TOPIC``: ``geometry_msgs/PoseStamped:/vrpn/quad/pose``,
+``nav_msgs/Odometry:/quad/odom``, or ``tf2_msgs/TFMessage:/tf:world/quad`` for the transform of
+frame quad in frame world. Positions are metres, z up, quaternions xyzw (REP 103); stamps are those
+of the header.
 
-Source: REP 103, REP 105; ROS 2 design, Topic and Service name mapping to DDS (``rt/`` before the topic, ``::msg::dds_::NAME_``).
-"""
+On a loopback ``host`` nothing leaves this machine: multicast is off there, and peers are looked for
+on it alone.
+
+Source: REP 103, REP 105; ROS 2 design, Topic and Service name mapping to DDS (``rt/`` before the
+topic, ``::msg::dds_::NAME_``)."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -23,21 +27,41 @@ KINDS = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry", "tf2_msgs/TFMessage")
 
 MOST_TAKEN = 100  # messages of a topic taken in one go
 
-LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
-<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>100</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+LOOPBACK = """<CycloneDDS><Domain>
+<General>
+<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast>
+</General>
+<Discovery>
+<ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>100</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers>
+</Discovery>
+</Domain></CycloneDDS>"""
 
-NETWORK = '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="{}"/></Interfaces></General></Domain></CycloneDDS>'
+NETWORK = (
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface"
+    ' address="{}"/></Interfaces></General></Domain></CycloneDDS>'
+)
 
 
 def message_types() -> dict[str, Any]:
-    """Return the messages that are read, by name, as Cyclone DDS has them; raises `SourceError` where the package is missing."""
+    """Return the messages that are read, by name, as Cyclone DDS has them; raises `SourceError`
+    where the package is missing.
+    """
     idl = load_extra("cyclonedds.idl", "ros2", "ROS 2 topics", SourceError)
     types = load_extra("cyclonedds.idl.types", "ros2", "ROS 2 topics", SourceError)
 
     def struct(package: str, name: str, **fields: Any) -> Any:
         meta, typename = type(idl.IdlStruct), f"{package}::msg::dds_::{name}_"
-        return dataclasses.dataclass(meta(name, (idl.IdlStruct,), {"__annotations__": fields, "__module__": __name__}, typename=typename))
+        return dataclasses.dataclass(
+            meta(
+                name,
+                (idl.IdlStruct,),
+                {"__annotations__": fields, "__module__": __name__},
+                typename=typename,
+            )
+        )
 
     real = types.float64
     stamp = struct("builtin_interfaces", "Time", sec=types.int32, nanosec=types.uint32)
@@ -51,38 +75,63 @@ def message_types() -> dict[str, Any]:
     placed = struct("geometry_msgs", "PoseWithCovariance", pose=pose, covariance=spread)
     moving = struct("geometry_msgs", "TwistWithCovariance", twist=twist, covariance=spread)
     transform = struct("geometry_msgs", "Transform", translation=vector, rotation=quaternion)
-    stamped = struct("geometry_msgs", "TransformStamped", header=header, child_frame_id=str, transform=transform)
+    stamped = struct(
+        "geometry_msgs", "TransformStamped", header=header, child_frame_id=str, transform=transform
+    )
     return {
         KINDS[0]: struct("geometry_msgs", "PoseStamped", header=header, pose=pose),
-        KINDS[1]: struct("nav_msgs", "Odometry", header=header, child_frame_id=str, pose=placed, twist=moving),
+        KINDS[1]: struct(
+            "nav_msgs", "Odometry", header=header, child_frame_id=str, pose=placed, twist=moving
+        ),
         KINDS[2]: struct("tf2_msgs", "TFMessage", transforms=types.sequence[stamped]),
     }
 
 
 def domain(params: MocapParams) -> Any:
-    """Return what joins the ROS domain of ``settings.domain``, 0 where left out; raises `SourceError` for a wrong number or address."""
+    """Return what joins the ROS domain of ``settings.domain``, 0 where left out; raises
+    `SourceError` for a wrong number or address.
+    """
     dds = load_extra("cyclonedds.domain", "ros2", "ROS 2 topics", SourceError)
     number = params.settings.get("domain", "0")
     if not number.isdecimal() or not int(number) <= 232:
-        raise SourceError(f"source.mocap.settings.domain '{number}'; expected ROS_DOMAIN_ID, 0 to 232")
+        raise SourceError(
+            f"source.mocap.settings.domain '{number}'; expected ROS_DOMAIN_ID, 0 to 232"
+        )
     try:
-        own = dds.Domain(int(number), LOOPBACK if params.host.startswith("127.") else NETWORK.format(params.host))
+        own = dds.Domain(
+            int(number), LOOPBACK if params.host.startswith("127.") else NETWORK.format(params.host)
+        )
         return own, dds.DomainParticipant(int(number))
     except Exception as error:  # of the package
-        raise SourceError(f"DDS on {params.host}, domain {number}: {error}; expected the address of a network card of ours") from error
+        raise SourceError(
+            f"DDS on {params.host}, domain {number}: {error}; expected the address of a network"
+            " card of ours"
+        ) from error
 
 
-def placed(kind: str, message: Any, frames: str) -> Iterator[tuple[float, tuple[float, ...], tuple[float, ...]]]:
-    """Yield the stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform ``PARENT/CHILD``."""
+def placed(
+    kind: str, message: Any, frames: str
+) -> Iterator[tuple[float, tuple[float, ...], tuple[float, ...]]]:
+    """Yield the stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform
+    ``PARENT/CHILD``.
+    """
     parent, _, child = frames.rpartition("/")
     if kind == KINDS[2]:
-        wanted = [t for t in message.transforms if (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")) == (parent, child)]
+        wanted = [
+            t
+            for t in message.transforms
+            if (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")) == (parent, child)
+        ]
         found = [(t.header, t.transform.translation, t.transform.rotation) for t in wanted]
     else:
         pose = message.pose if kind == KINDS[0] else message.pose.pose
         found = [(message.header, pose.position, pose.orientation)]
     for header, p, q in found:
-        yield float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+        yield (
+            float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec),
+            (p.x, p.y, p.z),
+            (q.x, q.y, q.z, q.w),
+        )
 
 
 def _topic(name: str) -> tuple[str, str, str]:
@@ -91,8 +140,8 @@ def _topic(name: str) -> tuple[str, str, str]:
     place, _, frames = rest.partition(":")
     if kind not in KINDS or not place.startswith("/") or (kind == KINDS[2]) != ("/" in frames):
         raise SourceError(
-            f"body named '{name}'; expected TYPE:TOPIC with a type of {', '.join(KINDS)}, such as {KINDS[0]}:/quad/pose, or "
-            f"{KINDS[2]}:/tf:world/quad"
+            f"body named '{name}'; expected TYPE:TOPIC with a type of {', '.join(KINDS)}, such as"
+            f" {KINDS[0]}:/quad/pose, or {KINDS[2]}:/tf:world/quad"
         )
     return kind, place, frames
 
@@ -103,18 +152,34 @@ class Ros2Source(MocapSource):
     _domain: Any
 
     def __init__(
-        self, params: MocapParams, bodies: tuple[RigidBody, ...], clock: Callable[[], float], link: Link | None = None
-    ) -> None:  # fmt: skip
-        """Subscribe; arguments and errors as `hil.poses.sources.mocap.MotionCaptureSource`, and a name that is no ``TYPE:TOPIC``."""
+        self,
+        params: MocapParams,
+        bodies: tuple[RigidBody, ...],
+        clock: Callable[[], float],
+        link: Link | None = None,
+    ) -> None:
+        """Subscribe; arguments and errors as `hil.poses.sources.mocap.MotionCaptureSource`, and a
+        name that is no ``TYPE:TOPIC``.
+        """
         super().__init__(clock, link)
         wanted = [(*_topic(name), body) for name, body in body_names(bodies).items()]
         types, self._domain = message_types(), domain(params)
-        core, sub, topic = (load_extra(f"cyclonedds.{name}", "ros2", "ROS 2 topics", SourceError) for name in ("core", "sub", "topic"))
+        core, sub, topic = (
+            load_extra(f"cyclonedds.{name}", "ros2", "ROS 2 topics", SourceError)
+            for name in ("core", "sub", "topic")
+        )
         quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(10))
         self._readers = []
         for kind, place, frames, body in wanted:
             described = topic.Topic(self._domain[1], f"rt{place}", types[kind])
-            self._readers.append(sub.DataReader(self._domain[1], described, qos=quality, listener=self._listener(core, kind, body, frames)))
+            self._readers.append(
+                sub.DataReader(
+                    self._domain[1],
+                    described,
+                    qos=quality,
+                    listener=self._listener(core, kind, body, frames),
+                )
+            )
 
     def _listener(self, core: Any, kind: str, body: str, frames: str) -> Any:
         source = self
@@ -123,7 +188,11 @@ class Ros2Source(MocapSource):
             def on_data_available(self, reader: Any) -> None:
                 arrival = source._clock()
                 for message in reader.take(MOST_TAKEN):
-                    for stamp, pos, quat in placed(kind, message, frames) if hasattr(message, "__dataclass_fields__") else ():
+                    for stamp, pos, quat in (
+                        placed(kind, message, frames)
+                        if hasattr(message, "__dataclass_fields__")
+                        else ()
+                    ):
                         source.hand_over(Pose(stamp, arrival, body, pos, quat))
 
         return Listener()

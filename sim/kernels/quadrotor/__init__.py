@@ -1,5 +1,6 @@
-"""The seven blocks of the analytical quadrotor (Table I of the paper), one file each, as pure Warp functions.
+"""The seven blocks of the analytical quadrotor (Table I of the paper), one file each, as pure Warp
+functions.
 
-Every function is generic over the precision: its arguments are structs and vectors of :class:`sim.kernels.structs.Types`.
-Parameters ``p`` are always the whole vehicle struct. The equations stand in :mod:`sim.params`.
-"""
+Every function is generic over the precision: its arguments are structs and vectors of
+:class:`sim.kernels.structs.Types`. Parameters ``p`` are always the whole vehicle struct. The
+equations stand in :mod:`sim.params`."""

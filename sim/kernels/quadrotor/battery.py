@@ -1,4 +1,7 @@
-"""Battery: remaining charge, open-circuit voltage and load-dependent sag. Equations: :class:`sim.params.BatteryParams`."""
+"""Battery: remaining charge, open-circuit voltage and load-dependent sag.
+
+Equations: :class:`sim.params.BatteryParams`.
+"""
 
 from typing import Any
 
@@ -14,8 +17,13 @@ def open_circuit_voltage(p: Any, used: Any):
 
 @wp.func
 def battery_sag(p: Any, used: Any, voltage: Any, motor_speed: Any, thrust: Any):
-    """Derivatives of the used fraction [1/s] and of the terminal voltage [V/s] under the rotors' load."""
-    power = p.battery.idle_power + wp.dot(thrust, motor_speed) * p.thrust.torque_ratio / p.battery.efficiency
+    """Derivatives of the used fraction [1/s] and of the terminal voltage [V/s] under the rotors'
+    load.
+    """
+    power = (
+        p.battery.idle_power
+        + wp.dot(thrust, motor_speed) * p.thrust.torque_ratio / p.battery.efficiency
+    )
     current = power / voltage
     settled = open_circuit_voltage(p, used) - p.battery.resistance * current
     hour = type(voltage)(3600.0)

@@ -1,4 +1,7 @@
-"""Low-level controller: body-rate command to motor-speed set-points. Equations: :class:`sim.params.ControllerParams`."""
+"""Low-level controller: body-rate command to motor-speed set-points.
+
+Equations: :class:`sim.params.ControllerParams`.
+"""
 
 from typing import Any
 
@@ -22,7 +25,9 @@ def speeds_of_thrusts(p: Any, f: Any):
 
 @wp.func
 def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
-    """Yaw share of a motor's thrust [N] that keeps the spread of all four within ``room``, given roll and pitch."""
+    """Yaw share of a motor's thrust [N] that keeps the spread of all four within ``room``, given
+    roll and pitch.
+    """
     big = type(yaw)(1.0e6)
     high_plus, low_plus, high_minus, low_minus = -big, big, -big, big
     for i in range(4):
@@ -40,10 +45,11 @@ def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
 
 @wp.func
 def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
-    """Distribute thrust [N] and torque [N m] over four rotors; gives up yaw first, then collective, then roll and pitch.
+    """Distribute thrust [N] and torque [N m] over four rotors; gives up yaw first, then collective,
+    then roll and pitch.
 
-    Returns the thrust of each rotor [N], shape (4,), and the delivered shares of the roll-pitch and of the yaw demand, 0 to 1.
-    """
+    Returns the thrust of each rotor [N], shape (4,), and the delivered shares of the roll-pitch and
+    of the yaw demand, 0 to 1."""
     zero = collective - collective
     room = max_thrust - p.controller.min_thrust
     roll_pitch = p.mixer.roll * torque_b[0] + p.mixer.pitch * torque_b[1]
@@ -67,17 +73,24 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
 
 
 @wp.func
-def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
+def rate_controller_betaflight(
+    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
+):
     """PID with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
 
-    Returns motor-speed set-points [rad/s], shape (4,), and the derivatives of integral, set-point filter and gyro filter.
-    """
+    Returns motor-speed set-points [rad/s], shape (4,), and the derivatives of integral, set-point
+    filter and gyro filter."""
     c = p.controller
     rate_command = type(rate_b)(command[1], command[2], command[3])
     setpoint_rate = (rate_command - setpoint) / c.setpoint_time_constant
     gyro_rate = (rate_b - gyro) / c.gyro_time_constant
     error = setpoint - rate_b
-    torque = wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+    torque = (
+        wp.cw_mul(c.p_gain, error)
+        + integral
+        - wp.cw_mul(c.d_gain, gyro_rate)
+        + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+    )
     ratio = voltage / p.battery.reference_voltage
     f, share, yaw_share = mix(p, command[0], torque, c.max_thrust * ratio * ratio)
     integral_rate = wp.cw_mul(c.i_gain, error)
@@ -96,8 +109,11 @@ def rate_controller_betaflight(p: Any, command: Any, rate_b: Any, integral: Any,
 
 
 @wp.func
-def rate_controller_motor_mixing(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
-    """PID whose output is added to motor commands, with iterm_relax, as Betaflight's firmware has them.
+def rate_controller_motor_mixing(
+    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
+):
+    """PID whose output is added to motor commands, with iterm_relax, as Betaflight's firmware has
+    them.
 
     Returns what `rate_controller_betaflight` does; the set-point filter is that of iterm_relax.
     """
@@ -110,10 +126,17 @@ def rate_controller_motor_mixing(p: Any, command: Any, rate_b: Any, integral: An
     integral_rate = wp.cw_mul(c.i_gain, error)
     for i in range(3):
         if i < 2:
-            integral_rate[i] = integral_rate[i] * wp.max(one - wp.abs(asked[i] - setpoint[i]) / c.relax_threshold, zero)
+            integral_rate[i] = integral_rate[i] * wp.max(
+                one - wp.abs(asked[i] - setpoint[i]) / c.relax_threshold, zero
+            )
         if integral_rate[i] * integral[i] > zero and wp.abs(integral[i]) >= c.integral_limit[i]:
             integral_rate[i] = zero
-    torque = wp.cw_mul(c.p_gain, error) + integral - wp.cw_mul(c.d_gain, gyro_rate) + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+    torque = (
+        wp.cw_mul(c.p_gain, error)
+        + integral
+        - wp.cw_mul(c.d_gain, gyro_rate)
+        + wp.cw_mul(c.feedforward_gain, setpoint_rate)
+    )
     two, quarter = type(voltage)(2.0), type(voltage)(0.25)
     idle = wp.sqrt(c.min_thrust / c.max_thrust)
     share = p.mixer.roll * torque[0] + p.mixer.pitch * torque[1] + p.mixer.yaw * torque[2]
@@ -132,11 +155,17 @@ def rate_controller_motor_mixing(p: Any, command: Any, rate_b: Any, integral: An
 
 
 @wp.func
-def rate_controller_geometric(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
-    """Proportional rate controller with the gyroscopic term, each rotor clipped by itself (the paper's ablation)."""
+def rate_controller_geometric(
+    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
+):
+    """Proportional rate controller with the gyroscopic term, each rotor clipped by itself (the
+    paper's ablation).
+    """
     rate_command = type(rate_b)(command[1], command[2], command[3])
     momentum = wp.cw_mul(p.body.inertia, rate_b)
-    torque = p.controller.geometric_gain * wp.cw_mul(p.body.inertia, rate_command - rate_b) + wp.cross(rate_b, momentum)
+    torque = p.controller.geometric_gain * wp.cw_mul(
+        p.body.inertia, rate_command - rate_b
+    ) + wp.cross(rate_b, momentum)
     f = p.mixer.roll * torque[0] + p.mixer.pitch * torque[1] + p.mixer.yaw * torque[2]
     quarter = command[0] / type(voltage)(4.0)
     for i in range(4):
@@ -146,7 +175,11 @@ def rate_controller_geometric(p: Any, command: Any, rate_b: Any, integral: Any, 
 
 
 @wp.func
-def motor_speeds(p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any):
-    """The controller by-passed: commands are motor-speed set-points [rad/s], shape (4,), from outside."""
+def motor_speeds(
+    p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
+):
+    """The controller by-passed: commands are motor-speed set-points [rad/s], shape (4,), from
+    outside.
+    """
     still = rate_b - rate_b
     return command, still, still, still

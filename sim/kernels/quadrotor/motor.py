@@ -1,8 +1,7 @@
 """Motor model. Equations: :class:`sim.params.MotorParams`.
 
-``motor_rate`` gives the speed that acts now and its derivative; ``motor_advance`` the speed after a step of two
-derivatives (first-order motor) or the set-point itself (instantaneous motor).
-"""
+``motor_rate`` gives the speed that acts now and its derivative; ``motor_advance`` the speed after a
+step of two derivatives (first-order motor) or the set-point itself (instantaneous motor)."""
 
 from typing import Any
 
@@ -17,7 +16,9 @@ def motor_rate_first_order(p: Any, speed: Any, target: Any):
 
 @wp.func
 def motor_rate_asymmetric(p: Any, speed: Any, target: Any):
-    """Speed [rad/s] and its derivative [rad/s^2], each of shape (4,): slower or faster where the rotor slows down."""
+    """Speed [rad/s] and its derivative [rad/s^2], each of shape (4,): slower or faster where the
+    rotor slows down.
+    """
     rate = (target - speed) / p.motor.time_constant
     for i in range(4):
         if target[i] < speed[i]:

@@ -1,9 +1,9 @@
 """Command queue: a continuous delay of the zero-order-held command.
 
-Convention: commands stand newest first; slot j holds the command that the policy gave j control periods ago. With
-``delay = whole * period + rest`` the command of slot ``whole + 1`` acts until ``rest`` into the period, that of slot
-``whole`` from then on. The step ends a substep exactly there, so the delay is exact, not rounded to substeps.
-"""
+Convention: commands stand newest first; slot j holds the command that the policy gave j control
+periods ago. With ``delay = whole * period + rest`` the command of slot ``whole + 1`` acts until
+``rest`` into the period, that of slot ``whole`` from then on. The step ends a substep exactly
+there, so the delay is exact, not rounded to substeps."""
 
 import math
 from typing import Any
@@ -20,7 +20,9 @@ def queue_depth(delay: float, period: float) -> int:
 
 @wp.func
 def split_delay(p: Any, period: Any):
-    """Split the delay into whole periods and the rest [s]; a rest below a microsecond counts as none."""
+    """Split the delay into whole periods and the rest [s]; a rest below a microsecond counts as
+    none.
+    """
     tiny = type(period)(1.0e-6)
     whole = wp.floor(p.queue.delay / period + tiny / period)
     rest = p.queue.delay - whole * period
@@ -31,7 +33,9 @@ def split_delay(p: Any, period: Any):
 
 @wp.func
 def held(queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: Any, period: Any):
-    """The command that acts at a time of a control period [s], and until when [s]; ``whole`` and ``switch`` are of `split_delay`."""
+    """The command that acts at a time of a control period [s], and until when [s]; ``whole`` and
+    ``switch`` are of `split_delay`.
+    """
     slot = whole
     until = period
     if time < switch - type(period)(1.0e-6):
@@ -44,8 +48,8 @@ def held(queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: 
 def push(queue: wp.array2d(dtype=Any), env: int, command: Any):
     """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one.
 
-    Returns whether the command was finite. One that is not is left out: the last one is held in its place.
-    """
+    Returns whether the command was finite. One that is not is left out: the last one is held in its
+    place."""
     depth = queue.shape[0]
     for k in range(depth - 1):
         queue[depth - 1 - k, env] = queue[depth - 2 - k, env]

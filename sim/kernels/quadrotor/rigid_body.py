@@ -1,8 +1,7 @@
 """The quadrotor's state as one struct: derivative from the blocks, advance along a derivative.
 
-``build_flow`` composes the seven blocks for one choice of kinds; the result is what both the hybrid simulator and the
-quadrotor alone integrate.
-"""
+``build_flow`` composes the seven blocks for one choice of kinds; the result is what both the hybrid
+simulator and the quadrotor alone integrate."""
 
 from typing import Any
 
@@ -30,7 +29,9 @@ AEROS = {"rotor_drag": aero.aero_rotor_drag, "none": aero.aero_none}
 def quat_rate(quat_wb: Any, rate_b: Any):
     """Time derivative of the attitude: half of ``quat_wb * (rate_b, 0)``."""
     half = type(rate_b[0])(0.5)
-    return quat_wb * type(quat_wb)(rate_b[0] * half, rate_b[1] * half, rate_b[2] * half, rate_b[0] - rate_b[0])
+    return quat_wb * type(quat_wb)(
+        rate_b[0] * half, rate_b[1] * half, rate_b[2] * half, rate_b[0] - rate_b[0]
+    )
 
 
 @wp.func
@@ -42,7 +43,9 @@ def angular_acceleration(p: Any, rate_b: Any, torque_b: Any):
 
 @wp.func
 def advance(s: Any, r: Any, h: Any):
-    """State after moving along the derivative ``r`` for ``h`` seconds; the attitude is normalised."""
+    """State after moving along the derivative ``r`` for ``h`` seconds; the attitude is
+    normalised.
+    """
     out = s
     out.pos_w = s.pos_w + h * r.pos_w
     out.quat_wb = wp.normalize(s.quat_wb + r.quat_wb * h)
@@ -74,7 +77,9 @@ def blend(a: Any, wa: Any, b: Any, wb: Any):
     return out
 
 
-def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset(), motors: bool = False):
+def build_flow(
+    t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset(), motors: bool = False
+):
     """Compose the blocks of a vehicle's kinds.
 
     Args:
@@ -84,20 +89,31 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
         motors: in place of the vehicle's controller, commands are motor-speed set-points.
 
     Returns:
-        ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal states),
-        ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and ``motor_advance``.
+        ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal
+        states), ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and
+        ``motor_advance``.
     """
     rate_controller = controller.motor_speeds if motors else CONTROLLERS[vehicle.controller.kind]
     motor_rate, motor_advance = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
     rotor_thrust = thrust.rotor_thrust_scaled if "gain" in extensions else thrust.rotor_thrust
-    Vehicle, Air, QuadState, QuadRate, Flow, vec3, vec4 = t.Vehicle, t.Air, t.QuadState, t.QuadRate, t.Flow, t.vec3, t.vec4
+    Vehicle, Air, QuadState, QuadRate, Flow, vec3, vec4 = (
+        t.Vehicle,
+        t.Air,
+        t.QuadState,
+        t.QuadRate,
+        t.Flow,
+        t.vec3,
+        t.vec4,
+    )
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
         out = Flow()
-        target, integral_rate, setpoint_rate, gyro_rate = rate_controller(p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage)
+        target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
+            p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
+        )
         speed, speed_rate = motor_rate(p, s.motor_speed, target)
         f = rotor_thrust(p, speed, s.voltage)
         if wp.static("ground_effect" in extensions):
@@ -106,7 +122,9 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
         through_air = s.vel_w - air.wind_w if wp.static("wind" in extensions) else s.vel_w
         vel_b = wp.quat_rotate_inv(s.quat_wb, through_air)
         aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)
-        force, torque = composer.compose(p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque)
+        force, torque = composer.compose(
+            p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque
+        )
         if wp.static("push" in extensions):
             force += wp.quat_rotate_inv(s.quat_wb, air.push_w)
             torque += air.twist_b
@@ -140,11 +158,20 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str] = fr
 
 
 def build_direct_flow(t: Types):
-    """The blocks by-passed: the command is (thrust [N], torque [N m] about x, y, z), acting at once and exactly.
+    """The blocks by-passed: the command is (thrust [N], torque [N m] about x, y, z), acting at once
+    and exactly.
 
     What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
     """
-    Vehicle, Air, QuadState, Flow, vec3, vec4, real = t.Vehicle, t.Air, t.QuadState, t.Flow, t.vec3, t.vec4, t.real
+    Vehicle, Air, QuadState, Flow, vec3, vec4, real = (
+        t.Vehicle,
+        t.Air,
+        t.QuadState,
+        t.Flow,
+        t.vec3,
+        t.vec4,
+        t.real,
+    )
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):

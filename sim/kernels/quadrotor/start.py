@@ -1,4 +1,6 @@
-"""Actuators, filters, battery and command queue of a vehicle in steady hover: where every episode starts."""
+"""Actuators, filters, battery and command queue of a vehicle in steady hover: where every episode
+starts.
+"""
 
 from typing import Any
 
@@ -11,7 +13,9 @@ from sim.params import VehicleParams
 
 @wp.func
 def hover_speed(p: Any, thrust: Any, voltage: Any):
-    """Motor speed [rad/s] at which one rotor gives a thrust [N] under a voltage [V]; inverts the whole thrust map."""
+    """Motor speed [rad/s] at which one rotor gives a thrust [N] under a voltage [V]; inverts the
+    whole thrust map.
+    """
     one = type(thrust)(1.0)
     two = type(thrust)(2.0)
     t = p.thrust
@@ -21,7 +25,9 @@ def hover_speed(p: Any, thrust: Any, voltage: Any):
 
 @wp.func
 def hover_voltage(p: Any, used: Any, thrust: Any, speed: Any):
-    """Terminal voltage [V] that a pack settles at while it feeds hover: the upper root of ``u^2 - u_oc u + R P = 0``."""
+    """Terminal voltage [V] that a pack settles at while it feeds hover: the upper root of ``u^2 -
+    u_oc u + R P = 0``.
+    """
     power = p.battery.idle_power + thrust * speed * p.thrust.torque_ratio / p.battery.efficiency
     source = open_circuit_voltage(p, used)
     root = source * source - type(thrust)(4.0) * p.battery.resistance * power
@@ -31,9 +37,9 @@ def hover_voltage(p: Any, used: Any, thrust: Any, speed: Any):
 def build_start(t: Types, vehicle: VehicleParams, State: type):
     """Build ``start(p, state, env, thrust, used)`` for a struct of state arrays.
 
-    It puts motors, filters, battery and queue of an environment in hover under a collective thrust [N] with a fraction
-    ``used`` of the charge gone. Nothing of the last episode stays. The body rate must have been set before.
-    """
+    It puts motors, filters, battery and queue of an environment in hover under a collective thrust
+    [N] with a fraction ``used`` of the charge gone. Nothing of the last episode stays. The body
+    rate must have been set before."""
     Vehicle, real, vec3, vec4 = t.Vehicle, t.real, t.vec3, t.vec4
     ideal = vehicle.battery.kind == "ideal"
 
@@ -44,8 +50,12 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
         if wp.static(ideal):
             charge_used = real(0.0)
         else:
-            for _ in range(4):  # speed and voltage depend on each other weakly: each round gains three digits
-                voltage = hover_voltage(p, used, thrust, hover_speed(p, thrust / real(4.0), voltage))
+            for _ in range(
+                4
+            ):  # speed and voltage depend on each other weakly: each round gains three digits
+                voltage = hover_voltage(
+                    p, used, thrust, hover_speed(p, thrust / real(4.0), voltage)
+                )
         speed = hover_speed(p, thrust / real(4.0), voltage)
         state.motor_speed[env] = vec4(speed, speed, speed, speed)
         state.integral[env] = vec3()

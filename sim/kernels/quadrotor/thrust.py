@@ -1,4 +1,7 @@
-"""Thrust and torque of the rotors from motor speed and battery voltage. Equations: :class:`sim.params.ThrustParams`."""
+"""Thrust and torque of the rotors from motor speed and battery voltage.
+
+Equations: :class:`sim.params.ThrustParams`.
+"""
 
 from typing import Any
 
@@ -8,7 +11,9 @@ import warp as wp
 @wp.func
 def rotor_thrust(p: Any, motor_speed: Any, voltage: Any):
     """Thrust of each rotor [N], shape (4,)."""
-    scale = type(voltage)(1.0) + p.thrust.voltage_coefficient * (voltage - p.battery.reference_voltage)
+    scale = type(voltage)(1.0) + p.thrust.voltage_coefficient * (
+        voltage - p.battery.reference_voltage
+    )
     return (p.thrust.k_f * wp.cw_mul(motor_speed, motor_speed) + p.thrust.k_1 * motor_speed) * scale
 
 
@@ -20,7 +25,10 @@ def rotor_thrust_scaled(p: Any, motor_speed: Any, voltage: Any):
 
 @wp.func
 def near_ground(p: Any, air: Any, height: Any, thrust: Any):
-    """Thrust of each rotor [N], shape (4,), at a height [m] of the vehicle. Equation: :class:`sim.params.AirParams`."""
+    """Thrust of each rotor [N], shape (4,), at a height [m] of the vehicle.
+
+    Equation: :class:`sim.params.AirParams`.
+    """
     quarter = type(height)(0.25)
     one = type(height)(1.0)
     ratio = quarter * p.rotors.radius / wp.max(height, type(height)(0.5) * p.rotors.radius)

@@ -1,8 +1,9 @@
-"""The replay as one kernel: a lane flies one window of a recorded flight from a state of its own with parameters of its own.
+"""The replay as one kernel: a lane flies one window of a recorded flight from a state of its own
+with parameters of its own.
 
-Every switch of the command, the latch, the separation and the knots of the latent forces end a step exactly; measured
-stamps lie inside steps and are read from the cubic through both ends. One thread a lane, no atomics.
-"""
+Every switch of the command, the latch, the separation and the knots of the latent forces end a step
+exactly; measured stamps lie inside steps and are read from the cubic through both ends. One thread
+a lane, no atomics."""
 
 from dataclasses import dataclass
 
@@ -21,7 +22,9 @@ from sim.kernels.rope.release import build_letting_go, build_step_in_flight
 from sim.kernels.structs import EXTENSIONS, Types, make_struct
 from sim.params import LawParams, SensingParams, VehicleParams
 
-EVERYTHING = frozenset(EXTENSIONS)  # the replay has every extension built in, so that lanes may differ in all of them
+EVERYTHING = frozenset(
+    EXTENSIONS
+)  # the replay has every extension built in, so that lanes may differ in all of them
 
 ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2  # how the payload starts: on the rope, flying, or not there
 
@@ -32,10 +35,15 @@ STATE_FIELDS = st.QUAD_FIELDS | {
     "payload_pos_w": ("vec3", False),  # where it starts loose, and where it is at the end
     "payload_vel_w": ("vec3", False),
     "slack_first": ("real", False),  # at the end alone: when the rope first went slack [s]
-    "slack_last": ("real", False),  # and when it last came taut again; before the window's start if it did not
+    "slack_last": (
+        "real",
+        False,
+    ),  # and when it last came taut again; before the window's start if it did not
 }
 
-SLACK = 0.15  # share of the payload's weight below which the rope counts as slack: its shape is then anyone's guess
+# share of the payload's weight below which the rope counts as slack: its shape is then anyone's
+# guess
+SLACK = 0.15
 
 WINDOW_FIELDS = {
     "start": ("real", False),  # [s], clock of the flight
@@ -59,14 +67,25 @@ LANE_FIELDS = {
     "window": ("int", False),
     "plant": ("int", False),  # row of the parameters
     "state": ("int", False),  # row of the initial states
-    "axis": ("int", False),  # of its latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force, or -1
+    "axis": (
+        "int",
+        False,
+    ),  # of its latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force, or -1
     "knot": ("int", False),
     "size": ("real", False),  # of the latent force at its knot [N], [N m]
     "substep": ("real", False),  # largest step [s]
     "keep": ("int", False),  # first row of its knots' states in the knot arrays, or -1
-    "resume": ("int", False),  # row of the knot arrays at which it leaves the lane that kept it, or -1
+    "resume": (
+        "int",
+        False,
+    ),  # row of the knot arrays at which it leaves the lane that kept it, or -1
     "parent": ("int", False),  # that lane, flown before, of the same window, plant and state
-    "shared": ("int", False),  # of a lane from a start: so many after it share its flight and differ in what sensors show of it
+    "shared": (
+        "int",
+        False,
+        # of a lane from a start: so many after it share its flight and differ in what sensors show
+        # of it
+    ),
 }
 
 KNOT_FIELDS = {
@@ -105,8 +124,12 @@ class ReplayKernel:
     Pointers: type
 
 
-def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()) -> ReplayKernel:
-    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws; numbers are read at run time."""
+def build_replay(
+    t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()
+) -> ReplayKernel:
+    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
+    numbers are read at run time.
+    """
     real, vec3 = t.real, t.vec3
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = segments
@@ -126,13 +149,36 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
     leaving = build_letting_go(t, EVERYTHING)
     fly_ball = build_step_in_flight(t, flight_acceleration)
     sampling = build_sampling(t, Sensing, Windows, Data)
-    Steps, Pointers, sample, copy_samples = sampling.Steps, sampling.Pointers, sampling.sample, sampling.copy_samples
+    Steps, Pointers, sample, copy_samples = (
+        sampling.Steps,
+        sampling.Pointers,
+        sampling.sample,
+        sampling.copy_samples,
+    )
     load_quad, store_quad = st.build_access(t, State)
-    Ball = make_struct("Ball", {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3})
-    Moment = make_struct("Moment", {
-        "time": real, "quad": QuadState, "rope": Rope, "ball": Ball, "total": vec3, "before": vec3, "pay": vec3, "pay_vel": vec3,
-        "separation": real, "mode": wp.int32, "latched": wp.int32, "knot": wp.int32, "slack": wp.int32, "at": Pointers,
-    })  # fmt: skip
+    Ball = make_struct(
+        "Ball",
+        {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3},
+    )
+    Moment = make_struct(
+        "Moment",
+        {
+            "time": real,
+            "quad": QuadState,
+            "rope": Rope,
+            "ball": Ball,
+            "total": vec3,
+            "before": vec3,
+            "pay": vec3,
+            "pay_vel": vec3,
+            "separation": real,
+            "mode": wp.int32,
+            "latched": wp.int32,
+            "knot": wp.int32,
+            "slack": wp.int32,
+            "at": Pointers,
+        },
+    )
     attached_code, loose_code = ATTACHED, LOOSE
 
     @wp.func
@@ -152,10 +198,14 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
 
     @wp.func
     def payload_now(r: Release, ball: Ball):
-        return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (ball.tail_vel - ball.vel)
+        return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (
+            ball.tail_vel - ball.vel
+        )
 
     @wp.func
-    def let_go(r: Release, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
+    def let_go(
+        r: Release, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)
+    ):
         """The payload and the loose rope at the separation."""
         ball = Ball()
         ball.root = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
@@ -169,7 +219,16 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         return ball
 
     @wp.func
-    def knot_of(knots: Knots, row: int, p: Vehicle, rope: Rope, s: QuadState, pos: vec3, vel: vec3, pull: real):
+    def knot_of(
+        knots: Knots,
+        row: int,
+        p: Vehicle,
+        rope: Rope,
+        s: QuadState,
+        pos: vec3,
+        vel: vec3,
+        pull: real,
+    ):
         knots.pos_w[row] = s.pos_w
         knots.vel_w[row] = s.vel_w
         knots.quat_wb[row] = s.quat_wb
@@ -247,13 +306,18 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
         end = windows.end[w]
         command = windows.command_first[w]
         delay = p.queue.delay
-        while command + 1 < windows.command_last[w] and data.command_time[command + 1] + delay <= time + tiny:
+        while (
+            command + 1 < windows.command_last[w]
+            and data.command_time[command + 1] + delay <= time + tiny
+        ):
             command = command + 1
         latch = windows.latch[w]
         separation = end + real(1.0)
         latched = mode != attached_code
         if mode == attached_code and latch <= time:
-            separation = wp.max(latch + r.lag, time)  # the pull at the latch lies before this window
+            separation = wp.max(
+                latch + r.lag, time
+            )  # the pull at the latch lies before this window
             latched = True
         knot = int(0)
         slack = bool(False)
@@ -295,7 +359,10 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
             copy_samples(windows, w, at, lanes.parent[lane], lane, out)
         while time < end - tiny:
             until = end
-            while command + 1 < windows.command_last[w] and data.command_time[command + 1] + delay <= time + tiny:
+            while (
+                command + 1 < windows.command_last[w]
+                and data.command_time[command + 1] + delay <= time + tiny
+            ):
                 command = command + 1
             if command + 1 < windows.command_last[w]:
                 until = wp.min(until, data.command_time[command + 1] + delay)
@@ -317,7 +384,9 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 if knot_time <= time + tiny:
                     if lanes.keep[lane] >= 0:
                         kept = lanes.keep[lane] + knot
-                        knot_of(knots, kept, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness, u))
+                        knot_of(
+                            knots, kept, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness, u)
+                        )
                         if kept < moments.shape[0]:
                             now = Moment()
                             now.time = time
@@ -359,7 +428,9 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 old_pay = pay
                 old_pay_vel = pay_vel
                 if mode == attached_code:
-                    s, total, fell_back = coupled.step(p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h)
+                    s, total, fell_back = coupled.step(
+                        p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                    )
                     pos1, vel1 = coupled.payload(rope, s, n, u)
                     pay = pos1
                     pay_vel = vel1
@@ -377,7 +448,19 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                         ball.pos = flown_pos
                         ball.vel = flown_vel
                         if r.rope_tail > real(0.0):
-                            root, root_vel = loose_step(rope, pushed, ball.root, ball.root_vel, n, u, stiffness, g, gamma, max_turn, h)
+                            root, root_vel = loose_step(
+                                rope,
+                                pushed,
+                                ball.root,
+                                ball.root_vel,
+                                n,
+                                u,
+                                stiffness,
+                                g,
+                                gamma,
+                                max_turn,
+                                h,
+                            )
                             tail_pos, tail_vel = chain.payload(rope, root, root_vel, n, u)
                             ball.root = root
                             ball.root_vel = root_vel
@@ -391,20 +474,64 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 k.t1 = t0 + h
                 k.h = h
                 last = j == count - 1 and until >= end - tiny
-                if last or at.due <= k.t1:  # most steps show nothing, and to ask costs as much as a tenth of a step
-                    at = sample(p, x, data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last, at, out, lane)
+                if (
+                    last or at.due <= k.t1
+                ):  # most steps show nothing, and to ask costs as much as a tenth of a step
+                    at = sample(
+                        p,
+                        x,
+                        data,
+                        windows,
+                        w,
+                        old,
+                        s,
+                        before,
+                        old_pay,
+                        old_pay_vel,
+                        pay,
+                        pay_vel,
+                        k,
+                        last,
+                        at,
+                        out,
+                        lane,
+                    )
                 for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
                     if last or marks[e].due <= k.t1:
                         marks[e] = sample(
-                            p, sensings[lanes.plant[e]], data, windows, w, old, s, before, old_pay, old_pay_vel, pay, pay_vel, k, last,
-                            marks[e], out, e,
-                        )  # fmt: skip
+                            p,
+                            sensings[lanes.plant[e]],
+                            data,
+                            windows,
+                            w,
+                            old,
+                            s,
+                            before,
+                            old_pay,
+                            old_pay_vel,
+                            pay,
+                            pay_vel,
+                            k,
+                            last,
+                            marks[e],
+                            out,
+                            e,
+                        )
                 before = old.rate_b
             time = until
 
         if lanes.keep[lane] >= 0:
             if knot < windows.knots[w]:
-                knot_of(knots, lanes.keep[lane] + knot, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness, u))
+                knot_of(
+                    knots,
+                    lanes.keep[lane] + knot,
+                    p,
+                    rope,
+                    s,
+                    pay,
+                    pay_vel,
+                    chain.pull(rope, stiffness, u),
+                )
             store_quad(ends, lane, s)
             ends.payload_pos_w[lane] = pay
             ends.payload_vel_w[lane] = pay_vel
@@ -415,4 +542,6 @@ def build_replay(t: Types, vehicle: VehicleParams, segments: int, laws: tuple[La
                 ends.cable_vel_w[i, lane] = u[i]
                 ends.stiffness[i, lane] = stiffness[i]
 
-    return ReplayKernel(replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment, Pointers)
+    return ReplayKernel(
+        replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment, Pointers
+    )

@@ -1,4 +1,6 @@
-"""Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the cores of a CPU."""
+"""Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the
+cores of a CPU.
+"""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +14,16 @@ from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
 from sim.kernels.laws import check_laws, structure
 from sim.kernels.replay import kernel as rk
-from sim.kernels.structs import Types, kinds_of, pack, pack_air, pack_rope, pack_vehicle, ropes_on, types
+from sim.kernels.structs import (
+    Types,
+    kinds_of,
+    pack,
+    pack_air,
+    pack_rope,
+    pack_vehicle,
+    ropes_on,
+    types,
+)
 from sim.params import GRAVITY, PlantParams, SensingParams
 
 
@@ -20,18 +31,24 @@ from sim.params import GRAVITY, PlantParams, SensingParams
 class Replayed:
     """What the lanes saw.
 
-    With Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro in a lane's window, its first
-    ``2 Nv + Np + Ng`` rows hold: position [m] and attitude against the measured one (rotation vector [rad]) in turns,
-    payload [m], rate [rad/s]. The rest is undefined. ``ends`` and ``knots`` are empty where no lane keeps.
-    """
+    With Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro in a lane's window,
+    its first ``2 Nv + Np + Ng`` rows hold: position [m] and attitude against the measured one
+    (rotation vector [rad]) in turns, payload [m], rate [rad/s]. The rest is undefined. ``ends`` and
+    ``knots`` are empty where no lane keeps."""
 
     seen: np.ndarray  # shape (rows, lanes, 3)
-    ends: dict[str, np.ndarray]  # states at the end of the windows of lanes that keep, as ``starts``; others undefined
-    knots: dict[str, np.ndarray]  # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
+    ends: dict[
+        str, np.ndarray
+    ]  # states at the end of the windows of lanes that keep, as ``starts``; others undefined
+    knots: dict[
+        str, np.ndarray
+    ]  # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
 
 
 class Recording:
-    """Windows and the flights that they are of, brought to a device once for all runs; the arrays must not change."""
+    """Windows and the flights that they are of, brought to a device once for all runs; the arrays
+    must not change.
+    """
 
     def __init__(self, windows: Mapping[str, np.ndarray], data: Mapping[str, np.ndarray]):
         """Keep them.
@@ -48,7 +65,14 @@ class Recording:
     def on(self, kernel: rk.ReplayKernel, t: Types, device: str) -> tuple:
         """Return windows and recorded data as a kernel's structs on a device."""
         if (kernel, device) not in self._there:
-            structs = (kernel.Windows, rk.WINDOW_FIELDS, self.windows), (kernel.Data, rk.DATA_FIELDS, self.data)
+            structs = (
+                (kernel.Windows, rk.WINDOW_FIELDS, self.windows),
+                (
+                    kernel.Data,
+                    rk.DATA_FIELDS,
+                    self.data,
+                ),
+            )
             self._there[kernel, device] = tuple(_struct(t, *given, device) for given in structs)
         return self._there[kernel, device]
 
@@ -57,7 +81,9 @@ _BUILDS: dict = {}
 
 PIECES = 4  # of the lanes for each core of a CPU
 
-FEW = 32  # lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes some 50 times as long
+# lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes
+# some 50 times as long
+FEW = 32
 
 
 class Replay:
@@ -66,21 +92,28 @@ class Replay:
     Raises ValueError: plants of different blocks or segments, or an unphysical parameter.
 
     Args:
-        plants: parameters of the rows that lanes choose from; one choice of blocks and one number of segments.
+        plants: parameters of the rows that lanes choose from; one choice of blocks and one number
+            of segments.
         sensings: of the same rows.
-        device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the same.
+        device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the
+            same.
         download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
     """
 
     def __init__(
-        self, plants: Sequence[PlantParams], sensings: Sequence[SensingParams], device: str = "cpu",
+        self,
+        plants: Sequence[PlantParams],
+        sensings: Sequence[SensingParams],
+        device: str = "cpu",
         download: Callable[[wp.array], np.ndarray] = wp.array.numpy,
-    ):  # fmt: skip
+    ):
         first = plants[0]
-        if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {first.rope.segments}:
+        if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {
+            first.rope.segments
+        }:
             raise ValueError(
-                f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with {len(sensings)} sensings: "
-                "expected one number of segments and a sensing each"
+                f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with"
+                f" {len(sensings)} sensings: expected one number of segments and a sensing each"
             )
         self.device, self.segments, self._sim = device, first.rope.segments, first.sim
         self._download = download
@@ -102,7 +135,12 @@ class Replay:
         self._plants: dict[str, list[wp.array]] = {}
 
     def run(
-        self, starts: Mapping[str, np.ndarray], recording: Recording, lanes: Mapping[str, np.ndarray], knot_spacing: float, knots: int = 1
+        self,
+        starts: Mapping[str, np.ndarray],
+        recording: Recording,
+        lanes: Mapping[str, np.ndarray],
+        knot_spacing: float,
+        knots: int = 1,
     ) -> Replayed:
         """Fly all lanes.
 
@@ -116,13 +154,21 @@ class Replay:
         k, t = self.kernel, self.types
         count = len(lanes["window"])
         device = self.device if count > FEW * cores() else "cpu"
-        if device != "cpu":  # lanes that wait for others would double the time, which is that of the slowest
+        if (
+            device != "cpu"
+        ):  # lanes that wait for others would double the time, which is that of the slowest
             lanes = {**lanes, "resume": np.full(count, -1)}
         if device not in self._plants:
-            self._plants[device] = [wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()]
+            self._plants[device] = [
+                wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()
+            ]
         w = np.asarray(lanes["window"])
         height = max(int(np.max(recording.rows[w])), 1)
-        segments = {"cable_dir_w": self.segments, "cable_vel_w": self.segments, "stiffness": self.segments}
+        segments = {
+            "cable_dir_w": self.segments,
+            "cable_vel_w": self.segments,
+            "stiffness": self.segments,
+        }
         keeps = bool(np.any(np.asarray(lanes["keep"]) >= 0))
         if keeps:
             ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
@@ -132,42 +178,71 @@ class Replay:
         out = wp.empty((height, count), dtype=t.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
         moments, vec3 = knots if np.any(resumed) else 0, t.vec3
-        ropes = [wp.empty((moments, self.segments), dtype=kind, device=device) for kind in (vec3, vec3, t.real)]
+        ropes = [
+            wp.empty((moments, self.segments), dtype=kind, device=device)
+            for kind in (vec3, vec3, t.real)
+        ]
         left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
         marks = wp.empty(count, dtype=k.Pointers, device=device)
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
-        launches = [rows[np.argsort(-costs[rows], kind="stable")] for rows in _in_order(np.asarray(lanes["shared"]), resumed)]
+        launches = [
+            rows[np.argsort(-costs[rows], kind="stable")]
+            for rows in _in_order(np.asarray(lanes["shared"]), resumed)
+        ]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, GRAVITY]
         told = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
-        (begin, flown), (windows, data) = (_struct(t, *given, device) for given in told), recording.on(k, t, device)
+        (begin, flown), (windows, data) = (
+            (_struct(t, *given, device) for given in told),
+            recording.on(k, t, device),
+        )
         before = [*self._plants[device], *numerics, begin, windows, flown, data, order]
         after, first = [ends, held, marks, *left_at, out], 0
         for rows in launches:
             self._launch(device, first, costs[rows], before, after)
             first += len(rows)
-        read = (self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS)) if keeps else ({}, {})
+        read = (
+            (self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
+            if keeps
+            else ({}, {})
+        )
         return Replayed(self._download(out), *read)
 
-    def _launch(self, device: str, begin: int, costs: np.ndarray, before: list, after: list) -> None:
-        """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread and leaves the others free.
+    def _launch(
+        self, device: str, begin: int, costs: np.ndarray, before: list, after: list
+    ) -> None:
+        """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread
+        and leaves the others free.
 
         Args:
             device: to launch on.
             begin: place of the first in the order.
-            costs: of each, in any unit; the longest come first, so that no core is left with one of them in the end.
+            costs: of each, in any unit; the longest come first, so that no core is left with one of
+                them in the end.
             before: arguments that come before the place of the first.
             after: those that come after it.
         """
         if not len(costs):
             return
         if device != "cpu":
-            wp.launch(self.kernel.replay, len(costs), [*before, begin, *after], device=device, block_dim=64)
+            wp.launch(
+                self.kernel.replay,
+                len(costs),
+                [*before, begin, *after],
+                device=device,
+                block_dim=64,
+            )
             wp.synchronize_device(device)
             return
-        whole = wp.launch(self.kernel.replay, len(costs), [*before, begin, *after], device="cpu", record_cmd=True)
+        whole = wp.launch(
+            self.kernel.replay, len(costs), [*before, begin, *after], device="cpu", record_cmd=True
+        )
 
-        def launch(first: int, last: int) -> None:  # packed once: that of each piece took longer than a lane's flight, with Python held
+        def launch(
+            first: int, last: int
+        ) -> (
+            None
+        ):  # packed once: that of each piece took longer than a lane's flight, with Python held
             piece = copy.copy(whole)
             piece.params = list(whole.params)
             piece.set_dim(last - first)
@@ -179,7 +254,11 @@ class Replay:
     @staticmethod
     def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
         return {
-            name: np.swapaxes(getattr(struct, name).numpy(), 0, 1) if by_row else getattr(struct, name).numpy()
+            name: (
+                np.swapaxes(getattr(struct, name).numpy(), 0, 1)
+                if by_row
+                else getattr(struct, name).numpy()
+            )
             for name, (_, by_row) in fields.items()
         }
 
@@ -197,14 +276,18 @@ def _struct(t: Types, struct: type, fields: Mapping, values: Mapping[str, np.nda
 
 
 def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
-    """Bounds of at most so many runs of lanes that cost about the same, each of at least one lane."""
+    """Bounds of at most so many runs of lanes that cost about the same, each of at
+    least one lane.
+    """
     total = np.cumsum(costs)
     inside = np.searchsorted(total, total[-1] / pieces * np.arange(1, pieces)) + 1
     return np.unique([0, *inside.tolist(), len(costs)]).tolist()
 
 
 def _in_order(shared: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lanes that fly, those from a start and those that leave another lane on its way; the rest ride along."""
+    """Lanes that fly, those from a start and those that leave another lane on its way; the rest
+    ride along.
+    """
     flies, number = np.ones(len(shared), dtype=bool), np.arange(len(shared))
     for lane in np.flatnonzero(shared > 0):
         flies[lane + 1 : lane + 1 + shared[lane]] = False

@@ -1,4 +1,5 @@
-"""What measured stamps show of a flight: they lie inside steps, are read from the cubic through both ends, and as sensors have it.
+"""What measured stamps show of a flight: they lie inside steps, are read from the cubic through
+both ends, and as sensors have it.
 
 Equations of delays, frames and markers: :class:`sim.params.SensingParams`.
 """
@@ -25,7 +26,9 @@ def rotation_of_vector(like: Any, vector: Any):
 
 @wp.func
 def vector_of_rotation(like: Any, quat: Any):
-    """Rotation vector [rad] (of the type of ``like``) of a unit quaternion, the shorter way round."""
+    """Rotation vector [rad] (of the type of ``like``) of a unit quaternion, the shorter
+    way round.
+    """
     one = type(quat[3])(1.0)
     sign = one
     if quat[3] < quat[3] - quat[3]:
@@ -41,10 +44,10 @@ def vector_of_rotation(like: Any, quat: Any):
 def build_sensing(t: Types, Sensing: type):
     """Warp functions of the measurement model.
 
-    Returns ``pose(sensing, com, pos_w, quat_wb, reference)`` -> measured position of the marker body [m] and its attitude against the
-    quaternion ``reference`` as a rotation vector [rad]; ``point(sensing, pos_w)`` -> measured position of the payload [m]; ``rate(sensing,
-    rate_b)`` [rad/s].
-    """
+    Returns ``pose(sensing, com, pos_w, quat_wb, reference)`` -> measured position of the marker
+    body [m] and its attitude against the quaternion ``reference`` as a rotation vector [rad];
+    ``point(sensing, pos_w)`` -> measured position of the payload [m]; ``rate(sensing, rate_b)``
+    [rad/s]."""
     vec3, quat, real = t.vec3, t.quat, t.real
 
     @wp.func
@@ -57,7 +60,9 @@ def build_sensing(t: Types, Sensing: type):
 
     @wp.func
     def point(x: Sensing, like: quat, pos_w: vec3):
-        return (real(1.0) + x.scale) * wp.quat_rotate(rotation_of_vector(like, x.frame_tilt), pos_w + x.payload_offset)
+        return (real(1.0) + x.scale) * wp.quat_rotate(
+            rotation_of_vector(like, x.frame_tilt), pos_w + x.payload_offset
+        )
 
     @wp.func
     def rate(x: Sensing, rate_b: vec3):
@@ -73,7 +78,9 @@ class Sampling:
     sample: wp.Function
     copy_samples: wp.Function
     Steps: type  # a step's two ends and its length [s]
-    Pointers: type  # how many stamps of each sensor were sampled, and the time of the state that the next one shows [s]
+    # how many stamps of each sensor were sampled, and the time of the state that the next one shows
+    # [s]
+    Pointers: type
 
 
 def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampling:
@@ -87,7 +94,9 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
     Vehicle, QuadState = t.Vehicle, t.QuadState
     see_pose, see_point, see_rate = build_sensing(t, Sensing)
     Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
-    Pointers = make_struct("Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32, "due": real})
+    Pointers = make_struct(
+        "Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32, "due": real}
+    )
 
     @wp.func
     def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
@@ -110,10 +119,27 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
 
     @wp.func
     def sample(
-        p: Vehicle, x: Sensing, data: Data, windows: Windows, w: int, a: QuadState, b: QuadState, before: vec3,
-        pa: vec3, va: vec3, pb: vec3, vb: vec3, k: Steps, last: bool, at: Pointers, out: wp.array2d(dtype=vec3), lane: int,
-    ):  # fmt: skip
-        """Write every measured stamp that falls into a step; the window's last step samples all that is left."""
+        p: Vehicle,
+        x: Sensing,
+        data: Data,
+        windows: Windows,
+        w: int,
+        a: QuadState,
+        b: QuadState,
+        before: vec3,
+        pa: vec3,
+        va: vec3,
+        pb: vec3,
+        vb: vec3,
+        k: Steps,
+        last: bool,
+        at: Pointers,
+        out: wp.array2d(dtype=vec3),
+        lane: int,
+    ):
+        """Write every measured stamp that falls into a step; the window's last step samples all
+        that is left.
+        """
         next = at
         next.due = windows.end[w]
         vehicles = windows.vehicle_count[w]
@@ -127,33 +153,54 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
                 break
             s = (time - k.t0) / span
             pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
-            q = blend_quat(a.quat_wb, quat_rate(a.quat_wb, a.rate_b), b.quat_wb, quat_rate(b.quat_wb, b.rate_b), s, span)
+            q = blend_quat(
+                a.quat_wb,
+                quat_rate(a.quat_wb, a.rate_b),
+                b.quat_wb,
+                quat_rate(b.quat_wb, b.rate_b),
+                s,
+                span,
+            )
             seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
             out[2 * next.vehicle, lane] = seen
             out[2 * next.vehicle + 1, lane] = turn
             next.vehicle = next.vehicle + 1
         while next.payload < payloads:
-            time = late(x, windows, w, data.payload_time[windows.payload_first[w] + next.payload], x.payload_delay)
+            time = late(
+                x,
+                windows,
+                w,
+                data.payload_time[windows.payload_first[w] + next.payload],
+                x.payload_delay,
+            )
             if time > k.t1 and not last:
                 next.due = wp.min(next.due, time)
                 break
             s = (time - k.t0) / span
-            out[2 * vehicles + next.payload, lane] = see_point(x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span))
+            out[2 * vehicles + next.payload, lane] = see_point(
+                x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span)
+            )
             next.payload = next.payload + 1
         while next.gyro < windows.gyro_count[w]:
-            time = late(x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay)
+            time = late(
+                x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay
+            )
             if time > k.t1 and not last:
                 next.due = wp.min(next.due, time)
                 break
             s = (time - k.t0) / span
-            bend = b.rate_b - a.rate_b - (a.rate_b - before)  # a parabola through three ends of steps
+            bend = (
+                b.rate_b - a.rate_b - (a.rate_b - before)
+            )  # a parabola through three ends of steps
             turning = a.rate_b + s * (b.rate_b - a.rate_b) - real(0.5) * s * (real(1.0) - s) * bend
             out[2 * vehicles + payloads + next.gyro, lane] = see_rate(x, turning)
             next.gyro = next.gyro + 1
         return next
 
     @wp.func
-    def copy_samples(windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)):
+    def copy_samples(
+        windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)
+    ):
         """What was seen before a lane leaves another."""
         vehicles = windows.vehicle_count[w]
         for i in range(2 * at.vehicle):

@@ -1,1 +1,3 @@
-"""Rope, payload and release: the chain's recursion, its coupling to the vehicle, and the ballistic flight."""
+"""Rope, payload and release: the chain's recursion, its coupling to the vehicle, and the ballistic
+flight.
+"""

@@ -1,31 +1,36 @@
-"""Rope and payload as a chain of slender rods below the vehicle: O(n) recursion with 3x3 matrices, linearly implicit.
+"""Rope and payload as a chain of slender rods below the vehicle:
 
-A slender rod on a frictionless universal joint passes a force and no moment. Seen from its upper joint, everything below
-rod i therefore asks for a force ``A a + b`` (A: symmetric apparent mass, a: acceleration of the joint). For rod i with
-direction n (from the upper joint outwards), ``u = dn/dt``, length l, mass m, centre of mass c along n, transverse
-inertia J about the upper joint, external force f at its centre, joint couples tau, and ``A, b`` of what hangs at its end,
-with ``dn'/dt = beta - |u|^2 n``:
+O(n) recursion with 3x3 matrices, linearly implicit.
 
-    (J I + l^2 P A P) beta = P [g - B a],   B = c m I + l A,   g = c f - l b + l^2 |u|^2 A n + tau x n
-    A' = m I + A - B Q B,   b' = b - f - |u|^2 B n + B Q g
+A slender rod on a frictionless universal joint passes a force and no moment. Seen from its upper
+joint, everything below rod i therefore asks for a force ``A a + b`` (A: symmetric apparent mass, a:
+acceleration of the joint). For rod i with direction n (from the upper joint outwards), ``u =
+dn/dt``, length l, mass m, centre of mass c along n, transverse inertia J about the upper joint,
+external force f at its centre, joint couples tau, and ``A, b`` of what hangs at its end, with
+``dn'/dt = beta - |u|^2 n``:
 
-where Q is the inverse of the left matrix in the plane normal to n. Each rod is solved in a tangent basis (e1, e2) of n:
-with ``b_k = B e_k`` and the 2x2 inverse q, ``c_k = sum_j q_kj b_j`` gives ``B Q B = sum_k b_k c_k^T`` and
-``beta = sum_k e_k (h_k - c_k . a)``. Derivation: Newton and Euler for one rod about its upper joint (Featherstone,
-*Rigid Body Dynamics Algorithms*, ch. 7, with a 2-dof joint that transmits no moment).
+    (J I + l^2 P A P) beta = P [g - B a],   B = c m I + l A,   g = c f - l b + l^2 |u|^2 A n + tau x
+    n A' = m I + A - B Q B,   b' = b - f - |u|^2 B n + B Q g
 
-Time integration (ROS2 of Verwer et al., SIAM J. Sci. Comput. 20, 1999, as a W-method): the Jacobian is approximated rod
-by rod by its geometric stiffness K (tension times arm) and its joint damping D, which only adds
-``gamma h D + gamma^2 h^2 K`` to J; any approximation keeps second order. With k1 the first stage, ``n2 = n + h (u + gamma h
-k1)``, ``u2 = u + h k1`` the predicted state and z the solution of the same recursion there, from ``(I - gh J) k2 = f2 - 2 k1``
-with ``z = k2 + 2 k1`` and gh = gamma h::
+where Q is the inverse of the left matrix in the plane normal to n. Each rod is solved in a tangent
+basis (e1, e2) of n: with ``b_k = B e_k`` and the 2x2 inverse q, ``c_k = sum_j q_kj b_j`` gives ``B
+Q B = sum_k b_k c_k^T`` and ``beta = sum_k e_k (h_k - c_k . a)``. Derivation: Newton and Euler for
+one rod about its upper joint (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7, with a 2-dof
+joint that transmits no moment).
+
+Time integration (ROS2 of Verwer et al., SIAM J. Sci. Comput. 20, 1999, as a W-method): the Jacobian
+is approximated rod by rod by its geometric stiffness K (tension times arm) and its joint damping D,
+which only adds ``gamma h D + gamma^2 h^2 K`` to J; any approximation keeps second order. With k1
+the first stage, ``n2 = n + h (u + gamma h k1)``, ``u2 = u + h k1`` the predicted state and z the
+solution of the same recursion there, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1`` and
+gh = gamma h::
 
     u+ = u + h/2 (k1 + z),   n+ = n + h/2 (u + u2 + gamma h (z - k1))
 
-In a rope that gives every rod lengthens with the pull at the mount (equations: :class:`sim.params.RopeParams`). With l the length
-of a rod and l' its growth, its lower end moves at ``l u + l' n`` and is accelerated by ``2 l' u`` besides; what hangs there and the
-rod's own mass take part in it.
-"""
+In a rope that gives every rod lengthens with the pull at the mount (equations:
+:class:`sim.params.RopeParams`). With l the length of a rod and l' its growth, its lower end moves
+at ``l u + l' n`` and is accelerated by ``2 l' u`` besides; what hangs there and the rod's own mass
+take part in it."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +43,9 @@ from sim.kernels.structs import Types
 
 @wp.func
 def sym_mul(d: Any, o: Any, v: Any):
-    """Product of the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)`` and a vector."""
+    """Product of the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)``
+    and a vector.
+    """
     return type(v)(
         d[0] * v[0] + o[0] * v[1] + o[1] * v[2],
         o[0] * v[0] + d[1] * v[1] + o[2] * v[2],
@@ -55,7 +62,9 @@ def tangent_basis(n: Any):
         sign = -one
     a = -one / (sign + n[2])
     b = n[0] * n[1] * a
-    return type(n)(one + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), type(n)(b, sign + n[1] * n[1] * a, -n[1])
+    return type(n)(one + sign * n[0] * n[0] * a, sign * b, -sign * n[0]), type(n)(
+        b, sign + n[1] * n[1] * a, -n[1]
+    )
 
 
 @wp.func
@@ -70,7 +79,9 @@ def growing(rope: Any, u: Any):
     return (type(rope.strain_rate)(2.0) * rope.strain_rate * rope.segment_length) * u
 
 
-def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset()) -> SimpleNamespace:
+def build_chain(
+    t: Types, segments: int, extensions: frozenset[str] = frozenset()
+) -> SimpleNamespace:
     """Recursion for a fixed number of segments.
 
     Args:
@@ -79,22 +90,29 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
 
     Returns:
-        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and force of the whole chain
-        at the mount, at the state and at the predicted state), ``down_first`` (root to leaf: first stage k1 and predicted
-        directions n2), ``down_second`` (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the
-        first stage alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear momentum
-        relative to the mount), ``stretched(natural, now, stiffness, u, h)`` (the rope under its pull, ``now`` what it was h
-        seconds before; with h 0 it is at rest).
+        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and
+        force of the whole chain at the mount, at the state and at the predicted state),
+        ``down_first`` (root to leaf: first stage k1 and predicted directions n2), ``down_second``
+        (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
+        alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear
+        momentum relative to the mount), ``stretched(natural, now, stiffness, u, h)`` (the rope
+        under its pull, ``now`` what it was h seconds before; with h 0 it is at rest).
     """
     L = segments
     real, vec3, Rope = t.real, t.vec3, t.Rope
     vec2 = wp.types.vector(2, real)
     last = L - 1
-    loaded, rubbing, giving = bool(extensions & LOADS), "mount_damping" in extensions, "compliance" in extensions
+    loaded, rubbing, giving = (
+        bool(extensions & LOADS),
+        "mount_damping" in extensions,
+        "compliance" in extensions,
+    )
 
     @wp.func
     def with_load(i: int, at: vec3, arm: real, load: vec3):
-        """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod alone."""
+        """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod
+        alone.
+        """
         if wp.static(loaded):
             if i == last:
                 return at + arm * load
@@ -102,7 +120,9 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def upper_damping(rope: Rope, i: int):
-        """Damping of the upper joint of rod i [N m s], with the mount's friction in the uppermost."""
+        """Damping of the upper joint of rod i [N m s], with the mount's friction in the
+        uppermost.
+        """
         if wp.static(rubbing):
             if i == 0:
                 return rope.joint_damping + rope.mount_damping
@@ -122,7 +142,9 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def rod(rope: Rope, i: int):
-        """Mass, centre along n, transverse inertia about the upper joint of rod i; the last one carries the payload."""
+        """Mass, centre along n, transverse inertia about the upper joint of rod i; the last one
+        carries the payload.
+        """
         if i == L - 1:
             return rope.last_mass, rope.last_center, rope.last_inertia
         return rope.segment_mass, real(0.5) * rope.segment_length, rope.segment_inertia
@@ -145,10 +167,21 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
         @wp.func
         def up(
-            rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), n2: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3), stiffness: wp.array(dtype=real), root_rate_w: vec3, gravity: vec3, load: vec3,
-            gamma: real, h: real, c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2),
-        ):  # fmt: skip
+            rope: Rope,
+            n: wp.array(dtype=vec3),
+            u: wp.array(dtype=vec3),
+            n2: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3),
+            stiffness: wp.array(dtype=real),
+            root_rate_w: vec3,
+            gravity: vec3,
+            load: vec3,
+            gamma: real,
+            h: real,
+            c1: wp.array(dtype=vec3),
+            c2: wp.array(dtype=vec3),
+            hs: wp.array(dtype=vec2),
+        ):
             l = rope.segment_length
             l2 = l * l
             gh = gamma * h
@@ -181,7 +214,10 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 cm = c * m
                 g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
                 if wp.static(second):
-                    g += gh * stiffness[i] * ui + two * gh * (stiffness[i] * (two * gh - h) + damping) * k1[i]
+                    g += (
+                        gh * stiffness[i] * ui
+                        + two * gh * (stiffness[i] * (two * gh - h) + damping) * k1[i]
+                    )
                 else:
                     g += -gh * stiffness[i] * ui
                 g = with_load(i, g, rope.payload_arm, load)
@@ -213,9 +249,19 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
                 g2 = wp.dot(e2, g)
                 h1 = s22 * g1 - s12 * g2
                 h2 = s11 * g2 - s12 * g1
-                b = b - with_load(i, f, real(1.0), load) - speed2 * (cm * ni + l * a_n) + h1 * b1 + h2 * b2
+                b = (
+                    b
+                    - with_load(i, f, real(1.0), load)
+                    - speed2 * (cm * ni + l * a_n)
+                    + h1 * b1
+                    + h2 * b2
+                )
                 d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
-                o = o - vec3(b1[0] * q1[1] + b2[0] * q2[1], b1[0] * q1[2] + b2[0] * q2[2], b1[1] * q1[2] + b2[1] * q2[2])
+                o = o - vec3(
+                    b1[0] * q1[1] + b2[0] * q2[1],
+                    b1[0] * q1[2] + b2[0] * q2[2],
+                    b1[1] * q1[2] + b2[1] * q2[2],
+                )
                 c1[i] = q1
                 c2[i] = q2
                 hs[i] = vec2(h1, h2)
@@ -226,7 +272,13 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
             return d, o, b
 
         @wp.func
-        def speed(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real):
+        def speed(
+            rope: Rope,
+            mount_vel_w: vec3,
+            u: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3),
+            h: real,
+        ):
             """Velocity of the payload's centre [m/s], world frame."""
             vel = mount_vel_w
             for i in range(L):
@@ -246,11 +298,21 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def down_first(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), mount_acc_w: vec3, gamma: real, h: real,
-        c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2), n2: wp.array(dtype=vec3),
+        rope: Rope,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        mount_acc_w: vec3,
+        gamma: real,
+        h: real,
+        c1: wp.array(dtype=vec3),
+        c2: wp.array(dtype=vec3),
+        hs: wp.array(dtype=vec2),
+        n2: wp.array(dtype=vec3),
         k1: wp.array(dtype=vec3),
-    ):  # fmt: skip
-        """Fill k1 and n2; return the largest squared rate [1/s^2] of the state and the predicted state."""
+    ):
+        """Fill k1 and n2; return the largest squared rate [1/s^2] of the state and the predicted
+        state.
+        """
         a = mount_acc_w
         fastest = real(0.0)
         for i in range(L):
@@ -266,12 +328,25 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
 
     @wp.func
     def down_second(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real),
-        mount_acc_w: vec3, mount_force_w: vec3, gravity: vec3, load: vec3, gamma: real, h: real,
-        c1: wp.array(dtype=vec3), c2: wp.array(dtype=vec3), hs: wp.array(dtype=vec2), n2: wp.array(dtype=vec3),
+        rope: Rope,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        mount_acc_w: vec3,
+        mount_force_w: vec3,
+        gravity: vec3,
+        load: vec3,
+        gamma: real,
+        h: real,
+        c1: wp.array(dtype=vec3),
+        c2: wp.array(dtype=vec3),
+        hs: wp.array(dtype=vec2),
+        n2: wp.array(dtype=vec3),
         k1: wp.array(dtype=vec3),
-    ):  # fmt: skip
-        """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return the new momentum."""
+    ):
+        """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return
+        the new momentum.
+        """
         a = mount_acc_w
         pull = mount_force_w
         l = rope.segment_length
@@ -302,15 +377,29 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
         return total
 
     @wp.func
-    def fall_back(n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), h: real, n2: wp.array(dtype=vec3), k1: wp.array(dtype=vec3)):
-        """Advance n and u by the first stage alone, linearly implicit Euler; the stiffness stays."""
+    def fall_back(
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        h: real,
+        n2: wp.array(dtype=vec3),
+        k1: wp.array(dtype=vec3),
+    ):
+        """Advance n and u by the first stage alone, linearly implicit Euler; the
+        stiffness stays.
+        """
         for i in range(L):
             new_u = u[i] + h * k1[i]
             n[i] = n2[i]
             u[i] = new_u - n2[i] * wp.dot(n2[i], new_u)
 
     @wp.func
-    def payload(rope: Rope, mount_pos_w: vec3, mount_vel_w: vec3, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
+    def payload(
+        rope: Rope,
+        mount_pos_w: vec3,
+        mount_vel_w: vec3,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+    ):
         pos = mount_pos_w
         vel = mount_vel_w
         for i in range(L):
@@ -338,37 +427,68 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str] = frozenset(
     def pull(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
         """Force [N] along the rope at the mount.
 
-        Of many rods from the geometric stiffness of the first (tension times length): half of what that rod itself weighs and swings
-        by is left out. Of a single one what it and the payload weigh, and what keeps them on their circle.
-        """
+        Of many rods from the geometric stiffness of the first (tension times length): half of what
+        that rod itself weighs and swings by is left out. Of a single one what it and the payload
+        weigh, and what keeps them on their circle."""
         if wp.static(L > 1):
             return stiffness[0] / rope.segment_length
         else:
-            return stiffness[0] / rope.last_center + rope.last_mass * rope.last_center * wp.dot(u[0], u[0])
+            return stiffness[0] / rope.last_center + rope.last_mass * rope.last_center * wp.dot(
+                u[0], u[0]
+            )
 
     @wp.func
-    def stretched(natural: Rope, now: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3), h: real):
+    def stretched(
+        natural: Rope, now: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3), h: real
+    ):
         if wp.static(giving):
             if natural.compliance != real(0.0):
                 out = natural
                 one = real(1.0)
                 tension = wp.max(pull(now, stiffness, u), real(0.0))
-                out.strain = natural.compliance * tension / (natural.segment_length * real(float(L)))
+                out.strain = (
+                    natural.compliance * tension / (natural.segment_length * real(float(L)))
+                )
                 if h > real(0.0):
                     out.strain_rate = (out.strain - now.strain) / (h * (one + out.strain))
                 out.segment_length = natural.segment_length * (one + out.strain)
                 longer = out.segment_length - natural.segment_length
-                rope_part = natural.segment_mass * natural.segment_length * natural.segment_length / real(3.0)
-                out.segment_inertia = natural.segment_inertia * (one + out.strain) * (one + out.strain)
+                rope_part = (
+                    natural.segment_mass
+                    * natural.segment_length
+                    * natural.segment_length
+                    / real(3.0)
+                )
+                out.segment_inertia = (
+                    natural.segment_inertia * (one + out.strain) * (one + out.strain)
+                )
                 out.payload_arm = natural.payload_arm + longer
                 out.last_center = natural.last_center + natural.stretched_share * longer
-                ball = natural.payload_mass * (out.payload_arm * out.payload_arm - natural.payload_arm * natural.payload_arm)
-                out.last_inertia = natural.last_inertia + rope_part * ((one + out.strain) * (one + out.strain) - one) + ball
+                ball = natural.payload_mass * (
+                    out.payload_arm * out.payload_arm - natural.payload_arm * natural.payload_arm
+                )
+                out.last_inertia = (
+                    natural.last_inertia
+                    + rope_part * ((one + out.strain) * (one + out.strain) - one)
+                    + ball
+                )
                 return out
         return now
 
     return SimpleNamespace(
-        up_first=up_first, up_second=up_second, down_first=down_first, down_second=down_second, fall_back=fall_back, payload=payload,
-        speed_first=speed_first, speed_second=speed_second, momentum=momentum, upper_damping=upper_damping,
-        com_velocity=com_velocity, pull=pull, stretched=stretched, segments=L, vec2=vec2,
-    )  # fmt: skip
+        up_first=up_first,
+        up_second=up_second,
+        down_first=down_first,
+        down_second=down_second,
+        fall_back=fall_back,
+        payload=payload,
+        speed_first=speed_first,
+        speed_second=speed_second,
+        momentum=momentum,
+        upper_damping=upper_damping,
+        com_velocity=com_velocity,
+        pull=pull,
+        stretched=stretched,
+        segments=L,
+        vec2=vec2,
+    )

@@ -1,4 +1,6 @@
-"""One integration step of the vehicle with the chain as one body: root solve, ROS2 stages, momentum, fall-back."""
+"""One integration step of the vehicle with the chain as one body: root solve, ROS2 stages,
+momentum, fall-back.
+"""
 
 from types import SimpleNamespace
 
@@ -10,16 +12,27 @@ from sim.kernels.structs import Types
 
 
 def build_root(t: Types):
-    """Solve for the root's acceleration, given what the chain asks for (``sim.kernels.rope.chain``).
+    """Solve for the root's acceleration, given what the chain asks for
+    (``sim.kernels.rope.chain``).
 
-    Returns a Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` -> acceleration of the centre of mass [m/s^2,
-    world], angular acceleration [rad/s^2, body], acceleration of the mount [world], force on the chain [N, world].
-    """
+    Returns a Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` ->
+    acceleration of the centre of mass [m/s^2, world], angular acceleration [rad/s^2, body],
+    acceleration of the mount [world], force on the chain [N, world]."""
     vec3, mat33, Vehicle, Rope, QuadState = t.vec3, t.mat33, t.Vehicle, t.Rope, t.QuadState
     real = t.real
 
     @wp.func
-    def root(p: Vehicle, rope: Rope, s: QuadState, force_b: vec3, torque_b: vec3, d: vec3, o: vec3, b: vec3, gravity: vec3):
+    def root(
+        p: Vehicle,
+        rope: Rope,
+        s: QuadState,
+        force_b: vec3,
+        torque_b: vec3,
+        d: vec3,
+        o: vec3,
+        b: vec3,
+        gravity: vec3,
+    ):
         r = rope.mount
         rot = wp.quat_to_matrix(s.quat_wb)
         inv_mass = real(1.0) / p.body.mass
@@ -27,8 +40,14 @@ def build_root(t: Types):
         acc = inv_mass * (rot * force_b) + gravity
         free = acc + rot * (wp.cross(alpha, r) + wp.cross(s.rate_b, wp.cross(s.rate_b, r)))
         arm = rot * wp.skew(r)
-        inv_inertia = vec3(real(1.0) / p.body.inertia[0], real(1.0) / p.body.inertia[1], real(1.0) / p.body.inertia[2])
-        mobility = wp.diag(vec3(inv_mass, inv_mass, inv_mass)) + arm * wp.diag(inv_inertia) * wp.transpose(arm)
+        inv_inertia = vec3(
+            real(1.0) / p.body.inertia[0],
+            real(1.0) / p.body.inertia[1],
+            real(1.0) / p.body.inertia[2],
+        )
+        mobility = wp.diag(vec3(inv_mass, inv_mass, inv_mass)) + arm * wp.diag(
+            inv_inertia
+        ) * wp.transpose(arm)
         mass = mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
         eye = wp.diag(vec3(real(1.0), real(1.0), real(1.0)))
         mount_acc = wp.inverse(eye + mobility * mass) * (free - mobility * b)
@@ -40,16 +59,25 @@ def build_root(t: Types):
     return root
 
 
-def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespace, payload: SimpleNamespace, extensions: frozenset[str]):
+def build_coupled_step(
+    t: Types,
+    flow,
+    rate,
+    motor_advance,
+    chain: SimpleNamespace,
+    payload: SimpleNamespace,
+    extensions: frozenset[str],
+):
     """One step of h seconds of vehicle and chain.
 
-    The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The velocity of the root
-    follows from the total linear momentum, which external forces alone change; so it is conserved to round-off.
-    Where a rod turns more than ``max_turn`` in the step, the first stage alone (linearly implicit Euler) is kept. Returns a namespace of
-    Warp functions ``step`` (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in place),
-    ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear momentum [N s]), ``mount_velocity`` [m/s] and
-    ``payload`` (position and velocity of its centre, world frame).
-    """
+    The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The
+    velocity of the root follows from the total linear momentum, which external forces alone change;
+    so it is conserved to round-off. Where a rod turns more than ``max_turn`` in the step, the first
+    stage alone (linearly implicit Euler) is kept. Returns a namespace of Warp functions ``step``
+    (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in
+    place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
+    momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its centre,
+    world frame)."""
     vec3, vec4, real = t.vec3, t.vec4, t.real
     Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow
     vec2, L, loaded = chain.vec2, chain.segments, bool(extensions & LOADS)
@@ -61,18 +89,28 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
 
     @wp.func
     def payload_state(rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
-        return chain.payload(rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u)
+        return chain.payload(
+            rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u
+        )
 
     def build_load(speed):
         @wp.func
         def load(
-            rope: Rope, air: Air, s: QuadState, f: Flow, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3), h: real,
-        ):  # fmt: skip
+            rope: Rope,
+            air: Air,
+            s: QuadState,
+            f: Flow,
+            n: wp.array(dtype=vec3),
+            u: wp.array(dtype=vec3),
+            k1: wp.array(dtype=vec3),
+            h: real,
+        ):
             """Force on the payload [N], world frame."""
             if wp.static(loaded):
                 jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
-                return payload.hanging(rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[L - 1], jet)
+                return payload.hanging(
+                    rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[L - 1], jet
+                )
             else:
                 return vec3()
 
@@ -82,11 +120,17 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
 
     @wp.func
     def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):
-        return p.body.mass * s.vel_w + rope.total_mass * mount_velocity(rope, s) + chain.momentum(rope, u)
+        return (
+            p.body.mass * s.vel_w
+            + rope.total_mass * mount_velocity(rope, s)
+            + chain.momentum(rope, u)
+        )
 
     @wp.func
     def root_velocity(p: Vehicle, rope: Rope, s: QuadState, total: vec3, relative: vec3):
-        """Velocity of the vehicle from the total momentum and the chain's own relative to the mount."""
+        """Velocity of the vehicle from the total momentum and the chain's own relative to the
+        mount.
+        """
         turn = wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
         return (total - rope.total_mass * turn - relative) / (p.body.mass + rope.total_mass)
 
@@ -97,9 +141,20 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
 
     @wp.func
     def step(
-        p: Vehicle, rope: Rope, air: Air, s: QuadState, total: vec3, command: vec4, n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3), stiffness: wp.array(dtype=real), gravity: vec3, gamma: real, max_turn: real, h: real,
-    ):  # fmt: skip
+        p: Vehicle,
+        rope: Rope,
+        air: Air,
+        s: QuadState,
+        total: vec3,
+        command: vec4,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        gravity: vec3,
+        gamma: real,
+        max_turn: real,
+        h: real,
+    ):
         k1 = wp.zeros(shape=(L,), dtype=vec3)
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
@@ -111,7 +166,9 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         f1 = flow(p, air, s, command)
         rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
         load1 = load_first(rope, air, s, f1, n, u, k1, h)
-        d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, rate_w, gravity, load1, gamma, h, c1, c2, hs)
+        d, o, b = chain.up_first(
+            rope, n, u, n2, k1, stiffness, rate_w, gravity, load1, gamma, h, c1, c2, hs
+        )
         torque = f1.torque_b + damping_torque(rope, s, rate_w, n[0], u[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f1.force_b, torque, d, o, b, gravity)
         fastest = chain.down_first(rope, n, u, mount_acc, gamma, h, c1, c2, hs, n2, k1)
@@ -131,14 +188,20 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         f2 = flow(p, air, s2, command)
         rate_w = wp.quat_rotate(s2.quat_wb, s2.rate_b)
         load2 = load_second(rope, air, s2, f2, n2, u, k1, h)
-        d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs)
+        d, o, b = chain.up_second(
+            rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs
+        )
         torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)
-        relative = chain.down_second(rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1)
+        relative = chain.down_second(
+            rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1
+        )
         r2 = rate(p, s2, f2, acc_w, alpha_b)
         out = advance(s, blend(r1, half, r2, half), h)
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
-        new_total = total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
+        new_total = (
+            total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
+        )
         if wp.static(loaded):
             new_total += (half * h) * (load1 + load2)
         out.vel_w = root_velocity(p, rope, out, new_total, relative)
@@ -160,4 +223,10 @@ def build_coupled_step(t: Types, flow, rate, motor_advance, chain: SimpleNamespa
         out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
         return out
 
-    return SimpleNamespace(step=step, step_alone=step_alone, mount_velocity=mount_velocity, momentum=momentum, payload=payload_state)
+    return SimpleNamespace(
+        step=step,
+        step_alone=step_alone,
+        mount_velocity=mount_velocity,
+        momentum=momentum,
+        payload=payload_state,
+    )

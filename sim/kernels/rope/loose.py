@@ -1,4 +1,6 @@
-"""Rope and payload in free flight after the release: the chain of :mod:`sim.kernels.rope.chain` without a vehicle."""
+"""Rope and payload in free flight after the release: the chain of :mod:`sim.kernels.rope.chain`
+without a vehicle.
+"""
 
 import warp as wp
 
@@ -8,10 +10,10 @@ from sim.kernels.structs import Types
 def build_loose_step(t: Types, chain, payload):
     """One ROS2 step of a rope that nothing holds.
 
-    The root's acceleration a follows from ``A a + b = 0``: nothing pulls at the upper end. As in the coupled step the
-    root's velocity follows from the total momentum. Returns a Warp function ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity,
-    gamma, max_turn, h)`` -> position and velocity of the upper end; the arrays n, u and stiffness change in place.
-    """
+    The root's acceleration a follows from ``A a + b = 0``: nothing pulls at the upper end. As in
+    the coupled step the root's velocity follows from the total momentum. Returns a Warp function
+    ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity, gamma, max_turn, h)`` -> position and
+    velocity of the upper end; the arrays n, u and stiffness change in place."""
     vec3, mat33, real, Rope, Air = t.vec3, t.mat33, t.real, t.Rope, t.Air
     vec2, L = chain.vec2, chain.segments
 
@@ -21,9 +23,18 @@ def build_loose_step(t: Types, chain, payload):
 
     @wp.func
     def step(
-        rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real), gravity: vec3, gamma: real, max_turn: real, h: real,
-    ):  # fmt: skip
+        rope: Rope,
+        air: Air,
+        pos_w: vec3,
+        vel_w: vec3,
+        n: wp.array(dtype=vec3),
+        u: wp.array(dtype=vec3),
+        stiffness: wp.array(dtype=real),
+        gravity: vec3,
+        gamma: real,
+        max_turn: real,
+        h: real,
+    ):
         k1 = wp.zeros(shape=(L,), dtype=vec3)
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
@@ -33,7 +44,22 @@ def build_loose_step(t: Types, chain, payload):
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
         load1 = payload.free(rope, air, chain.speed_first(rope, vel_w, u, k1, h))
         # a root that turns with the first rod rubs on nothing
-        d, o, b = chain.up_first(rope, n, u, n2, k1, stiffness, wp.cross(n[0], u[0]), gravity, load1, gamma, h, c1, c2, hs)
+        d, o, b = chain.up_first(
+            rope,
+            n,
+            u,
+            n2,
+            k1,
+            stiffness,
+            wp.cross(n[0], u[0]),
+            gravity,
+            load1,
+            gamma,
+            h,
+            c1,
+            c2,
+            hs,
+        )
         acc = free_root(d, o, b)
         fastest = chain.down_first(rope, n, u, acc, gamma, h, c1, c2, hs, n2, k1)
         weight = rope.total_mass * gravity
@@ -44,9 +70,13 @@ def build_loose_step(t: Types, chain, payload):
         predicted = vel_w + h * acc
         load2 = payload.free(rope, air, chain.speed_second(rope, predicted, u, k1, h))
         turn = wp.cross(n2[0], u[0] + h * k1[0])
-        d, o, b = chain.up_second(rope, n, u, n2, k1, stiffness, turn, gravity, load2, gamma, h, c1, c2, hs)
+        d, o, b = chain.up_second(
+            rope, n, u, n2, k1, stiffness, turn, gravity, load2, gamma, h, c1, c2, hs
+        )
         acc = free_root(d, o, b)
-        relative = chain.down_second(rope, n, u, stiffness, acc, vec3(), gravity, load2, gamma, h, c1, c2, hs, n2, k1)
+        relative = chain.down_second(
+            rope, n, u, stiffness, acc, vec3(), gravity, load2, gamma, h, c1, c2, hs, n2, k1
+        )
         vel = (total + h * weight + (half * h) * (load1 + load2) - relative) / rope.total_mass
         return pos_w + (half * h) * (vel_w + vel), vel
 

@@ -1,4 +1,7 @@
-"""Forces on the payload besides its weight and the rope. Equations: :class:`sim.params.RopeParams`."""
+"""Forces on the payload besides its weight and the rope.
+
+Equations: :class:`sim.params.RopeParams`.
+"""
 
 from types import SimpleNamespace
 
@@ -6,16 +9,22 @@ import warp as wp
 
 from sim.kernels.structs import Types
 
-LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})  # extensions that push at the payload
+LOADS = frozenset(
+    {"payload_drag", "swing_damping", "downwash", "push"}
+)  # extensions that push at the payload
 
 
 def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
-    """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws on it included."""
+    """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws
+    on it included.
+    """
     Rope, Air, vec3, real, in_flight = t.Rope, t.Air, t.vec3, t.real, laws.in_flight
 
     @wp.func
     def flight_acceleration(rope: Rope, air: Air, vel_w: vec3, gravity: vec3):
-        return gravity + (payload.free(rope, air, vel_w) + in_flight(air, vel_w)) * (real(1.0) / rope.payload_mass)
+        return gravity + (payload.free(rope, air, vel_w) + in_flight(air, vel_w)) * (
+            real(1.0) / rope.payload_mass
+        )
 
     return flight_acceleration
 
@@ -23,9 +32,9 @@ def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
 def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     """Functions of the payload's forces for a choice of extensions.
 
-    Returns a namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N] (``along_w`` the last segment's direction,
-    ``jet_w`` the force of the rotors on the air [N]) and ``free(rope, air, vel_w)`` [N] in flight.
-    """
+    Returns a namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N]
+    (``along_w`` the last segment's direction, ``jet_w`` the force of the rotors on the air [N]) and
+    ``free(rope, air, vel_w)`` [N] in flight."""
     Rope, Air, vec3 = t.Rope, t.Air, t.vec3
 
     @wp.func

@@ -1,7 +1,7 @@
 """Release and ballistic flight: closed-form landing, time to impact, clearance to the vehicle.
 
-Source: the paper, Sec. III-B (projectile without drag) and Eq. 5 (clearance at K fractions of the flight).
-"""
+Source: the paper, Sec. III-B (projectile without drag) and Eq. 5 (clearance at K fractions of the
+flight)."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -11,16 +11,22 @@ import warp as wp
 from sim.kernels.structs import Types
 
 FLIGHT_STEP = 0.02
-"""Largest step of a flight under drag [s]: RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it)."""
-FLIGHT_STEPS = 500  # steps after which a payload that has not come down counts as one that never will
+"""Largest step of a flight under drag [s]:
+
+RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it).
+"""
+FLIGHT_STEPS = (
+    500  # steps after which a payload that has not come down counts as one that never will
+)
 
 
 @wp.func
 def time_to_height(rope: Any, air: Any, pos_w: Any, vel_w: Any, height: Any, gravity: Any):
-    """Time [s] at which a projectile comes down to ``height`` [m]; 0 where it never reaches it; ``gravity``: magnitude [m/s^2].
+    """Time [s] at which a projectile comes down to ``height`` [m]; 0 where it never reaches it;
+    ``gravity``: magnitude [m/s^2].
 
-    Neither rope nor air counts in this module's functions; under drag they do (:func:`build_ballistic`).
-    """
+    Neither rope nor air counts in this module's functions; under drag they do
+    (:func:`build_ballistic`)."""
     zero = height - height
     two = type(height)(2.0)
     root = wp.max(vel_w[2] * vel_w[2] + two * gravity * (pos_w[2] - height), zero)
@@ -35,22 +41,35 @@ def projectile(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity: Any, time: 
 
 
 @wp.func
-def clearance(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity: Any, time: Any, vehicle_w: Any, samples: int):
-    """Least distance [m] of the flight to a point, at ``samples`` equal fractions of ``time`` from 0 to 1."""
+def clearance(
+    rope: Any,
+    air: Any,
+    pos_w: Any,
+    vel_w: Any,
+    gravity: Any,
+    time: Any,
+    vehicle_w: Any,
+    samples: int,
+):
+    """Least distance [m] of the flight to a point, at ``samples`` equal fractions of ``time`` from
+    0 to 1.
+    """
     least = wp.length(pos_w - vehicle_w)
     for k in range(1, samples):
         s = time * type(time)(float(k)) / type(time)(float(samples - 1))
-        least = wp.min(least, wp.length(projectile(rope, air, pos_w, vel_w, gravity, s) - vehicle_w))
+        least = wp.min(
+            least, wp.length(projectile(rope, air, pos_w, vel_w, gravity, s) - vehicle_w)
+        )
     return least
 
 
 def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     """How the payload leaves. Equations: :class:`sim.params.ReleaseParams`.
 
-    Returns a namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull at the latch [N], and the payload's
-    velocity [m/s] after ``kick(r, vel_w, along_w)`` with the last segment's direction and after ``tail(r, vel_w, com_vel_w)`` with the
-    velocity of the common centre of mass of payload and rope. Each does only what ``extensions`` name.
-    """
+    Returns a namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull
+    at the latch [N], and the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the
+    last segment's direction and after ``tail(r, vel_w, com_vel_w)`` with the velocity of the common
+    centre of mass of payload and rope. Each does only what ``extensions`` name."""
     real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
 
     @wp.func
@@ -62,17 +81,24 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
 
     @wp.func
     def kick(r: Release, vel_w: vec3, along_w: vec3):
-        return vel_w + r.kick_w + r.kick_along * along_w if wp.static("kick" in extensions) else vel_w
+        return (
+            vel_w + r.kick_w + r.kick_along * along_w if wp.static("kick" in extensions) else vel_w
+        )
 
     @wp.func
     def tail(r: Release, vel_w: vec3, com_vel_w: vec3):
-        return vel_w + r.rope_tail * (com_vel_w - vel_w) if wp.static("rope_tail" in extensions) else vel_w
+        return (
+            vel_w + r.rope_tail * (com_vel_w - vel_w)
+            if wp.static("rope_tail" in extensions)
+            else vel_w
+        )
 
     return SimpleNamespace(lag=lag, kick=kick, tail=tail)
 
 
 def build_step_in_flight(t: Types, acceleration):
-    """Return ``step(rope, air, pos_w, vel_w, gravity_w, h)``: position and velocity of the payload alone after h seconds, by RK4.
+    """Return ``step(rope, air, pos_w, vel_w, gravity_w, h)``: position and velocity of the payload
+    alone after h seconds, by RK4.
 
     Args:
         t: types of the wanted precision.
@@ -92,7 +118,9 @@ def build_step_in_flight(t: Types, acceleration):
         a4 = acceleration(rope, air, v4, gravity_w)
         sixth = h / real(6.0)
         two = real(2.0)
-        return pos_w + sixth * (vel_w + two * v2 + two * v3 + v4), vel_w + sixth * (a1 + two * a2 + two * a3 + a4)
+        return pos_w + sixth * (vel_w + two * v2 + two * v3 + v4), vel_w + sixth * (
+            a1 + two * a2 + two * a3 + a4
+        )
 
     return step
 
@@ -107,8 +135,9 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
 
     Returns:
         Namespace of Warp functions ``time_to_height(rope, air, pos, vel, height, gravity)`` [s],
-        ``after(rope, air, pos, vel, gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity, time, vehicle_w,
-        samples)`` [m], each with the arguments of the functions of the same names in this module.
+        ``after(rope, air, pos, vel, gravity, time)`` [m], ``clearance(rope, air, pos, vel, gravity,
+        time, vehicle_w, samples)`` [m], each with the arguments of the functions of the same names
+        in this module.
     """
     if not dragging:
         return SimpleNamespace(time_to_height=time_to_height, after=projectile, clearance=clearance)
@@ -151,7 +180,16 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
         return time + share
 
     @wp.func
-    def drag_clearance(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real, vehicle_w: vec3, samples: int):
+    def drag_clearance(
+        rope: Rope,
+        air: Air,
+        pos_w: vec3,
+        vel_w: vec3,
+        gravity: real,
+        time: real,
+        vehicle_w: vec3,
+        samples: int,
+    ):
         least = wp.length(pos_w - vehicle_w)
         pos = pos_w
         vel = vel_w

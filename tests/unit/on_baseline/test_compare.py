@@ -14,7 +14,9 @@ pytest.importorskip("piqp")
 
 
 def test_units_are_cut_into_batches_on_reference_plants_alone():
-    assert [u["throws"] for u in thrower.units("hybrid", "both", 2.0, 2 * BATCH + 1)] == [2 * BATCH + 1]
+    assert [u["throws"] for u in thrower.units("hybrid", "both", 2.0, 2 * BATCH + 1)] == [
+        2 * BATCH + 1
+    ]
     cut = thrower.units("reference", "both", 2.0, 2 * BATCH + 1)
     assert [(u["throws"], u["batch"]) for u in cut] == [(BATCH, 0), (BATCH, 1), (1, 2)]
     assert len({results.key_of(u) for u in cut}) == 3
@@ -36,7 +38,11 @@ def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, 
     assert cli.main([*words, "--out", str(tmp_path), "--json", str(out)]) == 0
     rows = json.loads(out.read_text())["rows"]
     own = thrower.title_of(thrower.OWN, "none")
-    assert [row["policy"] for row in rows] == ["state", own, *(thrower.title_of("hybrid", c) for c in thrower.MADE_UP)]
+    assert [row["policy"] for row in rows] == [
+        "state",
+        own,
+        *(thrower.title_of("hybrid", c) for c in thrower.MADE_UP),
+    ]
     printed = capsys.readouterr().out
     (line,) = [line for line in printed.splitlines() if own in line]
     assert "0.127 ± 0.019" in line, "the paper's TO+MPC stands beside our own-model row"

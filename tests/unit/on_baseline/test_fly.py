@@ -1,4 +1,6 @@
-"""The baseline in flight: controller against closed forms, throws in its own model and on the plants, front and command."""
+"""The baseline in flight: controller against closed forms, throws in its own model and on the
+plants, front and command.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,13 +35,18 @@ from visthrow.training.env import ThrowEnv
 pytest.importorskip("piqp")
 
 OWN_MODEL = 0.05
-"""Landing error in the own model from random starts [m] (measured 0.01): the paper's best is 0.027."""
+"""Landing error in the own model from random starts [m] (measured 0.01): the paper's best is 0.027.
+"""
 
 HYBRID = 0.2
-"""Mean landing error on the training simulator, all its noise and spread on, with all delays made up for [m] (measured 0.135)."""
+"""Mean landing error on the training simulator, all its noise and spread on, with all delays made
+up for [m] (measured 0.135).
+"""
 
 FEED_FORWARD = 0.3
-"""Of the first command against the flat input [N, rad/s]: one is held for 20 ms, the other changes (measured 0.16)."""
+"""Of the first command against the flat input [N, rad/s]: one is held for 20 ms, the other changes
+(measured 0.16).
+"""
 
 CONDENSED = 1e-4
 """Of the first command against a dense solution of the same programme; the solver stops at 1e-6."""
@@ -53,7 +60,13 @@ def experiment() -> Experiment:
 @pytest.fixture(scope="module")
 def plan(experiment):
     return plan_throw(
-        pm.pendulum_of(plant_of(experiment)), 2.0, 1.13, 1.7, PlanParams(), 0.04, lag=experiment.release.lag
+        pm.pendulum_of(plant_of(experiment)),
+        2.0,
+        1.13,
+        1.7,
+        PlanParams(),
+        0.04,
+        lag=experiment.release.lag,
     )
 
 
@@ -65,7 +78,9 @@ def test_controller_on_its_reference_commands_the_feed_forward(plan):
 
 
 def test_controller_solves_its_least_squares():
-    """Near hover without active bounds the programme is linear least squares: solved densely by numpy as well."""
+    """Near hover without active bounds the programme is linear least squares: solved densely by
+    numpy as well.
+    """
     model, params = pm.Pendulum(0.212, 0.06, 0.363), MPCParams(stages=12)
     states, inputs = pm.hover(model, np.tile([0.0, 0.0, 0.95], (13, 1)))
     inputs = inputs[:12]
@@ -142,13 +157,16 @@ def test_training_simulator_with_and_without_compensation(plan, experiment):
     assert flown.success.all()
     assert flown.error.mean() < HYBRID
     lagging = fly_plant(plan, "hybrid", experiment, delays_of(experiment, "delay"), 3)
-    # A tenth of a second at 1.7 m/s past the plan; the single throws' worst moments differ from processor to processor.
+    # A tenth of a second at 1.7 m/s past the plan; the single throws' worst moments differ from
+    # processor to processor.
     assert lagging.position_error.mean() > flown.position_error.mean() + 0.05
     assert lagging.landing_w[:, 0].mean() > flown.landing_w[:, 0].mean()
 
 
 def test_throws_in_the_training_simulator_start_as_the_policies_do(experiment):
-    """Vehicles, ropes and states are those of `protocol.throw` with the same count and seed, to the bit."""
+    """Vehicles, ropes and states are those of `protocol.throw` with the same count and seed, to the
+    bit.
+    """
     start = protocol.hover_start(experiment).task.start
     plant = HybridPlant(experiment, 7, 3, noise=experiment.task.noise, start=start)
     env = ThrowEnv(protocol.hover_start(experiment), "cpu", 3, 7)
@@ -160,11 +178,18 @@ def test_throws_in_the_training_simulator_start_as_the_policies_do(experiment):
 
 
 def test_commands_in_the_training_simulator_are_disturbed(experiment):
-    """In normalised units, by the training's deviations; the same command otherwise (``_disturbed`` alone is asked)."""
+    """In normalised units, by the training's deviations; the same command otherwise (``_disturbed``
+    alone is asked).
+    """
     noise = experiment.task.noise
-    plant = HybridPlant(experiment, 2000, noise=noise, start=protocol.hover_start(experiment).task.start)
+    plant = HybridPlant(
+        experiment, 2000, noise=noise, start=protocol.hover_start(experiment).task.start
+    )
     command = np.tile([3.0, 1.0, -1.0, 0.5], (2000, 1))
-    off = plant._disturbed(command)[:, 1:] / experiment.task.action.max_rate - command[:, 1:] / experiment.task.action.max_rate
+    off = (
+        plant._disturbed(command)[:, 1:] / experiment.task.action.max_rate
+        - command[:, 1:] / experiment.task.action.max_rate
+    )
     expected = np.hypot(noise.command_step, noise.command_bias)
     assert off.std() == pytest.approx(expected, rel=0.05)
     assert abs(off.mean()) < 4 * expected / np.sqrt(off.size)
@@ -202,7 +227,9 @@ def test_delays_by_name(experiment):
 
 
 def test_front_and_hypervolume_by_hand():
-    """Points (1, 3), (2, 1), (3, 2) under the corner (4, 4): the third is beaten; 1 x 1 + 2 x 3 = 7."""
+    """Points (1, 3), (2, 1), (3, 2) under the corner (4, 4): the third is beaten; 1 x 1 + 2 x 3 =
+    7.
+    """
     points = np.array([[3.0, 2.0], [1.0, 3.0], [2.0, 1.0], [5.0, 0.1]])
     assert pareto(points).tolist() == [1, 2, 3]
     assert front.hypervolume(points, (4.0, 4.0)) == pytest.approx(7.0)
@@ -210,23 +237,44 @@ def test_front_and_hypervolume_by_hand():
 
 
 def test_the_sweep_that_the_page_tells_of_is_the_one_on_record():
-    """Settings by plant and bounds, as docs/explanation/evidence.md says them; and the fastest plans' figures there."""
+    """Settings by plant and bounds, as docs/explanation/evidence.md says them; and the fastest
+    plans' figures there.
+    """
     root = Path(__file__).parents[3]
-    text = (root / "docs" / "explanation" / "evidence.md").read_text().split("**Front of agility")[1]
+    text = (
+        (root / "docs" / "explanation" / "evidence.md").read_text().split("**Front of agility")[1]
+    )
     flown = {}
-    for result in results.load(root / "visthrow" / "evidence" / "records" / "throws" / "baseline.json"):
+    for result in results.load(
+        root / "visthrow" / "evidence" / "records" / "throws" / "baseline.json"
+    ):
         u = result.unit
-        if (u["kind"], u["target"], u["throws"]) == ("baseline", 2.0, 10) and u["compensation"] != "delay":
+        if (u["kind"], u["target"], u["throws"]) == ("baseline", 2.0, 10) and u[
+            "compensation"
+        ] != "delay":
             settings = flown.setdefault((u["plant"], u["bounds"]), {})
-            means = tuple(float(result.of(name).mean()) for name in ("duration", "error")) if result.good.any() else (np.inf, np.inf)
+            means = (
+                tuple(float(result.of(name).mean()) for name in ("duration", "error"))
+                if result.good.any()
+                else (np.inf, np.inf)
+            )
             settings[u["speed"], u["w_t"], u["rho"]] = means
     fastest = {place: min(settings.values()) for place, settings in flown.items()}
-    best = {place: min(error for _, error in settings.values()) for place, settings in flown.items()}
-    ours, stand_in, papers = ("hybrid", "payload and thrust"), ("reference-realistic", "payload and thrust"), ("hybrid", "payload")
+    best = {
+        place: min(error for _, error in settings.values()) for place, settings in flown.items()
+    }
+    ours, stand_in, papers = (
+        ("hybrid", "payload and thrust"),
+        ("reference-realistic", "payload and thrust"),
+        ("hybrid", "payload"),
+    )
     assert f"fastest take {fastest[ours][0]:.2f} and {fastest[stand_in][0]:.2f} s" in text
     assert f"most accurate miss by {best[ours]:.3f} and {best[stand_in]:.3f} m" in text
     assert f"one plan with them is faster than both policies, {fastest[papers][0]:.2f} s" in text
-    lost = {place: sum(np.isinf(error) for _, error in settings.values()) for place, settings in flown.items()}
+    lost = {
+        place: sum(np.isinf(error) for _, error in settings.values())
+        for place, settings in flown.items()
+    }
     assert f"{lost[papers]} of the 20 settings land nothing" in text
     assert f"and {lost['pendulum', 'payload']} in the pendulum model" in text
     assert not any(lost[place] for place in lost if place[1] == ours[1])
@@ -240,29 +288,48 @@ def test_the_sweep_that_the_page_tells_of_is_the_one_on_record():
     ((place, settings),) = flown.items()
     assert place == stand_in
     assert set(settings) == {setting for setting in every if setting[0] in (2.2, 2.9)}
-    assert {row[:3] for row in front.PAPER_FRONT} >= {(2.2, *front.WEIGHTS[2]), (1.7, *front.WEIGHTS[3]), (1.7, *front.WEIGHTS[4])}
+    assert {row[:3] for row in front.PAPER_FRONT} >= {
+        (2.2, *front.WEIGHTS[2]),
+        (1.7, *front.WEIGHTS[3]),
+        (1.7, *front.WEIGHTS[4]),
+    }
 
 
 def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
     monkeypatch.setattr("visthrow.training.device.cores", lambda: 1)
     packed = tmp_path / "all.json"
-    words = ["baseline", "--quick", "--targets", "1.5", "--policies", "state", "--out", str(tmp_path), "--json", str(packed)]
+    words = [
+        "baseline",
+        "--quick",
+        "--targets",
+        "1.5",
+        "--policies",
+        "state",
+        "--out",
+        str(tmp_path),
+        "--json",
+        str(packed),
+    ]
     assert cli.main(words) == 0
     text = (tmp_path / "report.md").read_text()
     assert "0.127 ± 0.019, 1.546 ± 0.010" in text, "the paper's TO+MPC stands beside the own model"
     assert "learnt state policy, training simulator" in text
     units = [result.unit for result in results.load(packed)]
     assert sorted((u["kind"], u["plant"], u["throws"], u["target"]) for u in units) == [
-        ("baseline", "pendulum", 2, 1.5), ("baseline", "pendulum", 2, 2.0), ("baseline", "pendulum", 2, 2.0),
+        ("baseline", "pendulum", 2, 1.5),
+        ("baseline", "pendulum", 2, 2.0),
+        ("baseline", "pendulum", 2, 2.0),
         ("policy", "hybrid", 10, 2.0),
-    ]  # fmt: skip
+    ]
     assert {u["speed"] for u in units if u["kind"] == "baseline" and u["target"] == 2.0} == {2.2}
     assert (tmp_path / "front.png").stat().st_size > 10_000
     assert text.splitlines()[0] in capsys.readouterr().out
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()}
     assert cli.main(words) == 0
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()} == kept, "nothing is flown twice"
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()} == kept, (
+        "nothing is flown twice"
+    )
 
 
 def test_the_command_refuses_what_it_cannot_fly(tmp_path, capsys):

@@ -11,10 +11,14 @@ from visthrow.baseline.pendulum import DIR, POS, QUAT, RATE, VEL, Pendulum
 MODEL = Pendulum(0.21, 0.06, 0.36)
 
 ORDER_RATIO = 14.0
-"""Halving the step of a fourth-order method divides its error by 16; 14 leaves room for the higher orders."""
+"""Halving the step of a fourth-order method divides its error by 16; 14 leaves room for the higher
+orders.
+"""
 
 RK4 = 1e-6
-"""Relative error of the classical method at 2 ms over a second of the swings below (measured 1e-8 and less)."""
+"""Relative error of the classical method at 2 ms over a second of the swings below (measured 1e-8
+and less).
+"""
 
 
 def random_states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +27,9 @@ def random_states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     state[:, DIR] /= np.linalg.norm(state[:, DIR], axis=1, keepdims=True)
     state[:, RATE] -= (state[:, RATE] * state[:, DIR]).sum(1, keepdims=True) * state[:, DIR]
     state[:, QUAT] /= np.linalg.norm(state[:, QUAT], axis=1, keepdims=True)
-    return state, np.column_stack([rng.uniform(0.5, 8.0, count), rng.uniform(-5.0, 5.0, (count, 3))])
+    return state, np.column_stack(
+        [rng.uniform(0.5, 8.0, count), rng.uniform(-5.0, 5.0, (count, 3))]
+    )
 
 
 def roll(state, control, seconds, step=0.002):
@@ -35,8 +41,12 @@ def roll(state, control, seconds, step=0.002):
 def energy(model: Pendulum, state: np.ndarray) -> np.ndarray:
     """Kinetic and potential energy of both bodies [J], shape (...)."""
     pos, vel = pm.vehicle(model, state)
-    kinetic = model.vehicle_mass * (vel**2).sum(-1) + model.payload_mass * (state[..., VEL] ** 2).sum(-1)
-    return 0.5 * kinetic + GRAVITY * (model.vehicle_mass * pos[..., 2] + model.payload_mass * state[..., 2])
+    kinetic = model.vehicle_mass * (vel**2).sum(-1) + model.payload_mass * (
+        state[..., VEL] ** 2
+    ).sum(-1)
+    return 0.5 * kinetic + GRAVITY * (
+        model.vehicle_mass * pos[..., 2] + model.payload_mass * state[..., 2]
+    )
 
 
 def test_hover_is_an_equilibrium():
@@ -65,13 +75,18 @@ def test_thrust_adds_its_power_to_the_energy():
     after, before = pm.step(MODEL, state, control, h), pm.step(MODEL, state, control, -h)
     rise = (energy(MODEL, after) - energy(MODEL, before)) / (2.0 * h)
     x, y, z, w = state[:, QUAT].T
-    axis = np.column_stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
+    axis = np.column_stack(
+        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)]
+    )
     power = control[:, 0] * (axis * pm.vehicle(MODEL, state)[1]).sum(1)
     assert np.allclose(rise, power, rtol=1e-4, atol=1e-4)
 
 
 def test_newton_holds_for_each_body_with_the_tension_between_them():
-    """Vehicle and payload one by one: M a = c b - M g + T q, m a = -m g - T q, accelerations by differences."""
+    """Vehicle and payload one by one:
+
+    M a = c b - M g + T q, m a = -m g - T q, accelerations by differences.
+    """
     state, control = random_states(20, 2)
     h = 1e-4
     ends = [pm.step(MODEL, state, control, s * h) for s in (1, -1)]
@@ -80,12 +95,16 @@ def test_newton_holds_for_each_body_with_the_tension_between_them():
     assert np.allclose(0.06 * acc, -pull - [0, 0, 0.06 * 9.81], atol=1e-4)
     acc = (pm.vehicle(MODEL, ends[0])[1] - pm.vehicle(MODEL, ends[1])[1]) / (2 * h)
     x, y, z, w = state[:, QUAT].T
-    axis = np.column_stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
+    axis = np.column_stack(
+        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)]
+    )
     assert np.allclose(0.21 * acc, control[:, :1] * axis + pull - [0, 0, 0.21 * 9.81], atol=1e-3)
 
 
 def test_small_swing_has_the_period_of_two_bodies():
-    """Level thrust equal to the weight: omega^2 = g (M + m) / (M l), the payload swinging against the vehicle."""
+    """Level thrust equal to the weight: omega^2 = g (M + m) / (M l), the payload swinging against
+    the vehicle.
+    """
     state, control = pm.hover(MODEL, np.zeros(3))
     angle = 1e-3
     state[DIR] = [np.sin(angle), 0.0, -np.cos(angle)]
@@ -120,23 +139,32 @@ def test_jacobians_are_those_of_the_step():
     for i in range(pm.STATES + pm.INPUTS):
         change = np.zeros(pm.STATES + pm.INPUTS)
         change[i] = h
-        ends = [pm.step(MODEL, state + s * change[:16], control + s * change[16:], 0.02) for s in (1, -1)]
+        ends = [
+            pm.step(MODEL, state + s * change[:16], control + s * change[16:], 0.02)
+            for s in (1, -1)
+        ]
         slope = by_state[:, :, i] if i < pm.STATES else by_input[:, :, i - pm.STATES]
         assert np.allclose((ends[0] - ends[1]) / (2 * h), slope, atol=1e-7)
 
 
 def test_looking_ahead_follows_the_commands_on_their_way():
-    """Three different commands under way, each held for its own 20 ms: predicted as they will act."""
+    """Three different commands under way, each held for its own 20 ms: predicted as
+    they will act.
+    """
     state = pm.hover(MODEL, np.zeros((1, 3)))[0]
     sent = np.array([[[3.0, 1.0, 0.0, 0.0]], [[2.0, -2.0, 1.0, 0.0]], [[4.0, 0.0, 3.0, 0.5]]])
     seen = look_ahead(MODEL, state, sent, 0.02, 0.045)
-    expected = pm.step(MODEL, state, sent[2], 0.005)  # 45 ms before: the third last command, for 5 ms more
+    expected = pm.step(
+        MODEL, state, sent[2], 0.005
+    )  # 45 ms before: the third last command, for 5 ms more
     expected = pm.step(MODEL, pm.step(MODEL, expected, sent[1], 0.02), sent[0], 0.02)
     assert np.allclose(seen, expected, atol=1e-9)
     assert look_ahead(MODEL, state, sent, 0.02, 0.0) is state
 
 
-@pytest.mark.parametrize("values", [(0.0, 0.06, 0.36), (0.2, -1.0, 0.36), (0.2, 0.06, float("nan"))])
+@pytest.mark.parametrize(
+    "values", [(0.0, 0.06, 0.36), (0.2, -1.0, 0.36), (0.2, 0.06, float("nan"))]
+)
 def test_impossible_pendulums_are_refused(values):
     with pytest.raises(ValueError, match="expected more than 0"):
         Pendulum(*values)

@@ -6,7 +6,13 @@ import pytest
 from visthrow.baseline import pendulum as pm
 from visthrow.baseline import spline as sp
 from visthrow.baseline.pendulum import Pendulum
-from visthrow.baseline.plan import default_release, landing_point, plan_throw, read_release, release_for
+from visthrow.baseline.plan import (
+    default_release,
+    landing_point,
+    plan_throw,
+    read_release,
+    release_for,
+)
 from visthrow.baseline.spline import PlanError, PlanParams
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import FlightRecorder
@@ -14,10 +20,14 @@ from visthrow.logs.flightlog import FlightRecorder
 MODEL = Pendulum(0.212, 0.060, 0.363)
 
 JOINT = 1e-6
-"""Jump of a derivative where segments meet, relative to its largest value: rounding of a 32 x 32 system."""
+"""Jump of a derivative where segments meet, relative to its largest value: rounding of a 32 x 32
+system.
+"""
 
 OPEN_LOOP = 2e-3
-"""State error of the flat inputs flown open loop at 2 ms, held constant over each step (measured 2e-4)."""
+"""State error of the flat inputs flown open loop at 2 ms, held constant over each step (measured
+2e-4).
+"""
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +54,11 @@ def test_landing_by_hand():
 def test_release_is_read_off_a_flight():
     recorder = FlightRecorder({"times": {"separation": 0.5}})
     for time, height, speed in ((0.4, 1.0, 2.0), (0.6, 1.2, 3.0)):
-        recorder.add(time, payload_pos_w=np.array([0.0, 0.0, height]), payload_vel_w=np.array([speed, 0.0, 0.0]))
+        recorder.add(
+            time,
+            payload_pos_w=np.array([0.0, 0.0, height]),
+            payload_vel_w=np.array([speed, 0.0, 0.0]),
+        )
     assert read_release(recorder.log()) == pytest.approx((1.1, 2.5))
     with pytest.raises(ConfigError, match="let nothing go"):
         read_release(FlightRecorder({"result": {"failure": "the vehicle tilted too far"}}).log())
@@ -63,7 +77,9 @@ def test_impossible_releases_are_refused(height, speed):
 
 
 def through(start, waypoints, end, velocity, times):
-    """Spline from rest at a start [m], shape (3,), through waypoints, shape (3, 3), in segments of these times [s], shape (4,)."""
+    """Spline from rest at a start [m], shape (3,), through waypoints, shape (3, 3), in segments of
+    these times [s], shape (4,).
+    """
     solved = sp._coefficients(start, waypoints[None], end, velocity, times[None])[0]
     return sp.Spline(times, solved / (times[:, None] ** np.arange(sp.ORDER))[:, :, None])
 
@@ -86,7 +102,9 @@ def test_spline_meets_ends_waypoints_and_itself():
 
 
 def test_derivatives_of_the_spline_are_its_slopes():
-    path = through(np.zeros(3), np.arange(9.0).reshape(3, 3), np.ones(3), np.ones(3), np.full(4, 0.3))
+    path = through(
+        np.zeros(3), np.arange(9.0).reshape(3, 3), np.ones(3), np.ones(3), np.full(4, 0.3)
+    )
     time, h = np.array([0.1, 0.5, 0.95]), 1e-6
     slopes = (path.sample(time + h) - path.sample(time - h)) / (2 * h)
     assert np.allclose(slopes[:, :5], path.sample(time)[:, 1:], rtol=1e-4, atol=1e-3)

@@ -30,7 +30,9 @@ EVERY_FORMAT = pytest.mark.parametrize("name", list(FORMATS))
 FIT_RMS_PX = 1e-3  # measured 5.5e-4 px on the worst of the four cameras over its whole image
 FIT_MAX_PX = 0.02  # measured 0.015 px in the corners of the 512 px image, where ds and eucm end
 SUPERSAMPLE = 3  # samples a pixel along each axis
-MODELS_AGREE_PX = 0.05  # two published models of one camera, calibrated separately: measured 0.011 px in the mean
+MODELS_AGREE_PX = (
+    0.05  # two published models of one camera, calibrated separately: measured 0.011 px in the mean
+)
 
 
 @EVERY_FORMAT
@@ -89,7 +91,9 @@ def test_wrong_content_is_named(tmp_path, name, old, new, message):
 
 def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
     path = tmp_path / "ros.yaml"
-    lens_files.write_ros(path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0))
+    lens_files.write_ros(
+        path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0)
+    )
     path.write_text(path.read_text().replace("100.0", "200.0"))
     with pytest.raises(ValueError, match=r"ros\.yaml: theta_d"):
         files.read_ros(path)
@@ -98,8 +102,11 @@ def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
 def test_field_of_view_without_the_key(tmp_path):
     path = tmp_path / "kalibr.yaml"
     lens_files.write_kalibr(path, FisheyeParams(641, 481, 200.0, 200.0, 320.0, 240.0))
-    path.write_text("\n".join(line for line in path.read_text().splitlines() if "fov_deg" not in line) + "\n")
-    # Equidistant: the corner's outer edge, (320.5, 240.5) px from the centre, is seen at its distance / fx.
+    path.write_text(
+        "\n".join(line for line in path.read_text().splitlines() if "fov_deg" not in line) + "\n"
+    )
+    # Equidistant: the corner's outer edge, (320.5, 240.5) px from the centre, is seen at its
+    # distance / fx.
     expected = 2.0 * math.degrees(math.hypot(320.5, 240.5) / 200.0)
     assert files.read_kalibr(path).fov_deg == pytest.approx(expected, abs=1e-9)
     assert files.read_kalibr(path, fov_deg=150.0).fov_deg == 150.0
@@ -115,9 +122,12 @@ def test_real_basalt_files_fit(name, camera):
         assert report.rms_px < FIT_RMS_PX
         assert report.max_px < FIT_MAX_PX
         lenses.append(Fisheye(params))
-    # The two files hold the same camera: an oracle for both unprojections that our own code had no part in.
+    # The two files hold the same camera: an oracle for both unprojections that our own code had no
+    # part in.
     p = lenses[0].params
-    grid = np.stack(np.meshgrid(np.linspace(0, p.width - 1, 40), np.linspace(0, p.height - 1, 40)), -1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, p.width - 1, 40), np.linspace(0, p.height - 1, 40)), -1
+    ).reshape(-1, 2)
     rays, seen = lenses[0].unproject(torch.from_numpy(grid))
     pixels, _ = lenses[1].project(rays)
     before = seen & (rays[:, 2] > 0.0)
@@ -145,12 +155,16 @@ def test_basalt_refusals(tmp_path):
         fit_fisheye("fov", {}, 10, 10)
 
 
-def board_picture(lens: Fisheye, board: BoardParams, rot_cm: torch.Tensor, origin_c: torch.Tensor) -> np.ndarray:
-    """A chessboard, grey, uint8, shape (H, W), with a square of margin and a white border of another about the inner corners.
+def board_picture(
+    lens: Fisheye, board: BoardParams, rot_cm: torch.Tensor, origin_c: torch.Tensor
+) -> np.ndarray:
+    """A chessboard, grey, uint8, shape (H, W), with a square of margin and a white border of
+    another about the inner corners.
 
     Args:
         lens: of the picture. board: what is drawn.
-        rot_cm: board to camera, shape (3, 3). origin_c: first inner corner [m], shape (3,), camera frame.
+        rot_cm: board to camera, shape (3, 3). origin_c: first inner corner [m], shape (3,), camera
+            frame.
     """
     rays_c, seen = pixel_rays(lens, SUPERSAMPLE)
     to_board = rot_cm.double().T
@@ -165,7 +179,9 @@ def board_picture(lens: Fisheye, board: BoardParams, rot_cm: torch.Tensor, origi
     paper = hit & (x > -2) & (x < board.columns + 1) & (y > -2) & (y < board.rows + 1)
     black = printed & ((x.floor() + y.floor()) % 2 == 0)
     grey = torch.where(paper, torch.where(black, 0.05, 0.95), 0.45 * seen)
-    averaged = grey.unflatten(1, (-1, SUPERSAMPLE)).unflatten(0, (-1, SUPERSAMPLE)).mean((1, 3)).float()
+    averaged = (
+        grey.unflatten(1, (-1, SUPERSAMPLE)).unflatten(0, (-1, SUPERSAMPLE)).mean((1, 3)).float()
+    )
     return (averaged * 255.0).round().to(torch.uint8).numpy()
 
 
@@ -189,8 +205,9 @@ def test_calibration_from_rendered_boards():
     found, report = calibrate_from_boards(pictures, board, fov_deg=160.0)
     assert math.isnan(report.image_rms_px[-1])
     assert np.isfinite(report.image_rms_px[:-1]).all()
-    # Measured 0.09 px over all views (x and y together, small pictures with sharp edges), 0.14 px in the worst, and a
-    # lens that is 0.10 px off within the 54 deg that the boards cover; other OpenCV builds get room for twice that.
+    # Measured 0.09 px over all views (x and y together, small pictures with sharp edges), 0.14 px
+    # in the worst, and a lens that is 0.10 px off within the 54 deg that the boards cover; other
+    # OpenCV builds get room for twice that.
     assert 0.03 < report.rms_px < 0.2
     assert np.nanmax(report.image_rms_px) < 0.3
     theta = torch.linspace(0.05, 0.95, 20, dtype=torch.float64)

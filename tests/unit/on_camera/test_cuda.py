@@ -16,7 +16,9 @@ BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_graph_replay_equals_eager():
-    params = CameraParams(BENT, MountParams(), KeypointNoiseParams(drop_probability=0.1), 0.25, 0.033)
+    params = CameraParams(
+        BENT, MountParams(), KeypointNoiseParams(drop_probability=0.1), 0.25, 0.033
+    )
     camera = KeypointCamera(params, "cuda")
     normal = lambda *shape: torch.randn(ENVIRONMENTS, *shape, device="cuda")  # noqa: E731
     pose = [normal(3), rotation_from_vector(normal(3)), normal(2), normal(3)]

@@ -1,4 +1,6 @@
-"""The detector on rendered frames and on made-up edges: what is found where, what is refused, and what nuisances do."""
+"""The detector on rendered frames and on made-up edges: what is found where, what is refused, and
+what nuisances do.
+"""
 
 import dataclasses
 import math
@@ -7,7 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import BallSeen, Detector, GoalSeen, Known, Seen, detected_keypoints, ordered_corners
+from camera.detectors.contours import (
+    BallSeen,
+    Detector,
+    GoalSeen,
+    Known,
+    Seen,
+    detected_keypoints,
+    ordered_corners,
+)
 from camera.detectors.edges import cone_fit
 from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
@@ -17,7 +27,10 @@ from tests.unit.on_camera.nuisance import NuisanceParams, degrade
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(
-    CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033), dtype=torch.float64
+    CameraParams(
+        LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
+    ),
+    dtype=torch.float64,
 )
 DETECTOR = Detector(CAMERA.fisheye, 0.033, 0.25)
 POS = torch.tensor([[0.1, 0.0, 1.3]], dtype=torch.float64)
@@ -26,17 +39,25 @@ BALL = torch.tensor([[0.12, 0.05, 0.9]], dtype=torch.float64)
 GOAL = torch.tensor([[0.9, -0.3]], dtype=torch.float64)
 GREEN, YELLOW = (0.16, 0.55, 0.26), (0.80, 0.88, 0.20)
 CLUTTER = (
-    Clutter("rectangle", (0.4, 0.6, 0.0), (0.12, 0.12), 0.3, GREEN),  # of the goal's colour and size, without a rim
-    Clutter("rectangle", (-0.5, 0.3, 0.0), (0.15, 0.05), 0.8, YELLOW),  # of the ball's colour, not round
+    Clutter(
+        "rectangle", (0.4, 0.6, 0.0), (0.12, 0.12), 0.3, GREEN
+    ),  # of the goal's colour and size, without a rim
+    Clutter(
+        "rectangle", (-0.5, 0.3, 0.0), (0.15, 0.05), 0.8, YELLOW
+    ),  # of the ball's colour, not round
     Clutter("ball", (0.0, -0.7, 0.1), (0.1, 0.1), 0.0, (0.2, 0.2, 0.8)),
 )
 TOLERANCE = 0.8
-"""Of any keypoint on a clean frame of 400 pixels [px]; over random frames of 640 the RMS is a third of that."""
+"""Of any keypoint on a clean frame of 400 pixels [px]; over random frames of 640 the RMS is a third
+of that.
+"""
 
 
 def rendered(clutter=(), goal=GOAL, ball=BALL) -> np.ndarray:
     eye = POS[0] + ROT[0] @ CAMERA.position_b
-    return render_scene(CAMERA.fisheye, eye, ROT[0] @ CAMERA.rot_cb.T, goal[0], ball[0], 0.033, 0.25, 2, clutter).numpy()
+    return render_scene(
+        CAMERA.fisheye, eye, ROT[0] @ CAMERA.rot_cb.T, goal[0], ball[0], 0.033, 0.25, 2, clutter
+    ).numpy()
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +68,10 @@ def scene():
 @pytest.fixture(scope="module")
 def cluttered():
     """Neither goal nor payload in view, only what resembles them."""
-    far = torch.tensor([[60.0, 0.0]], dtype=torch.float64), torch.tensor([[60.0, 5.0, 0.5]], dtype=torch.float64)
+    far = (
+        torch.tensor([[60.0, 0.0]], dtype=torch.float64),
+        torch.tensor([[60.0, 5.0, 0.5]], dtype=torch.float64),
+    )
     return rendered(CLUTTER, *far)
 
 
@@ -115,7 +139,10 @@ def test_known_things_narrow_the_search(scene):
         assert DETECTOR.detect(frame, wrong).ball is None
     high = dataclasses.replace(known(), height=2.6)
     assert DETECTOR.detect(frame, high).goal is None, "a square of twice the size"
-    assert DETECTOR.detect(frame, dataclasses.replace(known(), ball_ray_c=found.ball.ray_c)).ball is not None
+    assert (
+        DETECTOR.detect(frame, dataclasses.replace(known(), ball_ray_c=found.ball.ray_c)).ball
+        is not None
+    )
 
 
 def test_wrong_pictures():
@@ -178,7 +205,10 @@ def test_exact_rays_give_the_keypoints_of_training():
     distance = np.linalg.norm(ball)
     seen = Seen(
         BallSeen(ball / distance, math.asin(0.033 / distance), 1.0),
-        GoalSeen(corners[[3, 0, 1, 2]] / np.linalg.norm(corners[[3, 0, 1, 2]], axis=1, keepdims=True), 1.0),
+        GoalSeen(
+            corners[[3, 0, 1, 2]] / np.linalg.norm(corners[[3, 0, 1, 2]], axis=1, keepdims=True),
+            1.0,
+        ),
     )
     camera = KeypointCamera(CAMERA.params)
     found, valid = detected_keypoints(camera, seen, ROT[0].numpy())
@@ -216,7 +246,9 @@ def test_clutter_lies_where_it_was_put(cluttered):
         (CLUTTER[2], (blue > 1.5 * green) & (blue > 0.15)),
         (CLUTTER[1], (green > 2.0 * blue) & (red > 2.0 * blue)),
     ):
-        point = (CAMERA.rot_cb @ ROT[0].T @ (torch.tensor(thing.centre_w, dtype=torch.float64) - eye))[None]
+        point = (
+            CAMERA.rot_cb @ ROT[0].T @ (torch.tensor(thing.centre_w, dtype=torch.float64) - eye)
+        )[None]
         pixel = CAMERA.fisheye.project(point)[0][0].numpy()
         v, u = np.nonzero(mask)
         assert np.hypot(u.mean() - pixel[0], v.mean() - pixel[1]) < 2.0

@@ -14,7 +14,9 @@ BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -
 NARROW = FisheyeParams(
     512, 512, 190.97, 190.99, 254.9, 256.9, 0.0035, 0.0007, -0.0021, 0.0002, 195.0
 )  # a TUM-VI-like lens
-LENSES = pytest.mark.parametrize("params", [EQUIDISTANT, BENT, NARROW], ids=["equidistant", "bent", "narrow"])
+LENSES = pytest.mark.parametrize(
+    "params", [EQUIDISTANT, BENT, NARROW], ids=["equidistant", "bent", "narrow"]
+)
 
 ANGLE_TOLERANCE = 1e-9  # rad; the bar of the model, 1e6 times the rounding of float64
 EDGE_TOLERANCE = 1e-12  # rounding of a dozen float64 operations on values near 1
@@ -41,7 +43,9 @@ def test_round_trip_up_to_the_field_of_view(params):
     assert valid.all()
     assert seen.all()
     assert angle_between(back, rays).max() < ANGLE_TOLERANCE
-    assert torch.allclose(back.norm(dim=-1), torch.ones(len(rays), dtype=torch.float64), atol=EDGE_TOLERANCE)
+    assert torch.allclose(
+        back.norm(dim=-1), torch.ones(len(rays), dtype=torch.float64), atol=EDGE_TOLERANCE
+    )
 
 
 @LENSES
@@ -49,20 +53,26 @@ def test_normalized_radius_is_one_at_the_edge(params):
     lens = Fisheye(params)
     edge = sphere(lens.half_fov)[-24:]
     normalized, _ = lens.project_normalized(edge)
-    assert torch.allclose(normalized.norm(dim=-1), torch.ones(24, dtype=torch.float64), atol=EDGE_TOLERANCE)
+    assert torch.allclose(
+        normalized.norm(dim=-1), torch.ones(24, dtype=torch.float64), atol=EDGE_TOLERANCE
+    )
     pixels, _ = lens.project(edge)
     assert torch.allclose(lens.normalize(pixels), normalized, atol=EDGE_TOLERANCE)
     assert torch.allclose(lens.denormalize(normalized), pixels, atol=1e-9)
 
 
 def test_closed_form_at_90_and_110_degrees():
-    # Equidistant, so u = fx theta + cx: 90 deg to the right is 319.5 + 166.6786 pi/2; the same past 90 deg.
+    # Equidistant, so u = fx theta + cx: 90 deg to the right is 319.5 + 166.6786 pi/2; the same past
+    # 90 deg.
     lens = Fisheye(EQUIDISTANT)
     t = math.radians(105.0)
-    points = torch.tensor([[2.0, 0.0, 0.0], [0.0, 3.0 * math.sin(t), 3.0 * math.cos(t)]], dtype=torch.float64)
+    points = torch.tensor(
+        [[2.0, 0.0, 0.0], [0.0, 3.0 * math.sin(t), 3.0 * math.cos(t)]], dtype=torch.float64
+    )
     pixels, valid = lens.project(points)
     expected = torch.tensor(
-        [[319.5 + 166.6786 * math.pi / 2, 319.5], [319.5, 319.5 + 166.6786 * t]], dtype=torch.float64
+        [[319.5 + 166.6786 * math.pi / 2, 319.5], [319.5, 319.5 + 166.6786 * t]],
+        dtype=torch.float64,
     )
     assert torch.allclose(pixels, expected, atol=1e-10)
     assert valid.all()
@@ -73,7 +83,10 @@ def test_closed_form_at_90_and_110_degrees():
 def test_gradcheck_past_90_degrees(params, degrees):
     lens = Fisheye(params)
     t = math.radians(degrees)
-    point = torch.tensor([[0.6 * math.sin(t), 0.8 * math.sin(t), math.cos(t)]], dtype=torch.float64) * 1.3
+    point = (
+        torch.tensor([[0.6 * math.sin(t), 0.8 * math.sin(t), math.cos(t)]], dtype=torch.float64)
+        * 1.3
+    )
     point.requires_grad_()
     assert torch.autograd.gradcheck(lambda p: lens.project(p)[0], (point,))
     assert torch.autograd.gradcheck(lambda p: lens.project_normalized(p)[0], (point,))
@@ -102,8 +115,14 @@ def test_value_and_gradient_are_finite_everywhere(params, dtype):
         [-1e-7, 1e-7, -5],
         [1e3, -1e3, -1e3],
     ]
-    points = torch.cat([torch.tensor(special, dtype=dtype), sphere(math.pi).to(dtype)]).requires_grad_()
-    for function in (lens.project, lens.project_normalized, lambda p: lens.project_normalized(p, clip=True)):
+    points = torch.cat(
+        [torch.tensor(special, dtype=dtype), sphere(math.pi).to(dtype)]
+    ).requires_grad_()
+    for function in (
+        lens.project,
+        lens.project_normalized,
+        lambda p: lens.project_normalized(p, clip=True),
+    ):
         value, valid = function(points)
         (gradient,) = torch.autograd.grad(value.sum(), points)
         assert value.isfinite().all()
@@ -118,7 +137,9 @@ def test_jacobian_on_the_axis_is_the_pinhole_one(params):
     lens = Fisheye(params)
     point = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
     jacobian = torch.autograd.functional.jacobian(lambda p: lens.project(p)[0], point)
-    expected = torch.tensor([[params.fx / 2, 0.0, 0.0], [0.0, params.fy / 2, 0.0]], dtype=torch.float64)
+    expected = torch.tensor(
+        [[params.fx / 2, 0.0, 0.0], [0.0, params.fy / 2, 0.0]], dtype=torch.float64
+    )
     assert torch.allclose(jacobian, expected, rtol=1e-9)
 
 
@@ -134,9 +155,13 @@ def test_a_point_behind_the_field_of_view_is_never_valid(params):
     assert not valid[outside].any()
     assert not seen[outside].any()
     assert (valid[~outside]).all()
-    assert (normalized[outside].norm(dim=-1) > 1.0).all(), "the map must stay one-to-one past the field of view"
+    assert (normalized[outside].norm(dim=-1) > 1.0).all(), (
+        "the map must stay one-to-one past the field of view"
+    )
     clipped, _ = lens.project_normalized(points, clip=True)
-    assert torch.allclose(clipped[outside].norm(dim=-1), torch.ones(int(outside.sum()), dtype=torch.float64))
+    assert torch.allclose(
+        clipped[outside].norm(dim=-1), torch.ones(int(outside.sum()), dtype=torch.float64)
+    )
     assert torch.equal(clipped[~outside], normalized[~outside])
 
 
@@ -145,7 +170,9 @@ def test_points_beside_the_sensor_are_not_valid_keypoints():
     assert not lens.circle_inside_image
     assert Fisheye(EQUIDISTANT).circle_inside_image
     t = math.radians(99.0)
-    points = torch.tensor([[0.0, math.sin(t), math.cos(t)], [math.sin(t), 0.0, math.cos(t)]], dtype=torch.float64)
+    points = torch.tensor(
+        [[0.0, math.sin(t), math.cos(t)], [math.sin(t), 0.0, math.cos(t)]], dtype=torch.float64
+    )
     pixels, valid = lens.project(points)
     assert valid.all()
     assert lens.on_sensor(pixels).tolist() == [False, True]
@@ -158,7 +185,9 @@ def test_pixels_beyond_the_field_of_view_do_not_unproject():
     rays, valid = lens.unproject(pixels)
     assert valid.tolist() == [False, True]
     assert rays.isfinite().all()
-    assert math.isclose(math.atan2(float(rays[0, :2].norm()), float(rays[0, 2])), lens.half_fov, abs_tol=1e-9)
+    assert math.isclose(
+        math.atan2(float(rays[0, :2].norm()), float(rays[0, 2])), lens.half_fov, abs_tol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -179,7 +208,8 @@ def test_bad_intrinsics_are_refused(change, message):
 
 
 def test_monotonic_limit_closed_form():
-    # theta_d' = 1 + 3 k1 theta^2 is zero at theta = sqrt(-1 / (3 k1)): k1 = -1/12 gives 2 rad = 114.6 deg.
+    # theta_d' = 1 + 3 k1 theta^2 is zero at theta = sqrt(-1 / (3 k1)): k1 = -1/12 gives 2 rad =
+    # 114.6 deg.
     fits = FisheyeParams(640, 640, 100.0, 100.0, 320.0, 320.0, k1=-1 / 12, fov_deg=2 * 114.0)
     Fisheye(fits)
     with pytest.raises(ValueError, match=r"114\.59"):
@@ -195,5 +225,7 @@ def test_same_bits_for_any_batch_and_memory_layout():
         packed, _ = lens.project_normalized(components.movedim(0, -1).contiguous())
         assert torch.equal(batch, packed)
         for i in range(0, 1003, 17):
-            single, _ = lens.project_normalized(components[:, i : i + 1].contiguous().movedim(0, -1))
+            single, _ = lens.project_normalized(
+                components[:, i : i + 1].contiguous().movedim(0, -1)
+            )
             assert torch.equal(single[0], batch[i])

@@ -21,17 +21,22 @@ STEPS = 20
 
 
 def throw(frames=40, pitch=0.8, thrust=16.0):
-    """Attitudes (N, 3, 3) of a vehicle that pitches to and fro under a thrust [m/s^2], and rays (N, 3) to the ball below its lens.
+    """Attitudes (N, 3, 3) of a vehicle that pitches to and fro under a thrust [m/s^2], and rays (N,
+    3) to the ball below its lens.
 
-    The rope's direction r obeys r'' = -(thrust / length) (its part across r) - |r'|^2 r: gravity pulls both alike.
-    """
+    The rope's direction r obeys r'' = -(thrust / length) (its part across r) - |r'|^2 r: gravity
+    pulls both alike."""
     r, v, dt = np.array([0.0, 0.0, -1.0]), np.zeros(3), PERIOD / STEPS
     rots, rays = [], []
     for k in range(frames * STEPS):
         angle = pitch * math.sin(2.0 * math.pi * k * dt / 1.1)
         up = np.array([math.sin(angle), 0.0, math.cos(angle)])
         if k % STEPS == 0:
-            rots.append(rotation_from_vector(torch.tensor([[0.0, angle, 0.0]], dtype=torch.float64))[0].numpy())
+            rots.append(
+                rotation_from_vector(torch.tensor([[0.0, angle, 0.0]], dtype=torch.float64))[
+                    0
+                ].numpy()
+            )
             rays.append(r.copy())
         pull = -thrust / LENGTH * (up - r * (r @ up)) - r * (v @ v)
         v = v + dt * pull
@@ -41,14 +46,20 @@ def throw(frames=40, pitch=0.8, thrust=16.0):
 
 
 def followed(rots, rays, blind, seed=0):
-    """By frame [rad]: angle from the truth of what is read (NaN: not seen) and of what is expected, and within which it is looked for."""
+    """By frame [rad]: angle from the truth of what is read (NaN: not seen) and of what is expected,
+    and within which it is looked for.
+    """
     rng, following = np.random.default_rng(seed), Following(RADIUS, SIDE, LENGTH * rays[0])
     read, off, within = [], [], []
     for i, (rot, ray) in enumerate(zip(rots, rays)):
         stamp = i * PERIOD
         known = following.known(rot, rot[:, 2], EYE, (0.2, 0.6), stamp)
         noisy = rot.T @ ray + READ * rng.standard_normal(3)
-        ball = None if i in blind else BallSeen(noisy / np.linalg.norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
+        ball = (
+            None
+            if i in blind
+            else BallSeen(noisy / np.linalg.norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
+        )
         seen = following.take(Seen(ball, None), rot, stamp)
         angle = lambda of: math.acos(min(1.0, float(of @ rot.T @ ray)))  # noqa: E731, B023
         read.append(math.nan if seen.ball is None else angle(seen.ball.ray_c))
@@ -58,7 +69,9 @@ def followed(rots, rays, blind, seed=0):
 
 
 def test_a_ball_that_is_lost_in_a_throw_reads_where_it_swings():
-    """Five frames: what it reads is off by less than the ball turns in one; at its last place it would be by what it turns in five."""
+    """Five frames: what it reads is off by less than the ball turns in one; at its last place it
+    would be by what it turns in five.
+    """
     rots, rays = throw()
     held, read = [], []
     for first in range(10, 34):
@@ -97,20 +110,32 @@ def test_without_an_attitude_nothing_is_followed():
 
 
 def square(rot, place, score, eye=EYE):
-    """A square about a place on the ground as a camera with an attitude, body axes and all, sees it from an eye."""
-    corners = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]]) * SIDE / 2.0 + [*place, 0.0] - eye
+    """A square about a place on the ground as a camera with an attitude, body axes and all, sees it
+    from an eye.
+    """
+    corners = (
+        np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
+        * SIDE
+        / 2.0
+        + [*place, 0.0]
+        - eye
+    )
     return GoalSeen(corners / np.linalg.norm(corners, axis=1, keepdims=True) @ rot, score)
 
 
 def goals(frames, eyes=None):
-    """Scores of the goals that are told of frames (each of them places and scores of squares) at `PERIOD`; None: missed."""
+    """Scores of the goals that are told of frames (each of them places and scores of squares) at
+    `PERIOD`; None: missed.
+    """
     rots, _ = throw(len(frames))
     following, told = Following(RADIUS, SIDE), []
     for i, (rot, frame) in enumerate(zip(rots, frames)):
         eye = EYE if eyes is None else eyes[i]
         following.known(rot, rot[:, 2], eye, None, i * PERIOD)
         squares = tuple(square(rot, *one, eye) for one in sorted(frame, key=lambda one: -one[1]))
-        goal = following.take(Seen(None, squares[0] if squares else None, squares), rot, i * PERIOD).goal
+        goal = following.take(
+            Seen(None, squares[0] if squares else None, squares), rot, i * PERIOD
+        ).goal
         told.append(None if goal is None else goal.score)
     return told
 
@@ -127,7 +152,9 @@ def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed(
             assert following.take(Seen(None, goal, (goal,)), rot, 0.0).goal is goal
             continue
         to = rot @ known.goal_ray_c
-        assert np.linalg.norm(eye[:2] - to[:2] * eye[2] / to[2] - place) < 0.02, "the vehicle flies, the goal lies"
+        assert np.linalg.norm(eye[:2] - to[:2] * eye[2] / to[2] - place) < 0.02, (
+            "the vehicle flies, the goal lies"
+        )
         assert following.take(Seen(None, None), rot, i * PERIOD).goal is None
 
 
@@ -136,13 +163,25 @@ HERE, THERE = (2.0, 0.0), (0.7, 1.4)
 
 
 def test_another_square_is_not_the_goal_in_the_frames_where_it_looks_likelier():
-    """Of a throw on pictures that landed 0.36 m off: two squares, each the likelier one now and then, or the only one that is found."""
-    looks = [((HERE, 0.74), (THERE, 0.57)), ((HERE, 0.56), (THERE, 0.71)), ((HERE, 0.82),), ((THERE, 0.6),), ((HERE, 0.81), (THERE, 0.72))]
+    """Of a throw on pictures that landed 0.36 m off: two squares, each the likelier one now and
+    then, or the only one that is found.
+    """
+    looks = [
+        ((HERE, 0.74), (THERE, 0.57)),
+        ((HERE, 0.56), (THERE, 0.71)),
+        ((HERE, 0.82),),
+        ((THERE, 0.6),),
+        ((HERE, 0.81), (THERE, 0.72)),
+    ]
     assert goals([looks[0], *looks]) == [0.74, 0.74, 0.56, 0.82, None, 0.81]
 
 
 def test_what_looked_likelier_first_is_not_the_goal_for_ever():
-    assert goals([((HERE, 0.7), (THERE, 0.75)), *[((HERE, 0.8), (THERE, 0.6))] * 2]) == [0.75, 0.8, 0.8]
+    assert goals([((HERE, 0.7), (THERE, 0.75)), *[((HERE, 0.8), (THERE, 0.6))] * 2]) == [
+        0.75,
+        0.8,
+        0.8,
+    ]
 
 
 def test_a_goal_is_found_again_where_it_was_carried():
@@ -161,7 +200,11 @@ def chosen(detector, probability, rays, known):
 
 def bayes(detector, probability, off, within):
     spread = within / GATE
-    likelier = (1.0 - math.cos(detector.lens.params.half_fov)) / spread**2 * math.exp(-0.5 * (off / spread) ** 2)
+    likelier = (
+        (1.0 - math.cos(detector.lens.params.half_fov))
+        / spread**2
+        * math.exp(-0.5 * (off / spread) ** 2)
+    )
     odds = probability / (1.0 - probability) * likelier
     return odds / (1.0 + odds)
 
@@ -177,7 +220,9 @@ def toward(angle):
 
 
 def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
-    """A thing 25 deg from where the ball is expected to 7 deg is not it, though it looks likelier; seen in a throw on pictures."""
+    """A thing 25 deg from where the ball is expected to 7 deg is not it, though it looks likelier;
+    seen in a throw on pictures.
+    """
     here, there, within = toward(0.0), toward(math.radians(25.0)), math.radians(28.0)
     assert chosen(learnt, [0.4], [here], Known()) is None
     ball = chosen(learnt, [0.66, 0.4], [there, here], Known(ball_ray_c=here, ball_within=within))
@@ -188,11 +233,19 @@ def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
 
 
 def test_where_a_goal_is_expected_a_faint_square_counts_with_its_own_probability(learnt):
-    corners = 0.05 * np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
+    corners = 0.05 * np.array(
+        [[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]]
+    )
     rays = [corners + toward(angle) for angle in (0.0, 0.8)]
-    things = torch.tensor(np.array([one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]), dtype=torch.float32)
+    things = torch.tensor(
+        np.array([one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]),
+        dtype=torch.float32,
+    )
     known = Known(goal_ray_c=toward(0.8), goal_within=math.radians(10.0))
-    scores = lambda known, *p: [one.score for one in learnt._squares(torch.tensor(p), things, known)]  # noqa: E731
+
+    def scores(known, *p):
+        return [one.score for one in learnt._squares(torch.tensor(p), things, known)]
+
     assert scores(known, 0.9, 0.6) == pytest.approx([0.9, 0.6])
     assert scores(known, 0.3, 0.2) == pytest.approx([0.2])
     assert scores(Known(), 0.3, 0.2) == []

@@ -7,12 +7,21 @@ import pytest
 import torch
 
 from camera.fisheye import Fisheye
-from camera.keypoints import KeypointCamera, ball_extremes_c, by_rule, goal_corners_w, keypoints, payload_keypoints
+from camera.keypoints import (
+    KeypointCamera,
+    ball_extremes_c,
+    by_rule,
+    goal_corners_w,
+    keypoints,
+    payload_keypoints,
+)
 from camera.mount import nominal_rot_cb, points_c_from_w, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 LENS = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
-PARAMS = CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033)
+PARAMS = CameraParams(
+    LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
+)
 CENTRED = replace(PARAMS, mount=MountParams())
 EDGE = math.radians(110.0)
 
@@ -45,12 +54,15 @@ def test_downward_mount_axes():
         points_w, pos_w, rot_wb, nominal_rot_cb(MountParams()), torch.zeros(3, dtype=torch.float64)
     )
     # Front is up in the image (-y_c), left is left (-x_c), below is ahead of the lens (+z_c).
-    expected = torch.tensor([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]], dtype=torch.float64)
+    expected = torch.tensor(
+        [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]], dtype=torch.float64
+    )
     assert torch.allclose(points_c[0], expected, atol=1e-12)
 
 
 def test_mount_rotation_is_about_body_axes():
-    # Pitch -90 deg about body y (left) turns the downward camera to the front: z_c = +x_b; image top is then body up.
+    # Pitch -90 deg about body y (left) turns the downward camera to the front: z_c = +x_b; image
+    # top is then body up.
     rot_cb = nominal_rot_cb(MountParams(rpy_deg=(0.0, -90.0, 0.0)))
     assert torch.allclose(rot_cb[2], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), atol=1e-9)
     assert torch.allclose(rot_cb[1], torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), atol=1e-9)
@@ -59,7 +71,9 @@ def test_mount_rotation_is_about_body_axes():
 
 def test_rotation_vector_against_the_matrix_exponential():
     vector = torch.tensor(
-        [[0.3, -1.2, 0.4], [0.0, 0.0, 0.0], [1e-4, 0.0, 3.0]], dtype=torch.float64, requires_grad=True
+        [[0.3, -1.2, 0.4], [0.0, 0.0, 0.0], [1e-4, 0.0, 3.0]],
+        dtype=torch.float64,
+        requires_grad=True,
     )
     x, y, z = vector.detach().unbind(-1)
     zero = torch.zeros_like(x)
@@ -78,18 +92,27 @@ def test_extrinsic_error_moves_and_turns_the_camera():
     pos_w, rot_wb = hover(2.0, 2)
     payload_w = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2, 3)
     goal_w = torch.zeros(2, 2, dtype=torch.float64)
-    points, _ = keypoints(camera, pos_w, rot_wb, goal_w, payload_w, camera.extrinsics(rotation_error, position_error))
+    points, _ = keypoints(
+        camera, pos_w, rot_wb, goal_w, payload_w, camera.extrinsics(rotation_error, position_error)
+    )
     middle = points[:, 4:].mean(1)
-    # Camera pitched to the front by 0.05 rad: the ball below lies 0.05 rad towards the image's bottom. Camera 0.1 m
-    # forward: atan(0.1) in the same direction.
-    assert torch.allclose(middle[0], torch.tensor([0.0, angle / EDGE], dtype=torch.float64), atol=1e-6)
-    assert torch.allclose(middle[1], torch.tensor([0.0, math.atan(0.1) / EDGE], dtype=torch.float64), atol=1e-4)
+    # Camera pitched to the front by 0.05 rad: the ball below lies 0.05 rad towards the image's
+    # bottom. Camera 0.1 m forward: atan(0.1) in the same direction.
+    assert torch.allclose(
+        middle[0], torch.tensor([0.0, angle / EDGE], dtype=torch.float64), atol=1e-6
+    )
+    assert torch.allclose(
+        middle[1], torch.tensor([0.0, math.atan(0.1) / EDGE], dtype=torch.float64), atol=1e-4
+    )
 
 
 def test_goal_corners_order_and_place():
     corners = goal_corners_w(torch.tensor([[2.0, 1.0, 0.04]]), 0.25)
     assert torch.equal(
-        corners[0], torch.tensor([[2.125, 1.125, 0.0], [2.125, 0.875, 0.0], [1.875, 0.875, 0.0], [1.875, 1.125, 0.0]])
+        corners[0],
+        torch.tensor(
+            [[2.125, 1.125, 0.0], [2.125, 0.875, 0.0], [1.875, 0.875, 0.0], [1.875, 1.125, 0.0]]
+        ),
     )
 
 
@@ -103,7 +126,8 @@ def test_goal_below_a_level_vehicle_closed_form():
         torch.zeros(1, 2, dtype=torch.float64),
         torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64),
     )
-    # Corner 0 (front left) 0.125 m each way, 1 m below: angle atan(0.125 sqrt 2), up and left in the image, 45 deg.
+    # Corner 0 (front left) 0.125 m each way, 1 m below: angle atan(0.125 sqrt 2), up and left in
+    # the image, 45 deg.
     c = math.atan(0.125 * math.sqrt(2.0)) / EDGE / math.sqrt(2.0)
     expected = torch.tensor([[-c, -c], [c, -c], [c, c], [-c, c]], dtype=torch.float64)
     assert valid.all()
@@ -116,21 +140,25 @@ def test_goal_below_a_level_vehicle_closed_form():
 
 @pytest.mark.parametrize(("distance", "tolerance"), [(0.2, 2e-3), (0.38, 3e-4), (0.6, 1e-4)])
 def test_payload_box_against_the_dense_outline(distance, tolerance):
-    # Tolerances: the box's second-order error up to 105 deg off the axis; at 0.38 m, the rope's length, a thirtieth of
-    # the noise.
+    # Tolerances: the box's second-order error up to 105 deg off the axis; at 0.38 m, the rope's
+    # length, a thirtieth of the noise.
     lens = Fisheye(LENS)
     generator = torch.Generator().manual_seed(1)
     centre = torch.randn(2000, 3, generator=generator, dtype=torch.float64)
     centre = centre / centre.norm(dim=1, keepdim=True)
     centre = centre[lens.angle(centre)[0] < math.radians(105.0)]
     helper = torch.where(
-        centre[:, :1].abs() < 0.9, torch.eye(3, dtype=torch.float64)[0], torch.eye(3, dtype=torch.float64)[1]
+        centre[:, :1].abs() < 0.9,
+        torch.eye(3, dtype=torch.float64)[0],
+        torch.eye(3, dtype=torch.float64)[1],
     )
     e1 = torch.nn.functional.normalize(torch.linalg.cross(centre, helper), dim=-1)
     e2 = torch.linalg.cross(centre, e1)
     phi = torch.linspace(0.0, 2.0 * math.pi, 361, dtype=torch.float64)[None, :, None]
     a = math.asin(0.033 / distance)
-    outline = math.cos(a) * centre[:, None] + math.sin(a) * (phi.cos() * e1[:, None] + phi.sin() * e2[:, None])
+    outline = math.cos(a) * centre[:, None] + math.sin(a) * (
+        phi.cos() * e1[:, None] + phi.sin() * e2[:, None]
+    )
     image, _ = lens.project_normalized(outline)
     points, _ = lens.project_normalized(ball_extremes_c(lens, centre * distance, 0.033))
     ours = torch.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], -1)
@@ -140,7 +168,9 @@ def test_payload_box_against_the_dense_outline(distance, tolerance):
 
 def test_payload_box_layout_and_smoothness():
     camera = KeypointCamera(CENTRED, dtype=torch.float64)
-    ball_c = torch.tensor([[0.1, 0.2, 0.3], [0.3, -0.1, -0.05]], dtype=torch.float64, requires_grad=True)
+    ball_c = torch.tensor(
+        [[0.1, 0.2, 0.3], [0.3, -0.1, -0.05]], dtype=torch.float64, requires_grad=True
+    )
     box, valid = payload_keypoints(camera, ball_c)
     left, top, right, bottom = box.unbind(1)
     assert valid.all()
@@ -157,7 +187,8 @@ def test_payload_box_layout_and_smoothness():
 def test_keypoints_are_finite_in_every_pose(dtype):
     camera = KeypointCamera(PARAMS, dtype=dtype)
     special = torch.tensor(
-        [[0, 0, 1], [0, 0, -1], [0, 0, 0], [0.01, 0, 0], [0, 0, -0.033], [1, 0, 0], [0, 0, 1e4]], dtype=dtype
+        [[0, 0, 1], [0, 0, -1], [0, 0, 0], [0.01, 0, 0], [0, 0, -0.033], [1, 0, 0], [0, 0, 1e4]],
+        dtype=dtype,
     )
     special.requires_grad_()
     box, _ = payload_keypoints(camera, special)
@@ -167,11 +198,13 @@ def test_keypoints_are_finite_in_every_pose(dtype):
 
 
 def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
-    # Nose down by 40 deg (a positive pitch about body y), target 62 deg off the vertical in front: 102 deg off the
-    # axis.
+    # Nose down by 40 deg (a positive pitch about body y), target 62 deg off the vertical in front:
+    # 102 deg off the axis.
     camera = KeypointCamera(CENTRED, dtype=torch.float64)
     pos_w, _ = hover(1.0)
-    rot_wb = rotation_from_vector(torch.tensor([[0.0, math.radians(40.0), 0.0]], dtype=torch.float64))
+    rot_wb = rotation_from_vector(
+        torch.tensor([[0.0, math.radians(40.0), 0.0]], dtype=torch.float64)
+    )
     goal_w = torch.tensor([[math.tan(math.radians(62.0)), 0.0]], dtype=torch.float64)
     above_w = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
     points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
@@ -183,22 +216,30 @@ def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
 
 @pytest.mark.parametrize("reads", ["edge", "zero"])
 def test_what_invalid_points_read(reads):
-    camera = KeypointCamera(replace(PARAMS, noise=KeypointNoiseParams(invalid_reads=reads)), dtype=torch.float64)
+    camera = KeypointCamera(
+        replace(PARAMS, noise=KeypointNoiseParams(invalid_reads=reads)), dtype=torch.float64
+    )
     points, valid = keypoints(camera, *scene(2000, torch.float64))
     corners = points[:, :4][~valid[:, :4]]
     expected = 1.0 if reads == "edge" else 0.0
     assert len(corners) > 50
-    assert torch.allclose(corners.norm(dim=-1), torch.full((len(corners),), expected, dtype=torch.float64))
+    assert torch.allclose(
+        corners.norm(dim=-1), torch.full((len(corners),), expected, dtype=torch.float64)
+    )
     assert points.abs().max() <= 1.0 + 1e-12
 
 
 def test_out_of_view_tells_nothing_but_that():
-    """Wherever a hidden thing is, all that reaches the policy is the same; of a ball cut by the edge no hidden side leaks."""
+    """Wherever a hidden thing is, all that reaches the policy is the same; of a ball cut by the
+    edge no hidden side leaks.
+    """
     honest = replace(PARAMS, noise=KeypointNoiseParams(invalid_reads="zero"))
     camera = KeypointCamera(honest, dtype=torch.float64)
     pos_w, rot_wb = hover(1.0, 3)
     goal_w = torch.zeros(3, 2, dtype=torch.float64)
-    above_w = torch.tensor([[0.0, 0.0, 2.0], [0.5, 0.3, 2.2], [-0.4, 0.0, 1.8]], dtype=torch.float64)
+    above_w = torch.tensor(
+        [[0.0, 0.0, 2.0], [0.5, 0.3, 2.2], [-0.4, 0.0, 1.8]], dtype=torch.float64
+    )
     points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
     assert not valid[:, 4:].any()
     assert torch.equal(points[:1], points[1:2])
@@ -208,7 +249,9 @@ def test_out_of_view_tells_nothing_but_that():
     _, sides = payload_keypoints(camera, 0.2 * rays)
     partly = sides.any(-1) & ~sides.all(-1)
     assert partly.sum() > 3
-    shown, told = by_rule(camera, torch.ones(81, 8, 2, dtype=torch.float64), torch.cat([sides, sides], -1))
+    shown, told = by_rule(
+        camera, torch.ones(81, 8, 2, dtype=torch.float64), torch.cat([sides, sides], -1)
+    )
     cut = told[partly, 4:]
     assert not cut.all(-1).any()
     for k, (one, other) in enumerate([(1, 3), (0, 2), (1, 3), (0, 2)]):
@@ -222,13 +265,16 @@ def test_batch_of_many_equals_batch_of_one_bit_for_bit():
     extrinsics = camera.extrinsics(0.02 * torch.ones(1003, 3), 0.001 * torch.ones(1003, 3))
     points, valid = keypoints(camera, *arguments, extrinsics)
     for i in range(0, 1003, 13):
-        one, seen = keypoints(camera, *(a[i : i + 1] for a in arguments), tuple(e[i : i + 1] for e in extrinsics))
+        one, seen = keypoints(
+            camera, *(a[i : i + 1] for a in arguments), tuple(e[i : i + 1] for e in extrinsics)
+        )
         assert torch.equal(one[0], points[i])
         assert torch.equal(seen[0], valid[i])
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))]
+    ("field", "value"),
+    [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))],
 )
 def test_bad_sizes_are_refused(field, value):
     with pytest.raises(ValueError, match=field):

@@ -1,4 +1,6 @@
-"""The learnt detector's geometry, file and calibration; what it finds stands in `visthrow detector check`."""
+"""The learnt detector's geometry, file and calibration; what it finds stands in `visthrow detector
+check`.
+"""
 
 import math
 
@@ -7,7 +9,16 @@ import pytest
 import torch
 
 from camera.detectors.fit import FitParams, Labels, offsets, other_lens, platt, search_loss
-from camera.detectors.learnt import CELL, KINDS, PATCH, LearntDetector, Networks, patches_of, places_of, views_about
+from camera.detectors.learnt import (
+    CELL,
+    KINDS,
+    PATCH,
+    LearntDetector,
+    Networks,
+    patches_of,
+    places_of,
+    views_about,
+)
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
 from visthrow import config
@@ -17,11 +28,15 @@ NORTH = torch.tensor([[0.0, -1.0, 0.0]])
 
 
 def ray(theta: float, phi: float) -> torch.Tensor:
-    return torch.tensor([[math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]])
+    return torch.tensor(
+        [[math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)]]
+    )
 
 
 def test_a_patch_is_upright_and_bent_by_no_lens():
-    """Lines of constant azimuth and elevation about a ray, painted on a frame, stand straight in its patch."""
+    """Lines of constant azimuth and elevation about a ray, painted on a frame, stand straight in
+    its patch.
+    """
     about = ray(1.2, 0.7)
     views = views_about(about, torch.tensor([0.3]), NORTH)
     torch.testing.assert_close(views.axes[0] @ views.axes[0].T, torch.eye(3), atol=1e-6, rtol=0)
@@ -30,8 +45,14 @@ def test_a_patch_is_upright_and_bent_by_no_lens():
     rays, _ = LENS.unproject(torch.stack([u, v], -1).reshape(-1, 2))
     inside = views.points(rays[None])[0]
     ahead = rays @ views.axes[0, 2] > 0.3
-    frame = torch.where(ahead[:, None], torch.cat([inside * 60.0 + 128.0, torch.full_like(inside[:, :1], 9.0)], -1).clamp(0, 255), 0.0)
-    patch = patches_of(frame.reshape(1, 320, 320, 3).to(torch.uint8), torch.tensor([0]), views, LENS, 40)[0]
+    frame = torch.where(
+        ahead[:, None],
+        torch.cat([inside * 60.0 + 128.0, torch.full_like(inside[:, :1], 9.0)], -1).clamp(0, 255),
+        0.0,
+    )
+    patch = patches_of(
+        frame.reshape(1, 320, 320, 3).to(torch.uint8), torch.tensor([0]), views, LENS, 40
+    )[0]
     at = (torch.arange(40) + 0.5) / 20.0 - 1.0
     expected = at * 60.0 + 128.0
     shown = (patch + 1.0) * 127.5
@@ -52,11 +73,20 @@ def test_places_are_where_the_grid_says():
 
 
 def labels() -> Labels:
-    corners = torch.tensor([[[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]]])
+    corners = torch.tensor(
+        [[[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]]]
+    )
     corners = torch.nn.functional.normalize(corners, dim=-1)
     rays = {"ball": ray(0.5, 0.0), "goal": ray(0.0, 0.0)}
     seen = {kind: torch.tensor([True]) for kind in KINDS}
-    return Labels(rays, {"ball": torch.tensor([0.08]), "goal": torch.tensor([0.14])}, seen, corners, -NORTH, ray(1.0, 1.0))
+    return Labels(
+        rays,
+        {"ball": torch.tensor([0.08]), "goal": torch.tensor([0.14])},
+        seen,
+        corners,
+        -NORTH,
+        ray(1.0, 1.0),
+    )
 
 
 def test_the_right_grid_has_the_least_loss():
@@ -77,13 +107,22 @@ def test_the_right_grid_has_the_least_loss():
 
 
 def test_corners_are_told_in_one_order():
-    """The order of a square that is turned by up to 40 deg is that of its quadrants, whatever order the labels have."""
+    """The order of a square that is turned by up to 40 deg is that of its quadrants, whatever order
+    the labels have.
+    """
     made = labels()
     views = views_about(made.rays["goal"], torch.tensor([0.3]), -made.north)
     exact = views.points(made.corners).flatten(1)
     found = torch.cat([torch.zeros(1, 2), exact], -1)
     for shift in range(4):
-        turned = Labels(made.rays, made.sizes, made.seen, made.corners.roll(shift, 1), made.north, made.distractor)
+        turned = Labels(
+            made.rays,
+            made.sizes,
+            made.seen,
+            made.corners.roll(shift, 1),
+            made.north,
+            made.distractor,
+        )
         assert offsets("goal", views, found, turned, torch.tensor([0])).abs().max() < 1e-6
 
 
@@ -118,7 +157,12 @@ def test_networks_are_written_and_read(tmp_path):
 
 def test_frames_of_another_size_are_refused():
     with pytest.raises(ValueError, match="expected multiples of 16 px"):
-        LearntDetector(Fisheye(FisheyeParams(100, 100, 30.0, 30.0, 49.5, 49.5, fov_deg=180.0)), 0.033, 0.25, networks=Networks())
+        LearntDetector(
+            Fisheye(FisheyeParams(100, 100, 30.0, 30.0, 49.5, 49.5, fov_deg=180.0)),
+            0.033,
+            0.25,
+            networks=Networks(),
+        )
     detector = LearntDetector(LENS, 0.033, 0.25, networks=Networks())
     with pytest.raises(ValueError, match="expected"):
         detector.detect(np.zeros((10, 10, 3), np.uint8))

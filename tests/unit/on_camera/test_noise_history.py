@@ -11,7 +11,10 @@ SAMPLES = 20_000
 
 
 def draw_step(environments, keypoints, generator):
-    return StepDraw(torch.randn(environments, keypoints, 2, generator=generator), torch.rand(environments, keypoints, generator=generator))
+    return StepDraw(
+        torch.randn(environments, keypoints, 2, generator=generator),
+        torch.rand(environments, keypoints, generator=generator),
+    )
 
 
 def test_push_shifts_and_fills_on_reset():
@@ -23,7 +26,9 @@ def test_push_shifts_and_fills_on_reset():
 
 def test_push_of_one_entry_and_of_bits():
     bits = torch.tensor([[[True, False]]])
-    assert push(bits, torch.tensor([[False, True]]), torch.tensor([False])).tolist() == [[[False, True]]]
+    assert push(bits, torch.tensor([[False, True]]), torch.tensor([False])).tolist() == [
+        [[False, True]]
+    ]
 
 
 def test_latency_interpolates_between_whole_steps():
@@ -47,10 +52,14 @@ def test_noise_has_the_stated_spread():
     bias = torch.randn(SAMPLES, 8, 2, generator=generator) * params.bias_std
     exact = torch.full((SAMPLES, 8, 2), 0.3)
     points, seen = apply_noise(
-        params, exact, torch.ones(SAMPLES, 8, dtype=torch.bool), bias, draw_step(SAMPLES, 8, generator)
+        params,
+        exact,
+        torch.ones(SAMPLES, 8, dtype=torch.bool),
+        bias,
+        draw_step(SAMPLES, 8, generator),
     )
-    # 160,000 points: the spread is known to 0.2 %, the drop-out rate to 0.001 (one sigma); the margins are five of
-    # them.
+    # 160,000 points: the spread is known to 0.2 %, the drop-out rate to 0.001 (one sigma); the
+    # margins are five of them.
     assert points[seen].std() == pytest.approx((0.01**2 + 0.002**2) ** 0.5, rel=0.01)
     assert bias.std() == pytest.approx(0.002, rel=0.01)
     assert 1.0 - seen.float().mean() == pytest.approx(0.2, abs=0.005)
@@ -64,7 +73,9 @@ def test_what_invalid_and_dropped_points_read(reads, expected):
     params = KeypointNoiseParams(step_std=0.01, drop_probability=0.5, invalid_reads=reads)
     exact = torch.tensor([[[0.6, 0.8], [0.1, 0.2], [0.1, 0.2]]])
     draw = StepDraw(torch.ones(1, 3, 2), torch.tensor([[0.9, 0.4, 0.5]]))
-    points, seen = apply_noise(params, exact, torch.tensor([[False, True, True]]), torch.zeros(1, 3, 2), draw)
+    points, seen = apply_noise(
+        params, exact, torch.tensor([[False, True, True]]), torch.zeros(1, 3, 2), draw
+    )
     assert seen.tolist() == [[False, False, True]]
     assert torch.allclose(points[0], torch.tensor([*expected, [0.11, 0.21]]))
 

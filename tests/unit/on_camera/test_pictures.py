@@ -15,22 +15,29 @@ from tests.drawn import pixel_rays, render_scene
 
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
 CAMERA = KeypointCamera(
-    CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033),
+    CameraParams(
+        LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
+    ),
     dtype=torch.float64,
 )
-# On the narrow side the picture is 320 px for 220 deg; a keypoint and the drawn edge differ by a pixel's width at most.
+# On the narrow side the picture is 320 px for 220 deg; a keypoint and the drawn edge differ by a
+# pixel's width at most.
 PIXEL_TOLERANCE = 1.0
 
 
 def throw_scene(pitch_deg: float):
     """A vehicle before the throw, its keypoints and its picture."""
     pos_w = torch.tensor([[0.3, 0.05, 1.3]], dtype=torch.float64)
-    rot_wb = rotation_from_vector(torch.tensor([[0.1, math.radians(pitch_deg), 0.2]], dtype=torch.float64))
+    rot_wb = rotation_from_vector(
+        torch.tensor([[0.1, math.radians(pitch_deg), 0.2]], dtype=torch.float64)
+    )
     goal_w = torch.tensor([[1.4, 0.2]], dtype=torch.float64)
     ball_w = torch.tensor([[0.45, 0.1, 1.02]], dtype=torch.float64)
     points, valid = keypoints(CAMERA, pos_w, rot_wb, goal_w, ball_w)
     eye_w = pos_w[0] + rot_wb[0] @ CAMERA.position_b
-    frame = render_scene(CAMERA.fisheye, eye_w, rot_wb[0] @ CAMERA.rot_cb.T, goal_w[0], ball_w[0], supersample=3)
+    frame = render_scene(
+        CAMERA.fisheye, eye_w, rot_wb[0] @ CAMERA.rot_cb.T, goal_w[0], ball_w[0], supersample=3
+    )
     return points[0], valid[0], frame
 
 
@@ -45,8 +52,12 @@ def test_drawn_ball_and_goal_lie_where_the_keypoints_say(pitch_deg):
     drawn = np.array([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
     box = np.array([pixels[4, 0], pixels[5, 1], pixels[6, 0], pixels[7, 1]])
     assert np.abs(drawn - box).max() < PIXEL_TOLERANCE + 0.5
-    v, u = np.nonzero((green > 1.5 * red) & (green > 1.3 * blue))  # the goal's field is the only green
-    assert np.hypot(u.mean() - pixels[:4, 0].mean(), v.mean() - pixels[:4, 1].mean()) < PIXEL_TOLERANCE
+    v, u = np.nonzero(
+        (green > 1.5 * red) & (green > 1.3 * blue)
+    )  # the goal's field is the only green
+    assert (
+        np.hypot(u.mean() - pixels[:4, 0].mean(), v.mean() - pixels[:4, 1].mean()) < PIXEL_TOLERANCE
+    )
 
 
 def test_frame_is_black_outside_the_field_of_view():
@@ -60,7 +71,9 @@ def test_pixel_rays_hit_pixel_centres():
     rays, seen = pixel_rays(CAMERA.fisheye)
     pixels, _ = CAMERA.fisheye.project(rays[100:110, 200:205])
     assert seen[100, 200]
-    assert torch.allclose(pixels[0, 0], torch.tensor([200.0, 100.0], dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(
+        pixels[0, 0], torch.tensor([200.0, 100.0], dtype=torch.float64), atol=1e-9
+    )
 
 
 def test_overlay_colours_the_points_and_leaves_the_input():
@@ -90,15 +103,19 @@ def test_overlay_marks_invalid_points_even_far_outside():
 
 
 def test_rectified_view_has_straight_lines():
-    # A frame whose colour is the tangent of the angle to the right of the axis rectifies to a linear ramp.
+    # A frame whose colour is the tangent of the angle to the right of the axis rectifies to a
+    # linear ramp.
     lens = CAMERA.fisheye
     rays, _ = pixel_rays(lens)
     ahead = rays[..., 2] > 0.3
-    ramp = torch.where(ahead, rays[..., 0] / rays[..., 2].clamp(min=0.3), torch.zeros_like(rays[..., 0]))
+    ramp = torch.where(
+        ahead, rays[..., 0] / rays[..., 2].clamp(min=0.3), torch.zeros_like(rays[..., 0])
+    )
     view = ViewParams(81, 61, 90.0)
     straight = rectify(ramp[None, None], lens, view)[0, 0]
     expected = (torch.arange(81, dtype=torch.float64) - 40.0) / 40.5
-    # Bilinear sampling of tan(theta) at 83 px/rad: second-order, (1/83)^2 / 8 * tan'' = 7e-4 at 45 deg off and corners.
+    # Bilinear sampling of tan(theta) at 83 px/rad: second-order, (1/83)^2 / 8 * tan'' = 7e-4 at 45
+    # deg off and corners.
     assert (straight[30] - expected).abs().max() < 2e-3
     assert (straight[:, 60] - expected[60]).abs().max() < 2e-3
 
@@ -110,7 +127,9 @@ def test_turned_view_looks_where_it_says():
     expected = torch.tensor([159.5 + 83.3 * math.radians(50.0), 159.5], dtype=torch.float64)
     assert torch.allclose(pixels[20, 20], expected, atol=1e-9)
     up, _ = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, pitch_deg=50.0))
-    assert torch.allclose(up[20, 20], torch.tensor([159.5, 159.5 - 83.3 * math.radians(50.0)], dtype=torch.float64))
+    assert torch.allclose(
+        up[20, 20], torch.tensor([159.5, 159.5 - 83.3 * math.radians(50.0)], dtype=torch.float64)
+    )
     _, past = view_map(CAMERA.fisheye, ViewParams(41, 41, 90.0, yaw_deg=100.0))
     assert not past[20, 40]
 

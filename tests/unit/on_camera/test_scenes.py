@@ -1,4 +1,6 @@
-"""The batched renderer: where things are in its pictures, against projection, motion and an independent renderer; seeds."""
+"""The batched renderer: where things are in its pictures, against projection, motion and an
+independent renderer; seeds.
+"""
 
 import math
 from dataclasses import replace
@@ -19,9 +21,13 @@ from tests.drawn import render_scene
 pytest.importorskip("skimage", reason="photographs of visthrow[detector]")
 
 LENS = FisheyeParams(192, 192, 50.0, 50.0, 95.5, 95.5, k1=-0.01, fov_deg=200.0)
-CAMERA = CameraParams(LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033)
+CAMERA = CameraParams(
+    LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
+)
 CENTRE = 0.2
-"""Of an evenly lit ball some pixels large, by the middle of its pixels against its projection [px]; the lens bends it a little."""
+"""Of an evenly lit ball some pixels large, by the middle of its pixels against its projection [px];
+the lens bends it a little.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +38,13 @@ def renderer():
 def hovering(ball=(0.05, 0.1, 1.0), goal=(0.7, 0.3), tilt=(0.1, -0.2, 0.05)):
     """A plain scene, evenly lit, its ball without a seam."""
     scenes = posed_scenes(
-        CAMERA, torch.tensor([[0.0, 0.0, 1.3]]), rotation_from_vector(torch.tensor([tilt])), torch.tensor([ball]), torch.tensor([goal]),
+        CAMERA,
+        torch.tensor([[0.0, 0.0, 1.3]]),
+        rotation_from_vector(torch.tensor([tilt])),
+        torch.tensor([ball]),
+        torch.tensor([goal]),
         torch.tensor([False]),
-    )  # fmt: skip
+    )
     scenes.light[:, 3] = 1.0
     scenes.ball[:, 14:17] = scenes.ball[:, 11:14]
     return scenes
@@ -61,9 +71,13 @@ def test_ball_and_square_are_where_the_lens_puts_them(renderer):
     truth, lens = truth_of(scenes, Fisheye(LENS)), Fisheye(LENS)
     ball, _ = lens.project(truth.ball_c)
     corners, _ = lens.project(truth.corners_c)
-    area = cv2.moments(corners[0].float().numpy())  # of the quadrangle: its nearer half is the larger one
+    area = cv2.moments(
+        corners[0].float().numpy()
+    )  # of the quadrangle: its nearer half is the larger one
     np.testing.assert_allclose(centroid(yellow(image)), ball[0].numpy(), atol=CENTRE)
-    np.testing.assert_allclose(centroid(green(image)), [area["m10"] / area["m00"], area["m01"] / area["m00"]], atol=CENTRE)
+    np.testing.assert_allclose(
+        centroid(green(image)), [area["m10"] / area["m00"], area["m01"] / area["m00"]], atol=CENTRE
+    )
     assert truth.ball_seen.all()
     assert truth.goal_seen.all()
     assert not image[0, 0].any(), "black outside the field of view"
@@ -74,7 +88,10 @@ def test_the_other_renderer_draws_the_same_square_and_ball(renderer):
     scenes, lens = hovering(), Fisheye(LENS)
     eye, mount = scenes.pose[0, :3], nominal_rot_cb(CAMERA.mount)
     rot = rotation_from_vector(torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64)) @ mount.T
-    other = render_scene(lens, eye, rot, scenes.goal[0, :2], scenes.ball[0, :3], supersample=3).numpy() * 255.0
+    other = (
+        render_scene(lens, eye, rot, scenes.goal[0, :2], scenes.ball[0, :3], supersample=3).numpy()
+        * 255.0
+    )
     ours = renderer.render(scenes)[0].numpy()
     for shape in (yellow, green):
         a, b = shape(ours), shape(other)
@@ -83,7 +100,9 @@ def test_the_other_renderer_draws_the_same_square_and_ball(renderer):
 
 
 def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
-    """A fast ball is smeared about where it is when its rows are exposed, off its place at the middle of the frame."""
+    """A fast ball is smeared about where it is when its rows are exposed, off its place at the
+    middle of the frame.
+    """
     scenes = hovering(ball=(-0.35, 0.1, 1.0))
     scenes.ball[:, 4:7] = torch.tensor([[0.0, 4.0, 0.0]])
     scenes = replace(scenes, shutter=torch.tensor([[0.004, 0.04, 0.0]]))
@@ -91,7 +110,9 @@ def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
     rolled, _ = lens.project(truth_of(scenes, lens).ball_c)
     still, _ = lens.project(truth_of(replace(scenes, shutter=torch.zeros(1, 3)), lens).ball_c)
     assert (rolled - still).norm() > 3.0
-    np.testing.assert_allclose(centroid(yellow(renderer.render(scenes)[0].numpy())), rolled[0].numpy(), atol=2 * CENTRE)
+    np.testing.assert_allclose(
+        centroid(yellow(renderer.render(scenes)[0].numpy())), rolled[0].numpy(), atol=2 * CENTRE
+    )
 
 
 def test_a_seed_gives_the_same_bits_alone_and_in_a_batch(renderer):
@@ -110,8 +131,14 @@ def test_nuisances_are_off_and_on(renderer):
     assert not plain.shutter.any()
     assert not plain.things[..., 0].any()
     assert not plain.rope[:, 3].any()
-    torch.testing.assert_close(plain.sensor[:, :4], torch.tensor([[1.0, 0.0, 0.0, 1.0]]).expand(4, 4))
-    torch.testing.assert_close(plain.pose, random_scenes(CAMERA, renderer.textures, 4, 1).pose, msg="the same moments all the same")
+    torch.testing.assert_close(
+        plain.sensor[:, :4], torch.tensor([[1.0, 0.0, 0.0, 1.0]]).expand(4, 4)
+    )
+    torch.testing.assert_close(
+        plain.pose,
+        random_scenes(CAMERA, renderer.textures, 4, 1).pose,
+        msg="the same moments all the same",
+    )
     scenes = hovering()
     blurred = replace(scenes, shutter=torch.tensor([[0.0, 0.0, 1.5]]))
     sharp, soft = (renderer.render(s)[0, 60:130, 60:130].float() for s in (scenes, blurred))

@@ -1,4 +1,6 @@
-"""The diagnosis put into a configuration: what is written is what training and the next diagnosis read."""
+"""The diagnosis put into a configuration: what is written is what training and the next diagnosis
+read.
+"""
 
 import json
 
@@ -14,7 +16,13 @@ from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.task import DiagnosedParams, Experiment, contract_of, drawn_plants, plant_of
 
-THETA = {"thrust_gain": 0.03, "mass_quad": 0.006, "rope_length": -0.004, "wind_x": 0.2, "frame_tilt_x": 0.01}
+THETA = {
+    "thrust_gain": 0.03,
+    "mass_quad": 0.006,
+    "rope_length": -0.004,
+    "wind_x": 0.2,
+    "frame_tilt_x": 0.01,
+}
 COVARIANCE = np.diag([0.01, 0.002, 0.0005, 0.02, 0.001]) ** 2
 COVARIANCE[0, 1] = COVARIANCE[1, 0] = 0.99 * 0.01 * 0.002
 
@@ -28,9 +36,18 @@ def diagnosis(tmp_path):
     """A diagnosis as explain writes it; a function that changes entries."""
 
     def write(**changes):
-        value = {"plant": "state", "theta": THETA, "covariance": COVARIANCE.tolist(), "overall": "KNOWN", "flights": 12,
-                 "gain": {"channels": [{"channel": "pos_w", "before": 2.0, "after": 1.0}], "nats_per_sample": 0.4,
-                          "landing": {"throws": 9, "before": 0.11, "after": 0.02}}}  # fmt: skip
+        value = {
+            "plant": "state",
+            "theta": THETA,
+            "covariance": COVARIANCE.tolist(),
+            "overall": "KNOWN",
+            "flights": 12,
+            "gain": {
+                "channels": [{"channel": "pos_w", "before": 2.0, "after": 1.0}],
+                "nats_per_sample": 0.4,
+                "landing": {"throws": 9, "before": 0.11, "after": 0.02},
+            },
+        }
         path = tmp_path / "diagnosis.json"
         path.write_text(json.dumps(value | changes))
         return str(path)
@@ -40,7 +57,9 @@ def diagnosis(tmp_path):
 
 def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     out = tmp_path / "mine.toml"
-    scatter = [{"name": "lag_jitter", "found": True, "size": 0.01, "unit": "s", "of": ["release_lag"]}]
+    scatter = [
+        {"name": "lag_jitter", "found": True, "size": 0.01, "unit": "s", "of": ["release_lag"]}
+    ]
     own = {"name": "wind_x", "estimate": 0.21, "low": 0.16, "high": 0.26, "unit": "m/s"}
     given = diagnosis(scatter=scatter, findings=[own, own | {"name": "wind_y"}])
     assert cli.main(["diagnose", "apply", given, "--out", str(out), "--plants", "8"]) == 0
@@ -51,9 +70,17 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert after.rope.length == pytest.approx(before.rope.length - 0.004)
     assert after.air.wind_w == (0.2, 0.0, 0.0)
     assert after.sensing.frame_tilt == (0.01, 0.0, 0.0)
-    assert after.diagnosed.effects == ("thrust_gain", "mass_quad", "rope_length", "wind_x", "release_lag")  # no tilted frame
+    assert after.diagnosed.effects == (
+        "thrust_gain",
+        "mass_quad",
+        "rope_length",
+        "wind_x",
+        "release_lag",
+    )  # no tilted frame
     np.testing.assert_allclose(np.array(after.diagnosed.covariance)[:4, :4], COVARIANCE[:4, :4])
-    lags = [plant.release.lag for plant in drawn_plants(after, 0)]  # what varies from throw to throw does so in training
+    lags = [
+        plant.release.lag for plant in drawn_plants(after, 0)
+    ]  # what varies from throw to throw does so in training
     assert np.std(lags) == pytest.approx(0.01, rel=0.5)
     assert len(set(lags)) == 8
     assert after.vehicle.motor == before.vehicle.motor
@@ -81,27 +108,60 @@ def test_applied_twice_is_applied_once_more(diagnosis, tmp_path, capsys):
 
 
 def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, capsys):
-    """The plant and the overrides that the diagnosis was made with, whatever the shipped one says; of another nothing is written."""
+    """The plant and the overrides that the diagnosis was made with, whatever the shipped one says;
+    of another nothing is written.
+    """
     quick, out = tmp_path / "quick.toml", tmp_path / "mended.toml"
     quick.write_text('base = "train/state.toml"\n[release]\nlag = 0.08\n')
-    found = {"theta": {"release_lag": 0.03}, "covariance": [[1e-6]], "overrides": ["rope.length=0.5"]}
-    for plant, option, message in ((str(quick), ["--plant", "state"], "do not count from state"), (None, [], "names no plant")):
-        assert cli.main(["diagnose", "apply", diagnosis(plant=plant, **found), *option, "--out", str(out)]) == 2
+    found = {
+        "theta": {"release_lag": 0.03},
+        "covariance": [[1e-6]],
+        "overrides": ["rope.length=0.5"],
+    }
+    for plant, option, message in (
+        (str(quick), ["--plant", "state"], "do not count from state"),
+        (None, [], "names no plant"),
+    ):
+        assert (
+            cli.main(
+                ["diagnose", "apply", diagnosis(plant=plant, **found), *option, "--out", str(out)]
+            )
+            == 2
+        )
         assert message in capsys.readouterr().err
     assert not out.exists()
-    assert cli.main(["diagnose", "apply", diagnosis(plant=str(quick), **found), "--out", str(out)]) == 0
+    assert (
+        cli.main(["diagnose", "apply", diagnosis(plant=str(quick), **found), "--out", str(out)])
+        == 0
+    )
     after = config.load(Experiment, out)
     assert (after.release.lag, after.rope.length) == pytest.approx((0.11, 0.5))
 
 
 def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
-    law = {"formula": "F_p = c (z x v_p)", "block": "payload force", "factors": ["speed"], "vector": "vertical_cross_vel",
-           "coefficient": 0.02, "sd": 0.001, "unit": "kg m^-1", "nats": 40.0}  # fmt: skip
+    law = {
+        "formula": "F_p = c (z x v_p)",
+        "block": "payload force",
+        "factors": ["speed"],
+        "vector": "vertical_cross_vel",
+        "coefficient": 0.02,
+        "sd": 0.001,
+        "unit": "kg m^-1",
+        "nats": 40.0,
+    }
     out = tmp_path / "law.toml"
-    arguments = ["diagnose", "apply", diagnosis(theta={}, covariance=[], laws=[law]), "--out", str(out)]
+    arguments = [
+        "diagnose",
+        "apply",
+        diagnosis(theta={}, covariance=[], laws=[law]),
+        "--out",
+        str(out),
+    ]
     assert cli.main([*arguments, "--laws", "1"]) == 0
     assert "vertical_cross_vel" in capsys.readouterr().out
-    assert config.load(Experiment, out).laws == (LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),)
+    assert config.load(Experiment, out).laws == (
+        LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),
+    )
     assert cli.main([*arguments, "--laws", "2"]) == 2
     assert "asks for number 2" in capsys.readouterr().err
     assert cli.main(arguments) == 0
@@ -110,9 +170,19 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
 
 def test_laws_that_belong_together_are_written_together(diagnosis, tmp_path):
     """The first explanation has two terms, the second, which stands in its place, one of them."""
-    swirl = {"block": "payload force", "factors": ["speed"], "vector": "vertical_cross_vel", "coefficient": 0.02}
+    swirl = {
+        "block": "payload force",
+        "factors": ["speed"],
+        "vector": "vertical_cross_vel",
+        "coefficient": 0.02,
+    }
     other = swirl | {"factors": [], "coefficient": 0.03}
-    given = diagnosis(theta={}, covariance=[], laws=[swirl, other], explanations=[[swirl, other], [other | {"coefficient": 0.05}]])
+    given = diagnosis(
+        theta={},
+        covariance=[],
+        laws=[swirl, other],
+        explanations=[[swirl, other], [other | {"coefficient": 0.05}]],
+    )
     for rank, coefficients in ((1, [0.02, 0.03]), (2, [0.05])):
         out = tmp_path / f"{rank}.toml"
         assert cli.main(["diagnose", "apply", given, "--out", str(out), "--laws", str(rank)]) == 0
@@ -133,7 +203,9 @@ def test_every_effect_can_be_written():
 
 def test_draws_keep_what_is_pinned_together():
     before = shipped()
-    loose = DiagnosedParams(("thrust_gain", "mass_quad"), tuple(map(tuple, COVARIANCE[:2, :2])), 400)
+    loose = DiagnosedParams(
+        ("thrust_gain", "mass_quad"), tuple(map(tuple, COVARIANCE[:2, :2])), 400
+    )
     from dataclasses import replace
 
     plants = drawn_plants(replace(before, diagnosed=loose), 1)
@@ -157,11 +229,20 @@ def test_a_config_without_diagnosis_keeps_its_contract():
         ({"theta": {"no_such": 1.0}, "covariance": [[1.0]]}, "no effects of the throw"),
         ({"covariance": [[1.0]]}, "expected one each"),
         ({"theta": None}, "no diagnosis"),
-        ({"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}}, "do not bear this out"),
+        (
+            {"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}},
+            "do not bear this out",
+        ),
         ({"model": "flyer"}, "a diagnosis of the model 'flyer'"),
         ({"theta": {"thrust_curve": -0.481}, "covariance": [[1e-3]]}, "from -0.0004 to 0.0004"),
-        ({"theta": {"thrust_curve": -1e-4}, "covariance": [[1e-9]], "findings": [{"name": "thrust_curve", "unit": "1"}]},
-         "thrust_curve in '1'; the throw's thrust_curve is in 'N s/rad'"),
+        (
+            {
+                "theta": {"thrust_curve": -1e-4},
+                "covariance": [[1e-9]],
+                "findings": [{"name": "thrust_curve", "unit": "1"}],
+            },
+            "thrust_curve in '1'; the throw's thrust_curve is in 'N s/rad'",
+        ),
     ],
 )
 def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):
@@ -172,45 +253,125 @@ def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):
 
 
 def test_nothing_named_writes_nothing(diagnosis, tmp_path, capsys):
-    assert cli.main(["diagnose", "apply", diagnosis(theta={}, covariance=[]), "--out", str(tmp_path / "x.toml")]) == 0
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "apply",
+                diagnosis(theta={}, covariance=[]),
+                "--out",
+                str(tmp_path / "x.toml"),
+            ]
+        )
+        == 0
+    )
     assert "nothing was named" in capsys.readouterr().out
 
 
-BALL = {"model": "ball", "theta": {"ball_drag": 0.03}, "covariance": [[1e-8]], "findings": [{"name": "ball_drag", "unit": "1/m"}]}
+BALL = {
+    "model": "ball",
+    "theta": {"ball_drag": 0.03},
+    "covariance": [[1e-8]],
+    "findings": [{"name": "ball_drag", "unit": "1/m"}],
+}
 
 
 def test_other_models_have_extended_setups(diagnosis, tmp_path):
-    """Sizes are counted from there by whoever loads the setup, in the next diagnosis and the next extension, too."""
+    """Sizes are counted from there by whoever loads the setup, in the next diagnosis and the next
+    extension, too.
+    """
     out, again = tmp_path / "once.toml", tmp_path / "twice.toml"
-    assert cli.main(["diagnose", "apply", diagnosis(**BALL, config="jugglebot"), "--out", str(out)]) == 0
-    assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", str(out), "--out", str(again)]) == 0
+    assert (
+        cli.main(["diagnose", "apply", diagnosis(**BALL, config="jugglebot"), "--out", str(out)])
+        == 0
+    )
+    assert (
+        cli.main(
+            ["diagnose", "apply", diagnosis(**BALL), "--config", str(out), "--out", str(again)]
+        )
+        == 0
+    )
     assert setups.load(out).effects == {"ball_drag": 0.03}
     assert setups.load(again).effects == pytest.approx({"ball_drag": 0.06})
     logs = [ball_log(drag=0.03, seed=1)]
     plain, extended = (setups.model_of(setups.load(name), logs) for name in ("jugglebot", out))
-    np.testing.assert_allclose(extended.residuals({})[0], plain.residuals({"ball_drag": 0.03})[0], atol=1e-9)
+    np.testing.assert_allclose(
+        extended.residuals({})[0], plain.residuals({"ball_drag": 0.03})[0], atol=1e-9
+    )
     assert extended.effects[0].bounds[0] == pytest.approx(plain.effects[0].bounds[0] - 0.03)
 
 
 def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys):
     out = tmp_path / "x.toml"
-    assert cli.main(["diagnose", "apply", diagnosis(**BALL), "--config", "pendulum_encoder", "--out", str(out)]) == 2
-    assert "a diagnosis of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum" in capsys.readouterr().err
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "apply",
+                diagnosis(**BALL),
+                "--config",
+                "pendulum_encoder",
+                "--out",
+                str(out),
+            ]
+        )
+        == 2
+    )
+    assert (
+        "a diagnosis of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum"
+        in capsys.readouterr().err
+    )
     out.write_text('base = "diagnose/jugglebot.toml"\n[effects]\nball_drag = 0.4\n')
     for theta, unit, name, message in (
         ({"ball_drag": 9.0}, "1/m", "jugglebot", "ball_drag = 9 1/m; the ball has it from"),
         ({"ball_drag": 0.2}, "1/m", str(out), "ball_drag = 0.6 1/m; the ball has it from"),
-        ({"ball_drag": 0.1}, "N", "jugglebot", "ball_drag in 'N'; the ball's ball_drag is in '1/m'"),
+        (
+            {"ball_drag": 0.1},
+            "N",
+            "jugglebot",
+            "ball_drag in 'N'; the ball's ball_drag is in '1/m'",
+        ),
         ({"thrust": 1.0}, "N", "jugglebot", "thrust are no effects of the ball"),
     ):
-        report = diagnosis(**{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]})
-        assert cli.main(["diagnose", "apply", report, "--config", name, "--out", str(tmp_path / "none.toml")]) == 2
+        report = diagnosis(
+            **{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]}
+        )
+        assert (
+            cli.main(
+                [
+                    "diagnose",
+                    "apply",
+                    report,
+                    "--config",
+                    name,
+                    "--out",
+                    str(tmp_path / "none.toml"),
+                ]
+            )
+            == 2
+        )
         assert message in capsys.readouterr().err
         assert not (tmp_path / "none.toml").exists()
     at_bound = diagnosis(**{**BALL, "theta": {"ball_drag": 0.1 + 1e-12}})
-    assert cli.main(["diagnose", "apply", at_bound, "--config", str(out), "--out", str(tmp_path / "bound.toml")]) == 0
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "apply",
+                at_bound,
+                "--config",
+                str(out),
+                "--out",
+                str(tmp_path / "bound.toml"),
+            ]
+        )
+        == 0
+    )
     setups.model_of(setups.load(tmp_path / "bound.toml"), [ball_log(seed=1)])
-    for entry, message in (("ball_drag = 9.0", "ball_drag = 9 1/m; this model has it from"), ("thrust = 1.0", "no effect 'thrust'")):
+    for entry, message in (
+        ("ball_drag = 9.0", "ball_drag = 9 1/m; this model has it from"),
+        ("thrust = 1.0", "no effect 'thrust'"),
+    ):
         out.write_text(f'base = "diagnose/jugglebot.toml"\n[effects]\n{entry}\n')
         with pytest.raises(LogError, match=message):
             setups.model_of(setups.load(out), [ball_log(seed=1)])
@@ -227,16 +388,34 @@ def test_a_broken_covariance_is_refused():
 
 
 def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
-    """The settings in the header become the block, the delay is as told, and what the block cannot say is named."""
+    """The settings in the header become the block, the delay is as told, and what the block cannot
+    say is named.
+    """
     log, out = tmp_path / "LOG00001.BFL", tmp_path / "firmware.toml"
     header = {
-        "Firmware revision": "Betaflight 4.6.0", "rollPID": "11,20,8", "pitchPID": "12,21,9", "yawPID": "45,80,0", "ff_weight": "0,0,0",
-        "iterm_relax_cutoff": "15", "motor_idle": "550", "pidsum_limit": "1000", "iterm_windup": "80", "gyro_lpf2_static_hz": "500",
-        "tpa_rate": "65", "Field I name": "loopIteration,time", "Field I signed": "0,0", "Field I predictor": "0,0",
-        "Field I encoding": "1,1", "Field P predictor": "6,2", "Field P encoding": "9,0",
-    }  # fmt: skip
+        "Firmware revision": "Betaflight 4.6.0",
+        "rollPID": "11,20,8",
+        "pitchPID": "12,21,9",
+        "yawPID": "45,80,0",
+        "ff_weight": "0,0,0",
+        "iterm_relax_cutoff": "15",
+        "motor_idle": "550",
+        "pidsum_limit": "1000",
+        "iterm_windup": "80",
+        "gyro_lpf2_static_hz": "500",
+        "tpa_rate": "65",
+        "Field I name": "loopIteration,time",
+        "Field I signed": "0,0",
+        "Field I predictor": "0,0",
+        "Field I encoding": "1,1",
+        "Field P predictor": "6,2",
+        "Field P encoding": "9,0",
+    }
     text = "H Product:Blackbox flight data recorder by Nicholas Sherlock\nH Data version:2\n"
-    log.write_bytes((text + "".join(f"H {name}:{value}\n" for name, value in header.items())).encode() + b"I\x00\x05")
+    log.write_bytes(
+        (text + "".join(f"H {name}:{value}\n" for name, value in header.items())).encode()
+        + b"I\x00\x05"
+    )
     command = ["diagnose", "apply", str(log), "--plant", "vision", "--out", str(out)]
     assert cli.main(command) == 2
     assert "--hover" in capsys.readouterr().err

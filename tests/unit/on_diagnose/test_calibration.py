@@ -1,4 +1,7 @@
-"""Error rates of the search over many random worlds: false alarms, completeness, coverage. Minutes, hence slow."""
+"""Error rates of the search over many random worlds: false alarms, completeness, coverage.
+
+Minutes, hence slow.
+"""
 
 import numpy as np
 import pytest
@@ -20,16 +23,31 @@ def worlds(count: int, hidden: int, floors: float, seed: int):
     rng = np.random.default_rng(seed)
     for i in range(count):
         names = rng.choice([e.name for e in EFFECTS], hidden, replace=False)
-        truth = {str(name): float(rng.choice((-1.0, 1.0)) * floors * rng.uniform(0.9, 1.1)) for name in names}
-        yield truth, SyntheticModel(
-            effects=EFFECTS, truth=truth, seed=int(rng.integers(10**6)), noise=rng.choice([0.5, 1.0, 2.0]),
-            gust=rng.choice([0.5, 1.0, 2.0]), curvature=0.1, fresh=i,
-        )  # fmt: skip
+        truth = {
+            str(name): float(rng.choice((-1.0, 1.0)) * floors * rng.uniform(0.9, 1.1))
+            for name in names
+        }
+        yield (
+            truth,
+            SyntheticModel(
+                effects=EFFECTS,
+                truth=truth,
+                seed=int(rng.integers(10**6)),
+                noise=rng.choice([0.5, 1.0, 2.0]),
+                gust=rng.choice([0.5, 1.0, 2.0]),
+                curvature=0.1,
+                fresh=i,
+            ),
+        )
 
 
 def test_null_worlds_raise_no_false_alarm():
     """At most as many as a rate of one per cent allows."""
-    alarms = [d for _, model in worlds(NULLS, 0, 0.0, 1) if (d := search.explain(model)).overall != result.NO_EFFECT]
+    alarms = [
+        d
+        for _, model in worlds(NULLS, 0, 0.0, 1)
+        if (d := search.explain(model)).overall != result.NO_EFFECT
+    ]
     assert binom.sf(len(alarms) - 1, NULLS, 0.01) > SURE, [a.reasons for a in alarms]
 
 

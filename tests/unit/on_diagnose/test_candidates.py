@@ -1,4 +1,6 @@
-"""Candidates whose derivatives at the model's own values fall short of what they explain: they are looked at where they lead."""
+"""Candidates whose derivatives at the model's own values fall short of what they explain: they are
+looked at where they lead.
+"""
 
 from dataclasses import replace
 
@@ -13,7 +15,9 @@ from visthrow.diagnose.select.point import Problem, fitted, linearise
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
 LUCK, SHOWN = 0.3, 0.2
-"""What better initial states explain, in noise; what an effect does there, in what its derivative says."""
+"""What better initial states explain, in noise; what an effect does there, in what its derivative
+says.
+"""
 BUMP = 0.3
 """Misfit a floor's distance from where initial states were fitted, in noise."""
 
@@ -33,7 +37,10 @@ class Whipping(SyntheticModel):
         floor = EFFECTS[3].floor
         far = BUMP * (theta.get(NAME, 0.0) - self.at) / floor
         rough = np.random.default_rng(3)
-        return [r + far * w.sigma * rough.choice((-1.0, 1.0), len(r)) for r, w in zip(super().residuals(theta), self._windows)]
+        return [
+            r + far * w.sigma * rough.choice((-1.0, 1.0), len(r))
+            for r, w in zip(super().residuals(theta), self._windows)
+        ]
 
 
 def explained(size: float):
@@ -48,7 +55,9 @@ def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_lead
 
 
 class Luckier(SyntheticModel):
-    """Initial states fitted anew explain more than the first at any size, and derivatives there tell of more than the size does."""
+    """Initial states fitted anew explain more than the first at any size, and derivatives there
+    tell of more than the size does.
+    """
 
     def __post_init__(self):
         super().__post_init__()
@@ -57,7 +66,10 @@ class Luckier(SyntheticModel):
     def windows(self, theta):
         self.fits += 1
         found = super().windows(theta)
-        return [replace(w, residual=r) for w, r in zip(found, self._fitted(theta, [w.residual for w in found]))]
+        return [
+            replace(w, residual=r)
+            for w, r in zip(found, self._fitted(theta, [w.residual for w in found]))
+        ]
 
     def residuals(self, theta, about=None):
         return self._fitted(theta, super().residuals(theta))
@@ -66,13 +78,25 @@ class Luckier(SyntheticModel):
         rough, taken_back = np.random.default_rng(3), (1.0 - SHOWN) * theta.get(NAME, 0.0)
         if self.fits > 1:
             return [r + taken_back * w.effects[:, 3] for r, w in zip(residuals, self._windows)]
-        return [r + LUCK * w.sigma * rough.choice((-1.0, 1.0), len(r)) for r, w in zip(residuals, self._windows)]
+        return [
+            r + LUCK * w.sigma * rough.choice((-1.0, 1.0), len(r))
+            for r, w in zip(residuals, self._windows)
+        ]
 
 
 def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(monkeypatch):
-    """Without it they explain the flights as well, which the simulation shows and derivatives do not."""
-    monkeypatch.setattr(selector.Selector, "settle", lambda self, point, active, doubted=None: point if doubted is None else fitted(
-        self.problem, linearise(self.problem, point.theta, point.noise), active))  # fmt: skip
+    """Without it they explain the flights as well, which the simulation shows and derivatives do
+    not.
+    """
+    monkeypatch.setattr(
+        selector.Selector,
+        "settle",
+        lambda self, point, active, doubted=None: (
+            point
+            if doubted is None
+            else fitted(self.problem, linearise(self.problem, point.theta, point.noise), active)
+        ),
+    )
     model = Luckier(effects=EFFECTS, truth={NAME: 2.0}, seed=8)
     assert not search.explain(model, laws=False).named
     assert model.fits == 2
@@ -84,19 +108,29 @@ def test_what_whips_where_nothing_is_hidden_is_not_named():
 
 @pytest.mark.parametrize("begin", [0.0, 2.0])
 @pytest.mark.parametrize("sure", [False, True])
-def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(begin, sure, monkeypatch):
-    """Derivatives of a rope of 24 segments are a fifth of a minute; those of one without a size yet are taken where they point."""
+def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(
+    begin, sure, monkeypatch
+):
+    """Derivatives of a rope of 24 segments are a fifth of a minute; those of one without a size yet
+    are taken where they point.
+    """
     model = SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5)
     plain, taken = selector.linearise, []
     monkeypatch.setattr(state, "curvature", lambda *_: np.inf)
     for module in (selector, state):
-        monkeypatch.setattr(module, "linearise", lambda *given: (taken.append(given), plain(*given))[1])
-        monkeypatch.setattr(module, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0))
+        monkeypatch.setattr(
+            module, "linearise", lambda *given: (taken.append(given), plain(*given))[1]
+        )
+        monkeypatch.setattr(
+            module, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0)
+        )
     monkeypatch.setattr(selector.Selector, "sure", lambda *_: sure)
     monkeypatch.setattr(selector.Selector, "_best", lambda *_: False)
     problem = Problem(model, tuple(range(len(model.windows({})))))
     nominal = plain(problem, np.zeros(len(EFFECTS)))
-    looked_at = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
+    looked_at = selector.Selector(
+        problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal
+    )
     looked_at._closer(state.Move((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
     assert len(taken) == (points.ROUNDS + (begin == 0.0) if sure else begin == 0.0)
     assert looked_at.origin is nominal  # a candidate that is refused leaves no derivatives behind
@@ -104,7 +138,9 @@ def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(beg
 
 @pytest.mark.parametrize("alike", [(), ("effect_05", "effect_07")])
 def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypatch):
-    """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its mass in all others."""
+    """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its
+    mass in all others.
+    """
     plain, tried = points.candidate, []
 
     def candidate(problem, point, active):
@@ -113,17 +149,29 @@ def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypa
 
     monkeypatch.setattr(points, "candidate", candidate)
     effects = [replace(e, confused_with=alike) if e.name == NAME else e for e in EFFECTS]
-    diagnosis = search.explain(SyntheticModel(effects=tuple(effects), truth={NAME: SIZE}, seed=5), laws=False)
+    diagnosis = search.explain(
+        SyntheticModel(effects=tuple(effects), truth={NAME: SIZE}, seed=5), laws=False
+    )
     assert diagnosis.named == (NAME,)
     assert {(5,), (7,)} <= set(tried) if alike else not {(5,), (7,)} & set(tried)
 
 
 def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):
-    """Here one that explains what the bend of an effect leaves: it is gone where the effect is linearised."""
+    """Here one that explains what the bend of an effect leaves: it is gone where the effect is
+    linearised.
+    """
     asked, plain = [], selector.Selector.stands
-    monkeypatch.setattr(state, "curvature", lambda *_: 0.0)  # the search stays with its first derivatives
-    monkeypatch.setattr(selector.Selector, "_lawful", lambda hunt, *_: asked.append(hunt.origin.theta[3]) or True)
-    monkeypatch.setattr(selector.Selector, "stands", lambda hunt, point, active, j: hunt.is_term(j) or plain(hunt, point, active, j))
+    monkeypatch.setattr(
+        state, "curvature", lambda *_: 0.0
+    )  # the search stays with its first derivatives
+    monkeypatch.setattr(
+        selector.Selector, "_lawful", lambda hunt, *_: asked.append(hunt.origin.theta[3]) or True
+    )
+    monkeypatch.setattr(
+        selector.Selector,
+        "stands",
+        lambda hunt, point, active, j: hunt.is_term(j) or plain(hunt, point, active, j),
+    )
     model = SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={NAME: SIZE}, seed=5)
     assert search.explain(model).overall == result.UNKNOWN
     assert asked[-1] == pytest.approx(SIZE, rel=0.1)
@@ -135,19 +183,29 @@ def test_a_name_that_a_later_one_left_with_hardly_any_size_is_dropped(monkeypatc
     plain, other = selector.Selector.sure, 6
 
     def sure(self, point, active, j):
-        return plain(self, point, active, j) and not (j == other and len(active) > 1 and active[-1] != other)
+        return plain(self, point, active, j) and not (
+            j == other and len(active) > 1 and active[-1] != other
+        )
 
     monkeypatch.setattr(selector.Selector, "sure", sure)
-    monkeypatch.setattr(selector.Selector, "_exchange", lambda _: False)  # alone it would be a better answer than the other alone
+    monkeypatch.setattr(
+        selector.Selector, "_exchange", lambda _: False
+    )  # alone it would be a better answer than the other alone
     hidden = {NAME: SIZE, EFFECTS[other].name: 3.0 * SIZE}
     said = []
-    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth=hidden, seed=5), laws=False, progress=said.append)
-    assert said.index(next(s for s in said if "effect_06 named" in s)) < said.index("effect_06 dropped again")
+    diagnosis = search.explain(
+        SyntheticModel(effects=EFFECTS, truth=hidden, seed=5), laws=False, progress=said.append
+    )
+    assert said.index(next(s for s in said if "effect_06 named" in s)) < said.index(
+        "effect_06 dropped again"
+    )
     assert diagnosis.named == (NAME,)
 
 
 class Levered(SyntheticModel):
-    """A floor of one effect does what three floors of another do, and something of its own besides."""
+    """A floor of one effect does what three floors of another do, and something of its
+    own besides.
+    """
 
     by, lever = 1, 3.0
 
@@ -157,7 +215,10 @@ class Levered(SyntheticModel):
     def windows(self, theta):
         own = np.arange(len(EFFECTS)) == self.by
         found = zip(super().windows(theta), self.residuals(theta))
-        return [replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * own) for w, r in found]
+        return [
+            replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * own)
+            for w, r in found
+        ]
 
     def residuals(self, theta, about=None):
         e = EFFECTS[self.by]
@@ -166,11 +227,15 @@ class Levered(SyntheticModel):
 
 
 def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
-    """The configuration gets the sizes with which the named effects alone explain the flights; a finding tells the cause's own."""
+    """The configuration gets the sizes with which the named effects alone explain the flights; a
+    finding tells the cause's own.
+    """
     off, off_alone = [], []
     for seed in range(5):
         truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
-        diagnosis = search.explain(Levered(effects=EFFECTS, truth=truth, seed=seed, throws=8), laws=False)
+        diagnosis = search.explain(
+            Levered(effects=EFFECTS, truth=truth, seed=seed, throws=8), laws=False
+        )
         assert diagnosis.named == (NAME,)
         size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
         off.append((own.estimate - size) / own.sd)

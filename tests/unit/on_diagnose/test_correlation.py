@@ -1,4 +1,6 @@
-"""Correlated measurement noise: the algebra against dense covariances, the estimate against planted noise, and what it is there for."""
+"""Correlated measurement noise: the algebra against dense covariances, the estimate against planted
+noise, and what it is there for.
+"""
 
 from dataclasses import replace
 
@@ -8,7 +10,12 @@ from scipy.signal import lfilter
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood import marginal
-from visthrow.diagnose.likelihood.correlation import Correlation, components, correlations, with_correlations
+from visthrow.diagnose.likelihood.correlation import (
+    Correlation,
+    components,
+    correlations,
+    with_correlations,
+)
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import point, result, search
 
@@ -21,17 +28,23 @@ def noise(rng, count: int, colour: str) -> np.ndarray:
     white = rng.normal(size=(count + 400, 3))
     a = np.exp(-1.0 / (RATE * TIME))
     first = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white, axis=0)
-    second = lfilter([np.sqrt((1.0 - a * a) ** 3 / (1.0 + a * a))], [1.0, -2.0 * a, a * a], white, axis=0)
+    second = lfilter(
+        [np.sqrt((1.0 - a * a) ** 3 / (1.0 + a * a))], [1.0, -2.0 * a, a * a], white, axis=0
+    )
     return {"white": white, "first": first, "second": second}[colour][400:]
 
 
 def flown(seed: int, colour: str, **options) -> SyntheticModel:
     """Flights whose sensors have noise of a colour."""
-    model = SyntheticModel(effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=4, **options)
+    model = SyntheticModel(
+        effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=4, **options
+    )
     rng = np.random.default_rng([seed, 1])
     for i, window in enumerate(model._windows):
         own = [noise(rng, len(window.residual) // 6, colour).ravel() for _ in range(2)]
-        model._windows[i] = replace(window, residual=window.residual + window.sigma * np.concatenate(own))
+        model._windows[i] = replace(
+            window, residual=window.residual + window.sigma * np.concatenate(own)
+        )
     return model
 
 
@@ -52,18 +65,24 @@ def test_inner_products_are_those_of_the_dense_covariance(order):
     floors = np.ones(SOME)
     z, gram = marginal.columns(window, floors), marginal.gram_of(told, floors, 2)
     inverse = np.linalg.inv(dense)
-    np.testing.assert_allclose(gram.inner.sum(0), z.T @ inverse @ z, rtol=1e-6, atol=1e-9 * np.abs(gram.inner).max())
+    np.testing.assert_allclose(
+        gram.inner.sum(0), z.T @ inverse @ z, rtol=1e-6, atol=1e-9 * np.abs(gram.inner).max()
+    )
     assert gram.square.sum() == pytest.approx(window.residual @ inverse @ window.residual)
     assert 2.0 * gram.log_sigma == pytest.approx(np.linalg.slogdet(dense)[1])
     other = np.random.default_rng(0).normal(size=len(window.residual)) * window.sigma
     again = marginal.with_residual(gram, told, floors, other)
-    np.testing.assert_allclose(again.cross.sum(0), z.T @ inverse @ other, rtol=1e-6, atol=1e-9 * np.abs(again.cross).max())
+    np.testing.assert_allclose(
+        again.cross.sum(0), z.T @ inverse @ other, rtol=1e-6, atol=1e-9 * np.abs(again.cross).max()
+    )
     assert again.square.sum() == pytest.approx(other @ inverse @ other)
 
 
 def test_white_noise_is_white():
     assert not estimated(flown(2, "white"))
-    assert not estimated(flown(2, "white", truth={"effect_02": 60.0, "effect_04": 40.0})), "causes are not noise"
+    assert not estimated(flown(2, "white", truth={"effect_02": 60.0, "effect_04": 40.0})), (
+        "causes are not noise"
+    )
 
 
 def test_what_lasts_for_longer_than_a_filter_is_no_noise():
@@ -95,4 +114,6 @@ def test_noise_that_is_correlated_is_no_cause(monkeypatch):
 def test_a_cause_is_found_behind_it():
     diagnosis = search.explain(flown(5, "first", truth={"effect_01": 15.0}))
     assert diagnosis.named == ("effect_01",)
-    assert diagnosis["effect_01"].low < 15.0 * catalogue(SOME)[1].floor < diagnosis["effect_01"].high
+    assert (
+        diagnosis["effect_01"].low < 15.0 * catalogue(SOME)[1].floor < diagnosis["effect_01"].high
+    )

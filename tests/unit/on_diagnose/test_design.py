@@ -1,4 +1,6 @@
-"""Optimised excitation: it beats what it began with, keeps within the limits, and is flown by every vehicle that can fly it."""
+"""Optimised excitation: it beats what it began with, keeps within the limits, and is flown by every
+vehicle that can fly it.
+"""
 
 from dataclasses import replace
 
@@ -21,15 +23,23 @@ ABOUT = ("rotor_drag_xy", "rotor_drag_z", "cmd_delay", "motor_tau", "thrust_curv
 def plant(params):
     from visthrow import config
 
-    return fly_manoeuvres.vehicle_of(params, plant_of(config.load(Experiment, config.find("train", "state"))))
+    return fly_manoeuvres.vehicle_of(
+        params, plant_of(config.load(Experiment, config.find("train", "state")))
+    )
 
 
 def hovered(params):
     """A diagnosis of a hover of the setup's vehicle, and what simulates manoeuvres of it."""
-    (hover,) = fly_manoeuvres.fly(plant(params), [fly_manoeuvres.carried(BASES["hover"], params)], 0)
-    model = FlyerModel([hover.setup_log(params, {params.position: 3e-4, "payload_pos_w": 3e-4})], params)
+    (hover,) = fly_manoeuvres.fly(
+        plant(params), [fly_manoeuvres.carried(BASES["hover"], params)], 0
+    )
+    model = FlyerModel(
+        [hover.setup_log(params, {params.position: 3e-4, "payload_pos_w": 3e-4})], params
+    )
     diagnosis = search.explain(model, laws=False)
-    return diagnosis, *fly_manoeuvres.simulator_of(model, diagnosis, lambda logs: FlyerModel(logs, params))
+    return diagnosis, *fly_manoeuvres.simulator_of(
+        model, diagnosis, lambda logs: FlyerModel(logs, params)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -39,33 +49,48 @@ def quadrotor():
 
 
 def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
-    """Sweeps along all axes at once tell more a second of drag, delay and the map of thrust; an optimiser that returns its start fails."""
+    """Sweeps along all axes at once tell more a second of drag, delay and the map of thrust; an
+    optimiser that returns its start fails.
+    """
     diagnosis, simulate, flown = quadrotor
     aim = plan.Aim(diagnosis, ABOUT)
     chosen = [flown(BASES[name]) for name in ("vertical sine", "circle")]
-    rates = [aim.nats(aim.information(s.model)) / m.seconds for m, s in zip(chosen, simulate(chosen))]
+    rates = [
+        aim.nats(aim.information(s.model)) / m.seconds for m, s in zip(chosen, simulate(chosen))
+    ]
     best = chosen[int(np.argmax(rates))]
     found = design.optimise(aim, best, simulate, design.Limits(), seed=1, steps=1)
     assert found.start == pytest.approx(max(rates), rel=0.02)  # but for the noise
     assert found.rate > 1.15 * found.start
     (again,) = simulate([found.manoeuvre])
     assert again.used < 1.0
-    assert aim.nats(aim.information(again.model)) / best.seconds == pytest.approx(found.rate, rel=0.02)
+    assert aim.nats(aim.information(again.model)) / best.seconds == pytest.approx(
+        found.rate, rel=0.02
+    )
 
 
 @pytest.mark.parametrize("base", BASES.values(), ids=lambda m: m.name)
 def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(base: Manoeuvre):
     same, own = design.designed(base, design.Limits(), design.START).reference(), base.reference()
     for name in ("pos_w", "yaw", "rates_b", "thrust_factor", "release"):
-        np.testing.assert_allclose(getattr(same, name), getattr(own, name), atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(same, name), getattr(own, name), atol=1e-12, err_msg=name
+        )
     limits = design.Limits(half=(1.5, 1.0), highest=2.0, speed=1.5)
     allowed = limits.around(own.pos_w)
     for numbers in np.random.default_rng(3).random((20, len(design.NUMBERS))):
         r = design.designed(base, limits, numbers).reference()
         moved = np.abs(r.pos_w[:, :2]).max(0)
         assert np.all(moved <= np.array(allowed.half) + 1e-9)
-        assert allowed.lowest - 1e-9 <= r.pos_w[:, 2].min() <= r.pos_w[:, 2].max() <= allowed.highest + 1e-9
-        assert np.linalg.norm(r.vel_w, axis=1).max() <= 1.02 * allowed.speed  # the hover before and after is not part of the fit
+        assert (
+            allowed.lowest - 1e-9
+            <= r.pos_w[:, 2].min()
+            <= r.pos_w[:, 2].max()
+            <= allowed.highest + 1e-9
+        )
+        assert (
+            np.linalg.norm(r.vel_w, axis=1).max() <= 1.02 * allowed.speed
+        )  # the hover before and after is not part of the fit
         assert np.abs(r.rates_b).max() <= limits.rate + np.abs(own.rates_b).max() + 1e-9
 
 
@@ -86,14 +111,18 @@ def test_sweeps_go_as_far_as_the_limits_let_them():
 def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
     cable, bare = (setup.load(name).flyer for name in ("cf_payload", "nanobench_cf21"))
     for params in (cable, bare):
-        flown = [m for m in (fly_manoeuvres.carried(m, params) for m in BASES.values()) if m is not None]
+        flown = [
+            m for m in (fly_manoeuvres.carried(m, params) for m in BASES.values()) if m is not None
+        ]
         assert {m.payload for m in flown} == {params.cable is not None}
         assert not any(np.isfinite(m.release) for m in flown)
 
 
 @pytest.mark.parametrize("name", ["cf_payload", "nanobench_cf21"])
 def test_the_simulated_flight_of_a_setup_is_one_that_its_own_model_explains(name):
-    """The log's input, attitude and path belong together by the setup's own numbers: hardly anything is left without any effect."""
+    """The log's input, attitude and path belong together by the setup's own numbers: hardly
+    anything is left without any effect.
+    """
     params = setup.load(name).flyer
     chosen = [fly_manoeuvres.carried(BASES[m], params) for m in ("fast passes x", "circle")]
     for flight in fly_manoeuvres.fly(plant(params), chosen, 0):
@@ -112,8 +141,17 @@ def test_what_cannot_be_flown_costs_more_than_anything_that_can(quadrotor):
         def nats(self, information):
             return information
 
-    flights = {0: fly_manoeuvres.Simulated(3.0, 0.4), 1: fly_manoeuvres.Simulated(None, 1.5), 2: fly_manoeuvres.Simulated(None, 9.0)}
-    search_ = design._Search(Aim(), flown(BASES["hover"]), lambda ms: [flights[i] for i in range(len(ms))], design.Limits())
+    flights = {
+        0: fly_manoeuvres.Simulated(3.0, 0.4),
+        1: fly_manoeuvres.Simulated(None, 1.5),
+        2: fly_manoeuvres.Simulated(None, 9.0),
+    }
+    search_ = design._Search(
+        Aim(),
+        flown(BASES["hover"]),
+        lambda ms: [flights[i] for i in range(len(ms))],
+        design.Limits(),
+    )
     flew, aborted, crashed = search_.costs(np.tile(design.START[:, None], 3))
     assert flew < aborted < crashed
     assert search_.best[0] == pytest.approx(3.0 / BASES["hover"].seconds)

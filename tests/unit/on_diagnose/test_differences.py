@@ -1,4 +1,6 @@
-"""Intervals of sizes are widened by what flights may differ by, as far as the flights do not say otherwise."""
+"""Intervals of sizes are widened by what flights may differ by, as far as the flights do not say
+otherwise.
+"""
 
 import numpy as np
 
@@ -22,10 +24,14 @@ def flights(shares: np.ndarray, rng: np.random.Generator) -> Statistics:
     noise = rng.multivariate_normal(np.zeros(2), information[0], len(shares))
     score = np.einsum("fij,fj->fi", information, sizes) + noise
     square = np.einsum("fi,fij,fj->f", score, np.linalg.inv(information), score)
-    return Statistics(np.arange(len(shares)), information, score, square, np.ones(len(shares)), np.zeros(2))
+    return Statistics(
+        np.arange(len(shares)), information, score, square, np.ones(len(shares)), np.zeros(2)
+    )
 
 
-PRIORS = Priors(np.ones(2), np.full(2, 50.0), np.full(2, -500.0), np.full(2, 500.0), np.ones(2, dtype=bool))
+PRIORS = Priors(
+    np.ones(2), np.full(2, 50.0), np.full(2, -500.0), np.full(2, 500.0), np.ones(2, dtype=bool)
+)
 
 
 def interval(statistics: Statistics) -> tuple[float, float]:
@@ -38,12 +44,16 @@ def interval(statistics: Statistics) -> tuple[float, float]:
 
 def test_one_flight_alone_tells_a_size_to_a_floor_and_a_third():
     """Nothing tells how flights differ, so that the prior stands."""
-    unlike = differences(flights(np.full(1, SIZE), np.random.default_rng(1)), PRIORS, [0], np.array([SIZE, 0.0]))
+    unlike = differences(
+        flights(np.full(1, SIZE), np.random.default_rng(1)), PRIORS, [0], np.array([SIZE, 0.0])
+    )
     np.testing.assert_allclose(unlike, 1.0, rtol=0.05)  # of the half-normal's square, over the grid
 
 
 def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter():
-    """Of sixteen flights nothing of a third of the size is left; where they scatter by more than that, the scatter is."""
+    """Of sixteen flights nothing of a third of the size is left; where they scatter by more than
+    that, the scatter is.
+    """
     rng = np.random.default_rng(2)
     assert interval(flights(np.full(16, SIZE), rng))[1] < 0.3
     apart = 2.0 * allowed(SIZE) * rng.standard_normal(16)
@@ -56,11 +66,15 @@ def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
     rng, held = np.random.default_rng(3), 0
     for _ in range(TRIED):
         deviation = abs(rng.standard_normal()) * allowed(SIZE)
-        size, sd = interval(flights(SIZE + deviation * rng.standard_normal(rng.integers(3, 9)), rng))
+        size, sd = interval(
+            flights(SIZE + deviation * rng.standard_normal(rng.integers(3, 9)), rng)
+        )
         held += abs(size - SIZE) < 1.96 * sd
     assert held > LEAST * TRIED
 
 
 def test_without_names_nothing_is_added():
     """Bounds of a model that explains its flights are those of its noise and its floors."""
-    assert not differences(flights(np.zeros(3), np.random.default_rng(4)), PRIORS, [], np.zeros(2)).any()
+    assert not differences(
+        flights(np.zeros(3), np.random.default_rng(4)), PRIORS, [], np.zeros(2)
+    ).any()

@@ -1,4 +1,6 @@
-"""Commands that got lost: what each would have changed, and that they are found and told beside what else there is."""
+"""Commands that got lost: what each would have changed, and that they are found and told beside
+what else there is.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -21,7 +23,11 @@ ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
 
 @cache
 def model_of(lost: float, throws: int = 3, **theta: float) -> ThrowModel:
-    return ThrowModel(fly(setting_with(theta), seed=4, free=1, throws=throws, seconds=3.0, lost=lost), paper_plant(), only=ONLY)
+    return ThrowModel(
+        fly(setting_with(theta), seed=4, free=1, throws=throws, seconds=3.0, lost=lost),
+        paper_plant(),
+        only=ONLY,
+    )
 
 
 def test_a_column_is_what_the_missing_command_changes():
@@ -33,7 +39,9 @@ def test_a_column_is_what_the_missing_command_changes():
     f = flights.flights[c.flight]
     acts = f.command_time + setting.plant.vehicle.queue.delay
     first = int(flights.windows["command_first"][w])
-    inside = np.flatnonzero((np.append(acts[1:], np.inf) > c.start) & (acts < c.end) & (np.arange(len(acts)) > 0))
+    inside = np.flatnonzero(
+        (np.append(acts[1:], np.inf) > c.start) & (acts < c.end) & (np.arange(len(acts)) > 0)
+    )
     assert columns[len(columns) // 2].shape[1] == len(inside)
     lane, largest = [Lane(w, 0, w, rough=True)], 0.0
     simulation = model.simulation(setting)
@@ -58,9 +66,13 @@ def test_a_problem_with_lost_commands_says_the_same_both_ways():
     for w, own, there, columns in zip(point.windows, windows, again.windows, point.commands):
         np.testing.assert_allclose(there.residual, w.residual, atol=1e-9)
         assert w.nuisance.shape[1] == own.nuisance.shape[1] + columns.shape[1]
-        assert np.all(w.nuisance_sd[len(own.nuisance_sd) :] == pytest.approx(np.sqrt(SHARE * (1.0 - SHARE))))
+        assert np.all(
+            w.nuisance_sd[len(own.nuisance_sd) :] == pytest.approx(np.sqrt(SHARE * (1.0 - SHARE)))
+        )
         np.testing.assert_allclose(own.residual - w.residual, SHARE * columns.sum(1), atol=1e-12)
-    assert all(w.nuisance.shape == windows[i].nuisance.shape for i, w in point.about.windows.items())
+    assert all(
+        w.nuisance.shape == windows[i].nuisance.shape for i, w in point.about.windows.items()
+    )
 
 
 def told(diagnosis):
@@ -69,7 +81,11 @@ def told(diagnosis):
 
 def test_lost_commands_are_found_beside_a_cause():
     diagnosis = search.explain(model_of(SHARE, com_x=0.003))
-    assert (diagnosis.overall, diagnosis.named, [s.name for s in told(diagnosis)]) == ("KNOWN", ("com_x",), [dropped.NAME])
+    assert (diagnosis.overall, diagnosis.named, [s.name for s in told(diagnosis)]) == (
+        "KNOWN",
+        ("com_x",),
+        [dropped.NAME],
+    )
     assert abs(diagnosis.theta["com_x"] - 0.003) < 3e-4
     found = told(diagnosis)[0]
     assert found.low < SHARE < found.high
@@ -79,7 +95,11 @@ def test_lost_commands_are_found_beside_a_cause():
 def test_commands_that_all_come_late_are_not_lost_and_few_windows_say_so(monkeypatch):
     model, asked = model_of(0.0, cmd_delay=0.015), []
     plain = model.without_commands
-    monkeypatch.setattr(model, "without_commands", lambda theta, windows: asked.append(len(windows)) or plain(theta, windows))
+    monkeypatch.setattr(
+        model,
+        "without_commands",
+        lambda theta, windows: asked.append(len(windows)) or plain(theta, windows),
+    )
     diagnosis = search.explain(model)
     assert not told(diagnosis)
     assert diagnosis.named == ("cmd_delay",)

@@ -25,7 +25,9 @@ class Phase:
 
 @pytest.mark.parametrize(("phases", "excessive"), [(2, True), (6, False)])
 def test_of_many_levels_one_is_high_by_chance(phases, excessive, monkeypatch):
-    """What is too much of one would be seen in one of a dozen of any null world's, at a threshold of five nats."""
+    """What is too much of one would be seen in one of a dozen of any null world's, at a threshold
+    of five nats.
+    """
     monkeypatch.setattr(excess, "_Phase", Phase)
     names = [f"phase {i}" for i in range(phases)]
     sd = {(0, name): 10.0 if name == names[-1] else 1.0 for name in names}
@@ -37,11 +39,16 @@ def test_of_many_levels_one_is_high_by_chance(phases, excessive, monkeypatch):
 
 @pytest.mark.parametrize(("metres_a_newton", "excessive"), [(1e-4, False), (1.0, True)])
 def test_a_force_that_moves_no_landing_is_nothing_unknown(metres_a_newton, excessive, monkeypatch):
-    """The throw's force of 10 N stands out from the calm phase's 1 N; it moves the vehicle by 1 mm in one case, by 10 m in the other."""
+    """The throw's force of 10 N stands out from the calm phase's 1 N; it moves the vehicle by 1 mm
+    in one case, by 10 m in the other.
+    """
     monkeypatch.setattr(excess, "_Phase", Phase)
     sd = {(0, "calm"): 1.0, (0, "throw"): 10.0}
     window = SimpleNamespace(channel=np.array([0, 1]), latent=np.array([[1.0], [metres_a_newton]]))
-    grams = [SimpleNamespace(phase=phase, latent_block=np.zeros(1, dtype=int), factor=np.eye(1)) for _, phase in sd]
+    grams = [
+        SimpleNamespace(phase=phase, latent_block=np.zeros(1, dtype=int), factor=np.eye(1))
+        for _, phase in sd
+    ]
     point = SimpleNamespace(noise=SimpleNamespace(latent_sd=sd), grams=grams, windows=[window] * 2)
     found = excess.levels(PROBLEM, point, point, 5.0)
     assert [level.excessive for level in found] == [False, excessive]

@@ -26,7 +26,9 @@ def explained(logs, folder, *arguments):
     for i, log in enumerate(logs):
         log.save(folder / f"{i}.npz")
     names = [str(folder / f"{i}.npz") for i in range(len(logs))]
-    status = cli.main(["diagnose", "explain", *names, *MODEL, "--json", str(folder / "said.json"), *arguments])
+    status = cli.main(
+        ["diagnose", "explain", *names, *MODEL, "--json", str(folder / "said.json"), *arguments]
+    )
     return status, json.loads((folder / "said.json").read_text())
 
 

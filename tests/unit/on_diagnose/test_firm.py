@@ -15,21 +15,38 @@ EFFECTS = catalogue(12)
 
 
 def promised(nats, came):
-    """Share and interval of flights that promise and bring so many nats by one effect of a size of 1."""
+    """Share and interval of flights that promise and bring so many nats by one effect of a size of
+    1.
+    """
     information = 2.0 * np.array(nats, dtype=float)[:, None, None]
-    score = (np.array(came, dtype=float) + np.array(nats))[:, None]  # came = score - information / 2
+    score = (np.array(came, dtype=float) + np.array(nats))[
+        :, None
+    ]  # came = score - information / 2
     count = len(nats)
-    statistics = Statistics(np.arange(count), information, score, np.zeros(count), np.ones(count), np.zeros(1))
+    statistics = Statistics(
+        np.arange(count), information, score, np.zeros(count), np.ones(count), np.zeros(1)
+    )
     return held_out.borne_out(statistics, np.ones((count, 1)), np.ones(1))
 
 
-@pytest.mark.parametrize(("nats", "came", "sure"), [
-    ([30.0, 40.0, 35.0], [29.0, 41.0, 36.0], True),
-    ([0.01, 30.0, 40.0, 35.0], [0.0, 29.0, 41.0, 36.0], True),  # one flight cannot tell: it counts neither way
-    ([30.0, 40.0, 35.0], [90.0, -60.0, 10.0], False),  # what three flights say has nothing in common
-    ([1.0, 1.2, 1.1], [1.0, 1.2, 1.1], False),  # 3 nats agree by chance as well
-    ([200.0, 0.1], [200.0, 0.1], False),  # one flight alone
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("nats", "came", "sure"),
+    [
+        ([30.0, 40.0, 35.0], [29.0, 41.0, 36.0], True),
+        (
+            [0.01, 30.0, 40.0, 35.0],
+            [0.0, 29.0, 41.0, 36.0],
+            True,
+        ),  # one flight cannot tell: it counts neither way
+        (
+            [30.0, 40.0, 35.0],
+            [90.0, -60.0, 10.0],
+            False,
+        ),  # what three flights say has nothing in common
+        ([1.0, 1.2, 1.1], [1.0, 1.2, 1.1], False),  # 3 nats agree by chance as well
+        ([200.0, 0.1], [200.0, 0.1], False),  # one flight alone
+    ],
+)
 def test_names_are_confirmed_by_what_flights_agree_on(nats, came, sure):
     share, low, _ = promised(nats, came)
     assert share == pytest.approx(sum(came) / sum(nats))
@@ -37,7 +54,10 @@ def test_names_are_confirmed_by_what_flights_agree_on(nats, came, sure):
 
 
 def test_a_cause_that_all_flights_show_is_confirmed():
-    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2), laws=False)
+    diagnosis = search.explain(
+        SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
+        laws=False,
+    )
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.held_out.low > 0.5
     assert diagnosis["effect_05"].verdict == result.FOUND
@@ -51,7 +71,9 @@ def judged(monkeypatch, truth, **changes):
         return replace(plain(*args), **changes)
 
     monkeypatch.setattr(held_out, "measure", measure)
-    return search.explain(SyntheticModel(effects=EFFECTS, truth=truth, throws=8, free=4, seed=2), laws=False)
+    return search.explain(
+        SyntheticModel(effects=EFFECTS, truth=truth, throws=8, free=4, seed=2), laws=False
+    )
 
 
 def test_names_that_held_out_flights_do_not_confirm_are_candidates(monkeypatch):
@@ -70,24 +92,53 @@ def test_names_that_do_harm_are_withdrawn(monkeypatch):
 
 def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     """Of two, the other keeps its name, with the size that it has alone."""
-    diagnosis = judged(monkeypatch, {"effect_05": 40.0, "effect_02": 40.0}, named_in={"effect_05": 1.0, "effect_02": 2 / 3})
+    diagnosis = judged(
+        monkeypatch,
+        {"effect_05": 40.0, "effect_02": 40.0},
+        named_in={"effect_05": 1.0, "effect_02": 2 / 3},
+    )
     assert diagnosis["effect_02"].verdict == result.CANDIDATE
     assert set(diagnosis.theta) == {"effect_05"}
     assert np.shape(diagnosis.covariance) == (1, 1)
     assert diagnosis.overall == result.KNOWN
 
 
-@pytest.mark.parametrize(("after", "verb"), [(0.050, "rises from 34 to 50 mm"), (0.012, "falls from 34 to 12 mm"),
-                                             (0.0341, "stays at 34 mm")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("after", "verb"),
+    [
+        (0.050, "rises from 34 to 50 mm"),
+        (0.012, "falls from 34 to 12 mm"),
+        (0.0341, "stays at 34 mm"),
+    ],
+)
 def test_the_landing_error_goes_where_it_goes(after, verb):
-    gain = SimpleNamespace(throws=3, held_out=True, before=0.034, after=after, low=0.9 * after, high=1.1 * after,
-                           released_before=0.01, released_after=0.01, moved={"lag": 0.01})  # fmt: skip
+    gain = SimpleNamespace(
+        throws=3,
+        held_out=True,
+        before=0.034,
+        after=after,
+        low=0.9 * after,
+        high=1.1 * after,
+        released_before=0.01,
+        released_after=0.01,
+        moved={"lag": 0.01},
+    )
     assert verb in landing_sentence(gain)
 
 
 def test_two_causes_that_may_be_two_others_are_told():
-    sets = [(("lag", "drag"), 0.0), (("lag", "mass"), 0.4), (("mass", "curve"), 1.66), (("sag",), 2.9)]  # the second is a class
+    sets = [
+        (("lag", "drag"), 0.0),
+        (("lag", "mass"), 0.4),
+        (("mass", "curve"), 1.66),
+        (("sag",), 2.9),
+    ]  # the second is a class
     told = instead(SimpleNamespace(theta={"lag": 1.0, "drag": 2.0}, sets=sets))
-    assert told == ["curve, mass in place of drag, lag, 1.7 nats behind", "sag in place of drag, lag, 2.9 nats behind"]
-    assert instead(SimpleNamespace(theta={"lag": 1.0}, sets=sets)) == []  # a law took the place of one
+    assert told == [
+        "curve, mass in place of drag, lag, 1.7 nats behind",
+        "sag in place of drag, lag, 2.9 nats behind",
+    ]
+    assert (
+        instead(SimpleNamespace(theta={"lag": 1.0}, sets=sets)) == []
+    )  # a law took the place of one
     assert instead(SimpleNamespace(theta={}, sets=())) == []

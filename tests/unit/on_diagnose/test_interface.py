@@ -1,4 +1,6 @@
-"""Axes, signs and units of commands that a log has otherwise than the simulation: each hidden, named, put right."""
+"""Axes, signs and units of commands that a log has otherwise than the simulation: each hidden,
+named, put right.
+"""
 
 import json
 from dataclasses import asdict
@@ -21,11 +23,16 @@ WEIGHT = GRAVITY * (PLANT.vehicle.body.mass + PLANT.rope.payload_mass + PLANT.ro
 
 
 def flown(seed: int, lag: float = 0.05) -> FlightLog:
-    """Attitudes of a vehicle whose rates follow its commands ``lag`` seconds later, and the commands."""
+    """Attitudes of a vehicle whose rates follow its commands ``lag`` seconds later, and the
+    commands.
+    """
     rng = np.random.default_rng(seed)
     sent = np.arange(0.0, 8.0, 0.02)
     bends = rng.normal(size=(3, 5)) * [1.2, 0.9, 0.7, 0.5, 0.3]
-    rates = sum(bends[:, k, None] * np.sin((k + 1) * 1.3 * sent + rng.uniform(0, 6, (3, 1))) for k in range(5)).T
+    rates = sum(
+        bends[:, k, None] * np.sin((k + 1) * 1.3 * sent + rng.uniform(0, 6, (3, 1)))
+        for k in range(5)
+    ).T
     thrust = WEIGHT * (1.0 + 0.1 * rng.normal(size=len(sent)))
     time = np.arange(0.0, 8.0, 0.005)
     real = np.column_stack([np.interp(time - lag, sent, c) for c in rates.T])
@@ -33,10 +40,14 @@ def flown(seed: int, lag: float = 0.05) -> FlightLog:
     for rate in real:
         turn = turn * Rotation.from_rotvec(0.005 * rate)
         quats.append((turn * Rotation.from_rotvec(3e-3 * rng.normal(size=3))).as_quat())
-    return FlightLog({
-        "quat_wb": Channel(time, np.array(quats), "1", "world"), "pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world"),
-        "command": Channel(sent, np.column_stack((thrust, rates)), "N, rad/s", "body"),
-    }, {})  # fmt: skip
+    return FlightLog(
+        {
+            "quat_wb": Channel(time, np.array(quats), "1", "world"),
+            "pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world"),
+            "command": Channel(sent, np.column_stack((thrust, rates)), "N, rad/s", "body"),
+        },
+        {},
+    )
 
 
 FULL = 4.0 * PLANT.vehicle.controller.max_thrust
@@ -56,7 +67,9 @@ def logs():
 
 def changed(log, change):
     c = log["command"]
-    return FlightLog({**log.channels, "command": Channel(c.time, change(c.values), c.unit, c.frame)}, log.meta)
+    return FlightLog(
+        {**log.channels, "command": Channel(c.time, change(c.values), c.unit, c.frame)}, log.meta
+    )
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -66,11 +79,16 @@ def test_each_mistake_is_suspected_and_put_right(logs, name):
     assert [m.name for m in found] == [name.split(" ")[0]]
     assert found[0].logs == 3
     for log, meant in zip(wrong, logs):
-        np.testing.assert_allclose(found[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            found[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
+        )
 
 
 def test_two_mistakes_at_once(logs):
-    wrong = [changed(log, lambda u: u[:, [0, 1, 3, 2]] * [101.97, -57.29578, 57.29578, 57.29578]) for log in logs]
+    wrong = [
+        changed(log, lambda u: u[:, [0, 1, 3, 2]] * [101.97, -57.29578, 57.29578, 57.29578])
+        for log in logs
+    ]
     assert [m.name for m in suspected(wrong, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
 
 
@@ -78,7 +96,10 @@ def test_good_logs_and_logs_that_disagree_are_not_suspected(logs):
     assert suspected(logs, PLANT) == []
     mixed = [changed(logs[0], WRONG["rate_axes"]), *logs[1:]]
     assert suspected(mixed, PLANT) == []
-    strangers = [changed(log, lambda u, other=other: other["command"].values) for log, other in zip(logs, [*logs[1:], logs[0]])]
+    strangers = [
+        changed(log, lambda u, other=other: other["command"].values)
+        for log, other in zip(logs, [*logs[1:], logs[0]])
+    ]
     assert suspected(strangers, PLANT) == []
     heavier = [changed(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in logs]
     assert suspected(heavier, PLANT) == []
@@ -90,16 +111,24 @@ def simulated(logs):
 
 @pytest.mark.parametrize(("change", "names"), [("rate_axes", ["rate_axes", "rate_unit"]), ("", [])])
 def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
-    """A mistake that is there stays put right; one that is suspected without reason is dropped again."""
+    """A mistake that is there stays put right; one that is suspected without reason is dropped
+    again.
+    """
     flights = fly(setting_with({}), free=2, throws=0, seconds=2.5, seed=3)
     both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
     wrong = [changed(log, both) for log in flights]
     if not change:  # as a relation by chance would have it
         turned = interface._rows(np.diag([1.0, 1.0, 1.0, -1.0]))
-        monkeypatch.setattr(interface, "suspected", lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)])
+        monkeypatch.setattr(
+            interface,
+            "suspected",
+            lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)],
+        )
     model, logs = put_right(wrong, PLANT, simulated)
     assert [m.name for m in model.mistakes] == names
     assert all(m.nats > 100.0 for m in model.mistakes)
     assert len(json.dumps([asdict(m) for m in model.mistakes])) >= 2
     for log, meant in zip(logs, flights):
-        np.testing.assert_allclose(log["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            log["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
+        )

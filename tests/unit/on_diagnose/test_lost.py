@@ -1,4 +1,6 @@
-"""Windows that the simulation does not follow: which are left out, when, and what they would have been taken for."""
+"""Windows that the simulation does not follow: which are left out, when, and what they would have
+been taken for.
+"""
 
 from dataclasses import replace
 
@@ -23,14 +25,20 @@ ROUGH = 1.0
 
 
 class Spoiled(SyntheticModel):
-    """One window moves as nobody can know; with ``beyond`` only where the first effect is larger than that [floors]."""
+    """One window moves as nobody can know; with ``beyond`` only where the first effect is larger
+    than that [floors].
+    """
 
     shaken, rough, beyond = True, ROUGH, -1.0
 
     def _spoilt(self, theta, residuals):
         if abs(theta.get("effect_00", 0.0)) / EFFECTS[0].floor <= self.beyond:
             return residuals
-        noise = np.random.default_rng(1).standard_normal(len(residuals[BAD])) * self.rough * self._windows[BAD].sigma
+        noise = (
+            np.random.default_rng(1).standard_normal(len(residuals[BAD]))
+            * self.rough
+            * self._windows[BAD].sigma
+        )
         return [r + noise if i == BAD else r for i, r in enumerate(residuals)]
 
     def windows(self, theta):
@@ -48,7 +56,8 @@ def lost_of(model) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("shaken", "rough", "expected"), [(True, 0.0, []), (True, ROUGH, [BAD]), (False, ROUGH, []), (False, 3.0, [BAD])]
+    ("shaken", "rough", "expected"),
+    [(True, 0.0, []), (True, ROUGH, [BAD]), (False, ROUGH, []), (False, 3.0, [BAD])],
 )
 def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected):
     model = Spoiled(effects=EFFECTS, throws=8, seed=4)
@@ -68,9 +77,14 @@ def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goe
     assert diagnosis.windows == len(model.windows({})) - 1
 
 
-@pytest.mark.parametrize(("active", "stands"), [([0], True), ([0, 5], False), ([5], False), ([], False)])
+@pytest.mark.parametrize(
+    ("active", "stands"), [([0], True), ([0, 5], False), ([5], False), ([], False)]
+)
 def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(active, stands):
-    """Otherwise it begins anew: the window may have brought the name. Terms that were looked at on the way are left behind."""
+    """Otherwise it begins anew: the window may have brought the name.
+
+    Terms that were looked at on the way are left behind.
+    """
     model = SyntheticModel(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
     problem = Problem(model, tuple(range(len(model.windows({})))))
     nominal = linearise(problem, np.zeros(len(EFFECTS)))
@@ -90,7 +104,9 @@ def test_windows_soon_after_slack_are_marked(monkeypatch):
     model = ThrowModel(logs, paper_plant(), only=["rope_length"])
     cuts = model.flights.cuts
     never = np.array([c.start - 1.0 for c in cuts])
-    assert not any(c.after_slack for c in model._without_slack({"slack_first": never, "slack_last": never}))
+    assert not any(
+        c.after_slack for c in model._without_slack({"slack_first": never, "slack_last": never})
+    )
     last = never.copy()
     last[1] = cuts[1].start + 0.1
     first = np.where(np.arange(len(cuts)) == 1, cuts[1].start + 0.05, never)
@@ -101,8 +117,14 @@ def test_windows_soon_after_slack_are_marked(monkeypatch):
 
 
 def test_a_rope_that_hung_still_begins_straighter():
-    """In windows after hover, and in a flight's first one if it is hover itself; not where it flew, swung or came taut before."""
-    model = ThrowModel(fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=5.0), paper_plant(), only=["rope_length"])
+    """In windows after hover, and in a flight's first one if it is hover itself; not where it flew,
+    swung or came taut before.
+    """
+    model = ThrowModel(
+        fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=5.0),
+        paper_plant(),
+        only=["rope_length"],
+    )
     bend = next(d for d in model._directions if d.calm is not None)
     before, spreads = None, set()
     for c in model.flights.cuts:

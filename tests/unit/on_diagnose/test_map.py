@@ -1,4 +1,6 @@
-"""`visthrow diagnose map`: mappings proposed for real tables, tables of odd forms, logs of one flight joined, throttles as commands."""
+"""`visthrow diagnose map`: mappings proposed for real tables, tables of odd forms, logs of one
+flight joined, throttles as commands.
+"""
 
 import gzip
 from pathlib import Path
@@ -25,9 +27,11 @@ from visthrow.logs.units import UNITS
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 SETS = {
-    "payload_cf_single/log204": "cf_payload", "payload_cf_two_drones/coltrans_02_cf3": "cf_payload_pair",
-    "nanobench_cf21/B3_figure8_fast_rep1": "nanobench_cf21", "pendulum_single/single_pendulum_id": "pendulum_encoder",
-}  # fmt: skip
+    "payload_cf_single/log204": "cf_payload",
+    "payload_cf_two_drones/coltrans_02_cf3": "cf_payload_pair",
+    "nanobench_cf21/B3_figure8_fast_rep1": "nanobench_cf21",
+    "pendulum_single/single_pendulum_id": "pendulum_encoder",
+}
 SLOPE = 0.15
 """Of a slope that 20 s of an accelerometer with 0.1 m/s^2 of noise tell, averaged over 0.1 s."""
 FREE = {"est_vel_w", "motor_command", "current", "angle_rate", "torque_command_b"}
@@ -45,16 +49,22 @@ def test_a_proposal_names_the_columns_that_the_shipped_mapping_names(path, tmp_p
     common = [c for c in mine.channels if c.name in ours and c.name not in FREE]
     assert len(common) >= min(len(set(ours) - FREE) - 1, 8)
     for channel in common:
-        positions = [c for c in shipped.channels if c.name in ("pos_w", "est_pos_w")]  # captured, and estimated on board
+        positions = [
+            c for c in shipped.channels if c.name in ("pos_w", "est_pos_w")
+        ]  # captured, and estimated on board
         others = positions if channel.name == "pos_w" else [ours[channel.name]]
         if channel.name != "rate_b":  # several columns hold rates
-            assert (channel.columns, channel.unit, channel.kind) in [(c.columns, c.unit, c.kind) for c in others]
+            assert (channel.columns, channel.unit, channel.kind) in [
+                (c.columns, c.unit, c.kind) for c in others
+            ]
     assert (mine.time.column, mine.time.unit) == (shipped.time.column, shipped.time.unit)
     log = read(file, mine)[0]
     assert not contradictions(check([log], setup.known(tmp_path / "mine.toml")))
 
 
-def written(path: Path, columns: dict[str, np.ndarray], mark: str = ",", comma: bool = False) -> Path:
+def written(
+    path: Path, columns: dict[str, np.ndarray], mark: str = ",", comma: bool = False
+) -> Path:
     rows = "\n".join(mark.join(f"{x:.9g}" for x in row) for row in zip(*columns.values()))
     text = f"{mark.join(columns)}\n{rows.replace('.', ',') if comma else rows}\n"
     path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
@@ -62,7 +72,9 @@ def written(path: Path, columns: dict[str, np.ndarray], mark: str = ",", comma: 
 
 
 def table(**more: np.ndarray) -> dict[str, np.ndarray]:
-    """A flight as another tool might write it: milliseconds, millimetres, degrees, rates in another body frame."""
+    """A flight as another tool might write it: milliseconds, millimetres, degrees, rates in another
+    body frame.
+    """
     columns = flight(20.0)
     angles = np.degrees(Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, ::-1])
     names = {"millis": 1e3 * columns["time"]}
@@ -74,13 +86,22 @@ def table(**more: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def test_units_and_axes_are_found_by_physics(tmp_path):
-    path = written(tmp_path / "a.csv", {**table(), "vbat_mV": np.linspace(3900.0, 3700.0, 2000)}, mark=";", comma=True)
+    path = written(
+        tmp_path / "a.csv",
+        {**table(), "vbat_mV": np.linspace(3900.0, 3700.0, 2000)},
+        mark=";",
+        comma=True,
+    )
     found = propose(table_of(path), "a.csv")
     by = {c.name: c for c in found.mapping.channels}
     assert (found.mapping.time.column, found.mapping.time.unit) == ("millis", "ms")
     assert {name: c.unit for name, c in by.items()} == {
-        "quat_wb": "deg", "rate_b": "deg/s", "acc_b": "g", "battery_voltage": "mV", "pos_w": "mm",
-    }  # fmt: skip
+        "quat_wb": "deg",
+        "rate_b": "deg/s",
+        "acc_b": "g",
+        "battery_voltage": "mV",
+        "pos_w": "mm",
+    }
     assert by["rate_b"].axes == "x,-y,-z"
     assert "axes by physics" in found.why["rate_b"]
 
@@ -89,7 +110,19 @@ def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
     path = written(tmp_path / "a.csv.gz", table())
     assert cli.main(["diagnose", "map", str(path), "--out", str(tmp_path / "mine.toml")]) == 0
     assert 'name = "rate_b"  # the rates of the attitude' in capsys.readouterr().out
-    assert cli.main(["diagnose", "check", str(path), "--config", str(tmp_path / "mine.toml"), "--no-pictures"]) == 0
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "check",
+                str(path),
+                "--config",
+                str(tmp_path / "mine.toml"),
+                "--no-pictures",
+            ]
+        )
+        == 0
+    )
 
 
 def test_a_flying_model_carries_the_weight_that_was_weighed():
@@ -99,7 +132,10 @@ def test_a_flying_model_carries_the_weight_that_was_weighed():
     hover = 4.0 * found.flyer["thrust_map"][1] * 0.68  # of full throttle, by eye
     assert hover == pytest.approx(0.027 * 9.81, rel=0.2)
     assert not any("weigh" in question for question in found.questions)
-    assert any("what does the vehicle weigh? 1 kg" in question for question in propose(table_of(file), file.name).questions)
+    assert any(
+        "what does the vehicle weigh? 1 kg" in question
+        for question in propose(table_of(file), file.name).questions
+    )
 
 
 def test_what_is_not_known_is_asked(tmp_path):
@@ -112,16 +148,28 @@ def test_what_is_not_known_is_asked(tmp_path):
         table_of(tmp_path / "a.ulg")
 
 
-def unnamed(columns: dict[str, np.ndarray], length: str, angle: str, above: float = 0.0) -> dict[str, np.ndarray]:
+def unnamed(
+    columns: dict[str, np.ndarray], length: str, angle: str, above: float = 0.0
+) -> dict[str, np.ndarray]:
     """Position, over a point so far above the floor, and angles, in units that no name says."""
     angles = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, :0:-1] / UNITS[angle][1]
     path = (columns["pos_w"] - [0.0, 0.0, above]) / UNITS[length][1]
-    return {"time": columns["time"], **named("pos", path), "roll": angles[:, 0], "pitch": angles[:, 1], "yaw": 0.0 * angles[:, 0]}
+    return {
+        "time": columns["time"],
+        **named("pos", path),
+        "roll": angles[:, 0],
+        "pitch": angles[:, 1],
+        "yaw": 0.0 * angles[:, 0],
+    }
 
 
-@pytest.mark.parametrize(("length", "angle"), [(of, leaning) for of in ("m", "cm", "mm") for leaning in ("rad", "deg")])
+@pytest.mark.parametrize(
+    ("length", "angle"), [(of, leaning) for of in ("m", "cm", "mm") for leaning in ("rad", "deg")]
+)
 def test_gravity_says_the_units_that_no_name_says(length, angle):
-    """A gentle flight, whose degrees could be radians: in the right units it accelerates level as it leans."""
+    """A gentle flight, whose degrees could be radians: in the right units it accelerates level as
+    it leans.
+    """
     found = propose(unnamed(flight(20.0, scale=0.05), length, angle), "a.csv")
     assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": length, "quat_wb": angle}
     assert f"{length} by gravity" in found.why["pos_w"]
@@ -131,7 +179,9 @@ def test_gravity_says_the_units_that_no_name_says(length, angle):
 
 @pytest.mark.parametrize(("seed", "asked"), [(0, False), (2, True)])
 def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_about(seed, asked):
-    """About the origin both stay in a hall, and a hundredth of the path is near a 57th of the lean."""
+    """About the origin both stay in a hall, and a hundredth of the path is near a 57th
+    of the lean.
+    """
     found = propose(unnamed(flight(20.0, seed=seed, scale=0.05), "cm", "deg", above=2.9), "a.csv")
     if asked:
         (question,) = found.questions
@@ -141,7 +191,12 @@ def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_abo
     else:
         assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "cm", "quat_wb": "deg"}
         assert not found.questions
-    both = {c.name: c.unit for c in propose(unnamed(flight(20.0, seed=seed, scale=0.05), "m", "rad", above=2.9), "a.csv").mapping.channels}
+    both = {
+        c.name: c.unit
+        for c in propose(
+            unnamed(flight(20.0, seed=seed, scale=0.05), "m", "rad", above=2.9), "a.csv"
+        ).mapping.channels
+    }
     assert both == {"pos_w": "m", "quat_wb": "rad"}
 
 
@@ -156,12 +211,18 @@ def test_a_path_that_names_its_unit_tells_that_of_the_angles_to_one_that_does_no
     columns = unnamed(flight(20.0, seed=2, scale=0.05), "cm", "deg", above=2.9)
     second = {f"mocap_pos_{letter}_cm": columns[f"pos_{letter}"] + 1.0 for letter in "xyz"}
     found = propose(columns | second, "a.csv")
-    assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "cm", "mocap_pos_w": "cm", "quat_wb": "deg"}
+    assert {c.name: c.unit for c in found.mapping.channels} == {
+        "pos_w": "cm",
+        "mocap_pos_w": "cm",
+        "quat_wb": "deg",
+    }
     assert not any("a guess" in question for question in found.questions)
 
 
 def test_a_hover_in_millimetres_is_no_flight_of_a_kilometre():
-    """It spans 42 of its units and no name says which; the captured position beside it is in metres."""
+    """It spans 42 of its units and no name says which; the captured position beside it is in
+    metres.
+    """
     file = REAL / "payload_cf_single" / "log206.csv.gz"
     found = propose(table_of(file), file.name)
     units = {c.name: c.unit for c in found.mapping.channels}
@@ -178,9 +239,16 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
     assert [(c.name, c.unit) for c in found.mapping.channels] == [("pos_w", "mm")]
     assert "falls freely" in found.why["pos_w"]
     slow = {"time": 0.01 * np.arange(2000)}
-    for reach, unit, asked in ((3.0, "m", False), (15.0, "m", True), (400.0, "mm", True), (3e6, "m", True)):
+    for reach, unit, asked in (
+        (3.0, "m", False),
+        (15.0, "m", True),
+        (400.0, "mm", True),
+        (3e6, "m", True),
+    ):
         sway = reach * np.sin(0.2 * slow["time"])
-        found = propose(slow | named("pos", np.column_stack([sway, 0.5 * sway, 0.2 * sway])), "a.csv")
+        found = propose(
+            slow | named("pos", np.column_stack([sway, 0.5 * sway, 0.2 * sway])), "a.csv"
+        )
         assert found.mapping.channels[0].unit == unit
         assert any(f"'{unit}' is a guess" in question for question in found.questions) == asked
 
@@ -190,14 +258,27 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
 def test_columns_without_a_number_are_no_channel(gone):
     columns = flight(20.0)
     lost = np.full(len(columns["time"]), gone)
-    table = {"time": columns["time"], **named("pos", columns["pos_w"]), **named("vel", columns["vel_w"]), **named("acc", columns["acc_b"])}
-    found = propose({**table, "acc_x": lost, **named("cam_pos", np.stack([lost] * 3, axis=1))}, "a.csv")
+    table = {
+        "time": columns["time"],
+        **named("pos", columns["pos_w"]),
+        **named("vel", columns["vel_w"]),
+        **named("acc", columns["acc_b"]),
+    }
+    found = propose(
+        {**table, "acc_x": lost, **named("cam_pos", np.stack([lost] * 3, axis=1))}, "a.csv"
+    )
     assert {c.name for c in found.mapping.channels} == {"pos_w", "vel_w"}
 
 
 def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     file = REAL / "payload_cf_single" / "log206.csv.gz"
-    with pytest.raises(LogError, match=r"36\.9 is 36\.9 kg, but .* carries 0\.0408 kg in N: grams\? Expected kilograms: --mass 0\.0369"):
+    with pytest.raises(
+        LogError,
+        match=(
+            r"36\.9 is 36\.9 kg, but .* carries 0\.0408 kg in N: grams\? Expected kilograms: --mass"
+            r" 0\.0369"
+        ),
+    ):
         propose(table_of(file), file.name, mass=36.9)
     found = propose(table_of(file), file.name, mass=0.0369)
     assert "N by the mass: it carries 0.04077 kg" in found.why["thrust_command"]
@@ -208,7 +289,10 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     assert {c.name: c.unit for c in found.mapping.channels}["thrust_command"] == "gf"
     assert found.flyer["thrust_map"] == [0.0, 1.0, 0.0]
     both = propose(grams, file.name, mass=36.9)  # 41 kgf carry it as well as 41 gf carry 36.9 g
-    assert any("36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?" in question for question in both.questions)
+    assert any(
+        "36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?" in question
+        for question in both.questions
+    )
     apart = {name: cells for name, cells in table_of(file).items() if not name.startswith("acc")}
     apart["ctrlLee.thrustSI"] = 1e3 * apart["ctrlLee.thrustSI"]
     strange = propose(apart, file.name, mass=4.0)
@@ -218,9 +302,15 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
 def test_a_mass_that_nothing_can_doubt_is_asked_about():
     file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
     found = propose(table_of(file), file.name, mass=27.0)
-    assert any("the vehicle weighs 27 kg? Nothing in the log is in newtons" in question for question in found.questions)
+    assert any(
+        "the vehicle weighs 27 kg? Nothing in the log is in newtons" in question
+        for question in found.questions
+    )
     ball = REAL / "jugglebot_throws" / "session7.csv.gz"
-    assert any("--mass is not used" in question for question in propose(table_of(ball), ball.name, mass=0.1).questions)
+    assert any(
+        "--mass is not used" in question
+        for question in propose(table_of(ball), ball.name, mass=0.1).questions
+    )
 
 
 def named(stem: str, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -231,8 +321,15 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
     """Motion capture 37.42 s behind the vehicle's log; rates by gyro and by attitude tell."""
     columns = flight(20.0)
     whole = log_of(columns)
-    onboard = FlightLog({name: whole[name] for name in ("rate_b", "acc_b", "command")}, {"source": "a.npz"})
-    late = {n: Channel(whole[n].time[300:] + 37.42, whole[n].values[300:], whole[n].unit, whole[n].frame) for n in ("pos_w", "quat_wb")}
+    onboard = FlightLog(
+        {name: whole[name] for name in ("rate_b", "acc_b", "command")}, {"source": "a.npz"}
+    )
+    late = {
+        n: Channel(
+            whole[n].time[300:] + 37.42, whole[n].values[300:], whole[n].unit, whole[n].frame
+        )
+        for n in ("pos_w", "quat_wb")
+    }
     seen = FlightLog(late, {"source": "b.npz"})
     offset, correlation, by = offset_of(onboard, seen)
     assert offset == pytest.approx(-37.42, abs=0.01)
@@ -247,27 +344,49 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
     with pytest.raises(LogError, match="not one flight"):
         join([onboard, FlightLog({"quat_wb": stranger["quat_wb"]}, {"source": "c.npz"})])
     with pytest.raises(LogError, match="nothing in it that the others measured too"):
-        join([onboard, FlightLog({"battery_voltage": Channel(np.arange(9.0), np.ones(9), "V")}, {"source": "d.npz"})])
+        join(
+            [
+                onboard,
+                FlightLog(
+                    {"battery_voltage": Channel(np.arange(9.0), np.ones(9), "V")},
+                    {"source": "d.npz"},
+                ),
+            ]
+        )
 
 
 NEAR = 1e-3
-"""Of an offset by gyro and attitudes of 0.2 deg; 0.15 ms is the standard deviation of ten flights of 10 s, 0.38 ms the largest [s]."""
+"""Of an offset by gyro and attitudes of 0.2 deg; 0.15 ms is the standard deviation of ten flights
+of 10 s, 0.38 ms the largest [s].
+"""
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
-    """As `hil` writes its log: rates that it worked out of poses come 6 ms late. They neither tell the offset nor stay."""
+    """As `hil` writes its log: rates that it worked out of poses come 6 ms late.
+
+    They neither tell the offset nor stay.
+    """
     columns = flight(10.0, seed=seed)
     time, rng = columns["time"][::2], np.random.default_rng(seed)
     noise = Rotation.from_rotvec(np.radians(0.2) * rng.standard_normal((len(time), 3)))
     turned = Rotation.from_euler("z", 0.5)  # markers glued on askew
     quat = (Rotation.from_quat(columns["quat_wb"][::2]) * turned * noise).as_quat()
-    rate = np.stack([np.interp(time - 0.006, columns["time"], x) for x in columns["rate_b"].T], axis=1)
-    seen = {"quat_wb": Channel(time, quat, "1", "world"), "rate_b": Channel(time, rate, "rad/s", "body")}
-    gyro = np.round(np.degrees(columns["rate_b"]))  # whole degrees a second, as Betaflight's blackbox has them
+    rate = np.stack(
+        [np.interp(time - 0.006, columns["time"], x) for x in columns["rate_b"].T], axis=1
+    )
+    seen = {
+        "quat_wb": Channel(time, quat, "1", "world"),
+        "rate_b": Channel(time, rate, "rad/s", "body"),
+    }
+    gyro = np.round(
+        np.degrees(columns["rate_b"])
+    )  # whole degrees a second, as Betaflight's blackbox has them
     box = FlightLog({"rate_b": Channel(columns["time"] + 5.0, np.radians(gyro), "rad/s", "body")})
     box.meta.update(source="box", ingest={"rate_b": {}})
-    run = FlightLog(seen, {"estimated": ["vel_w", "rate_b"], "ingest": {"rate_b": {}, "quat_wb": {}}})
+    run = FlightLog(
+        seen, {"estimated": ["vel_w", "rate_b"], "ingest": {"rate_b": {}, "quat_wb": {}}}
+    )
     log = join([run, box])
     assert log.meta["joined"][0]["offset_s"] == pytest.approx(-5.0, abs=NEAR)
     assert np.array_equal(log["rate_b"].values, box["rate_b"].values)
@@ -280,14 +399,23 @@ def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
 
 
 def test_samples_in_steps_are_not_stale_where_they_repeat_themselves():
-    """Rates of whole degrees a second at 400 Hz: those at which a step was just taken are half a step ahead of the rate."""
+    """Rates of whole degrees a second at 400 Hz: those at which a step was just taken are half a
+    step ahead of the rate.
+    """
     time = np.arange(0.0, 25.0, 2.5e-3)
     rate = np.stack([0.3 * np.sin(2.0 * np.pi * f * time) for f in (0.5, 0.7, 0.9)], axis=1)
     step = np.radians(1.0)
     rounded = step * np.round(rate / step)
     pose = {
-        "pos_w": Channel(time[::10], np.random.default_rng(0).normal(0.0, 1e-3, (1000, 3)), "m", "world"),
-        "quat_wb": Channel(time[::10], np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1)) + 1e-6 * np.arange(1000)[:, None], "1", "world"),
+        "pos_w": Channel(
+            time[::10], np.random.default_rng(0).normal(0.0, 1e-3, (1000, 3)), "m", "world"
+        ),
+        "quat_wb": Channel(
+            time[::10],
+            np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1)) + 1e-6 * np.arange(1000)[:, None],
+            "1",
+            "world",
+        ),
         "command": Channel(time[::20], np.zeros((500, 4)), "N, rad/s", "body"),
     }
     gyro = record_of(FlightLog({**pose, "rate_b": Channel(time, rounded, "rad/s", "body")})).gyro
@@ -295,12 +423,21 @@ def test_samples_in_steps_are_not_stale_where_they_repeat_themselves():
     assert gyro.sigma == pytest.approx(step / np.sqrt(12.0), rel=0.1)
     ahead = np.mean((gyro.values - rate) * np.sign(np.gradient(rate, axis=0)))
     assert abs(ahead) < 0.02 * step
-    held = np.repeat(rate[::5], 5, axis=0) + 0.0  # a finer sensor that is logged five times as often as it measures
-    assert len(record_of(FlightLog({**pose, "rate_b": Channel(time, held, "rad/s", "body")})).gyro.time) == len(time) / 5
+    held = (
+        np.repeat(rate[::5], 5, axis=0) + 0.0
+    )  # a finer sensor that is logged five times as often as it measures
+    assert (
+        len(
+            record_of(FlightLog({**pose, "rate_b": Channel(time, held, "rad/s", "body")})).gyro.time
+        )
+        == len(time) / 5
+    )
 
 
 def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
-    """A ULog holds ``thrust_body`` and rates; hover is at 0.37 of full, with a slope of 0.8 about it."""
+    """A ULog holds ``thrust_body`` and rates; hover is at 0.37 of full, with a slope of 0.8 about
+    it.
+    """
     pytest.importorskip("pyulog")
     columns, plant = flight(20.0), paper_plant()
     weight = 9.81 * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
@@ -311,15 +448,42 @@ def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
     stamps = (1_000_000 + np.round(1e6 * columns["time"])).astype(int).tolist()
     flip = np.array([1.0, -1.0, -1.0])
     quat = (columns["quat_wb"] * [1, -1, -1, 1])[:, [3, 0, 1, 2]]
-    logfiles.write_ulg(tmp_path / "a.ulg", {
-        ("vehicle_local_position", 0): (["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
-         [(t, *(p * flip), *(v * flip)) for t, p, v in zip(stamps, columns["pos_w"], columns["vel_w"])]),
-        ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"], [(t + 3000, *q) for t, q in zip(stamps, quat)]),
-        ("sensor_combined", 0): (["uint64_t timestamp", "float[3] gyro_rad", "float[3] accelerometer_m_s2"],
-         [(t, *(w * flip), *(a * flip)) for t, w, a in zip(stamps, columns["rate_b"], columns["acc_b"])]),
-        ("vehicle_rates_setpoint", 0): (["uint64_t timestamp", "float roll", "float pitch", "float yaw", "float[3] thrust_body"],
-         [(t, *(c[1:] * flip), 0.0, 0.0, -u) for t, c, u in zip(stamps, columns["command"], ahead)]),
-    })  # fmt: skip
+    logfiles.write_ulg(
+        tmp_path / "a.ulg",
+        {
+            ("vehicle_local_position", 0): (
+                ["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
+                [
+                    (t, *(p * flip), *(v * flip))
+                    for t, p, v in zip(stamps, columns["pos_w"], columns["vel_w"])
+                ],
+            ),
+            ("vehicle_attitude", 0): (
+                ["uint64_t timestamp", "float[4] q"],
+                [(t + 3000, *q) for t, q in zip(stamps, quat)],
+            ),
+            ("sensor_combined", 0): (
+                ["uint64_t timestamp", "float[3] gyro_rad", "float[3] accelerometer_m_s2"],
+                [
+                    (t, *(w * flip), *(a * flip))
+                    for t, w, a in zip(stamps, columns["rate_b"], columns["acc_b"])
+                ],
+            ),
+            ("vehicle_rates_setpoint", 0): (
+                [
+                    "uint64_t timestamp",
+                    "float roll",
+                    "float pitch",
+                    "float yaw",
+                    "float[3] thrust_body",
+                ],
+                [
+                    (t, *(c[1:] * flip), 0.0, 0.0, -u)
+                    for t, c, u in zip(stamps, columns["command"], ahead)
+                ],
+            ),
+        },
+    )
     (log,) = read(tmp_path / "a.ulg")
     assert "command" not in log
     (made,), (mistake,) = commanded([log], plant)
@@ -330,4 +494,6 @@ def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
     assert np.mean(command.values[:, 0]) == pytest.approx(np.mean(true), rel=0.02)
     assert np.polyfit(true, command.values[:, 0], 1)[0] == pytest.approx(1.0, abs=SLOPE)
     recorded = record_of(made)
-    assert len(recorded.vehicle.time) == len(recorded.attitude.time) > 1000, "attitudes lie between the positions"
+    assert len(recorded.vehicle.time) == len(recorded.attitude.time) > 1000, (
+        "attitudes lie between the positions"
+    )

@@ -1,4 +1,6 @@
-"""Sufficient statistics of windows against dense linear algebra, noise levels against planted ones."""
+"""Sufficient statistics of windows against dense linear algebra, noise levels against
+planted ones.
+"""
 
 from dataclasses import replace
 
@@ -26,7 +28,9 @@ def likelihood(gram, levels, window):
 
 def alone(gram, levels, window, latents=False):
     """What a window says by itself."""
-    return Stack([gram], windows=[window]).integrals(levels, latents=latents).shares([gram], levels)[0]
+    return (
+        Stack([gram], windows=[window]).integrals(levels, latents=latents).shares([gram], levels)[0]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +46,9 @@ def dense(window, gram, levels, floors, at):
     deviation = levels.deviation(gram, at)
     columns = marginal.columns(window, floors)
     states = columns[:, : gram.nuisances] * deviation[: gram.nuisances]
-    latents = columns[:, gram.nuisances : len(deviation)] @ gram.factor * deviation[gram.nuisances :]
+    latents = (
+        columns[:, gram.nuisances : len(deviation)] @ gram.factor * deviation[gram.nuisances :]
+    )
     sensor = (window.sigma * levels.scale[window.channel]) ** 2
     return np.diag(sensor) + states @ states.T + latents @ latents.T, columns[:, len(deviation) :]
 
@@ -54,20 +60,39 @@ def test_information_and_score_are_those_of_the_dense_covariance(fitted):
         part = statistics(grams, levels)[at]
         inverse = np.linalg.inv(v)
         np.testing.assert_allclose(part.information, s.T @ inverse @ s, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6
+        )
         g = windows[at].latent
         whole = g.T @ inverse @ g
-        np.testing.assert_allclose(part.latent_information, whole, rtol=1e-5, atol=1e-4 * np.abs(whole).max())
-        np.testing.assert_allclose(part.latent_score, g.T @ inverse @ windows[at].residual, rtol=1e-5, atol=1e-3)
+        np.testing.assert_allclose(
+            part.latent_information, whole, rtol=1e-5, atol=1e-4 * np.abs(whole).max()
+        )
+        np.testing.assert_allclose(
+            part.latent_score, g.T @ inverse @ windows[at].residual, rtol=1e-5, atol=1e-3
+        )
 
 
 def test_likelihood_is_that_of_the_dense_covariance(fitted):
-    """At any noise levels and any weights of the samples, so that models compare whose outliers are not the same."""
+    """At any noise levels and any weights of the samples, so that models compare whose outliers are
+    not the same.
+    """
     _, windows, floors, levels, grams = fitted
-    other = replace(levels, scale=1.3 * levels.scale, latent_sd={k: 2.0 * v for k, v in levels.latent_sd.items()})
-    spared = replace(windows[0], sigma=np.where(np.arange(len(windows[0].sigma)) % 7, 1.0, 3.0) * windows[0].sigma)
+    other = replace(
+        levels,
+        scale=1.3 * levels.scale,
+        latent_sd={k: 2.0 * v for k, v in levels.latent_sd.items()},
+    )
+    spared = replace(
+        windows[0],
+        sigma=np.where(np.arange(len(windows[0].sigma)) % 7, 1.0, 3.0) * windows[0].sigma,
+    )
     gram = marginal.correlated(marginal.gram_of(spared, floors, 2), spared, levels.correlation_time)
-    for window, of, choice in ((windows[0], grams[0], levels), (windows[0], grams[0], other), (spared, gram, levels)):
+    for window, of, choice in (
+        (windows[0], grams[0], levels),
+        (windows[0], grams[0], other),
+        (spared, gram, levels),
+    ):
         v, _ = dense(window, of, choice, floors, 0)
         sign, log_det = np.linalg.slogdet(v)
         assert sign > 0
@@ -78,9 +103,20 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
 def test_windows_side_by_side_are_what_they_are_alone(fitted):
     """Of different sizes, in more batches than one, in their order."""
     _, windows, floors, levels, grams = fitted
-    lean = [replace(w, latent=w.latent[:, :-4], latent_block=w.latent_block[:-4], latent_axis=w.latent_axis[:-4],
-                    latent_time=w.latent_time[:-4]) for w in windows[::3]]  # fmt: skip
-    shorter = [marginal.correlated(marginal.gram_of(w, floors, 2), w, levels.correlation_time) for w in lean]
+    lean = [
+        replace(
+            w,
+            latent=w.latent[:, :-4],
+            latent_block=w.latent_block[:-4],
+            latent_axis=w.latent_axis[:-4],
+            latent_time=w.latent_time[:-4],
+        )
+        for w in windows[::3]
+    ]
+    shorter = [
+        marginal.correlated(marginal.gram_of(w, floors, 2), w, levels.correlation_time)
+        for w in lean
+    ]
     mixed = [*grams, *shorter]
     rows = [*range(len(grams)), *range(0, len(grams), 3)]
     values = [likelihood(gram, levels, w) for gram, w in zip(mixed, rows)]
@@ -101,7 +137,10 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
 def test_grams_and_other_residuals_are_the_same_side_by_side(fitted):
     """Of windows of different lengths and numbers of columns, as a GPU has them padded."""
     _, windows, floors, _, _ = fitted
-    mixed = [*windows[:4], replace(windows[4], latent=np.zeros((0, 0)), latent_block=np.zeros(0, dtype=int))]
+    mixed = [
+        *windows[:4],
+        replace(windows[4], latent=np.zeros((0, 0)), latent_block=np.zeros(0, dtype=int)),
+    ]
     cut = ("time", "channel", "residual", "sigma", "effects", "nuisance", "latent")
     mixed.append(replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut}))
     grams = [marginal.gram_of(w, floors, 2) for w in mixed]
@@ -109,13 +148,22 @@ def test_grams_and_other_residuals_are_the_same_side_by_side(fitted):
     for found, single in zip(designs.grams_of(mixed, floors, 2, "cpu:0"), grams, strict=True):
         for name in ("inner", "cross", "square", "count", "log_sigma"):
             value = getattr(single, name)
-            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max())
+            np.testing.assert_allclose(
+                getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max()
+            )
         assert found.shown == pytest.approx(single.shown)
     for _ in range(2):  # what stays on the device is not what the residuals were
         residuals = [drawn.normal(size=len(w.residual)) for w in mixed]
-        alone = [marginal.with_residual(gram, *given) for gram, *given in zip(grams, mixed, [floors] * len(mixed), residuals)]
-        for found, single in zip(designs.with_residuals(grams, mixed, floors, residuals, "cpu:0"), alone, strict=True):
-            np.testing.assert_allclose(found.cross, single.cross, rtol=1e-9, atol=1e-9 * np.abs(single.cross).max())
+        alone = [
+            marginal.with_residual(gram, *given)
+            for gram, *given in zip(grams, mixed, [floors] * len(mixed), residuals)
+        ]
+        for found, single in zip(
+            designs.with_residuals(grams, mixed, floors, residuals, "cpu:0"), alone, strict=True
+        ):
+            np.testing.assert_allclose(
+                found.cross, single.cross, rtol=1e-9, atol=1e-9 * np.abs(single.cross).max()
+            )
             np.testing.assert_allclose(found.square, single.square, rtol=1e-9)
 
 
@@ -123,9 +171,15 @@ def test_latents_are_correlated_the_same_side_by_side(fitted):
     """Where the inner products stay for what comes next, unless they were replaced since."""
     _, windows, floors, levels, _ = fitted
     cut = ("time", "channel", "residual", "sigma", "effects", "nuisance", "latent")
-    mixed = [*windows[:4], replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut})]
+    mixed = [
+        *windows[:4],
+        replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut}),
+    ]
     few = mixed[1].latent_time < mixed[1].latent_time.max()
-    knots = {name: getattr(mixed[1], name)[few] for name in ("latent_block", "latent_axis", "latent_time")}
+    knots = {
+        name: getattr(mixed[1], name)[few]
+        for name in ("latent_block", "latent_axis", "latent_time")
+    }
     mixed[1] = replace(mixed[1], latent=mixed[1].latent[:, few], **knots)
     raw = designs.grams_of(mixed, floors, 2, "cpu:0")
     raw[2] = marginal.gram_of(mixed[2], floors, 2)  # as one of few whose outliers were mended
@@ -135,11 +189,20 @@ def test_latents_are_correlated_the_same_side_by_side(fitted):
         assert not isinstance(single.placed, marginal.There)
         for name in ("inner", "cross", "factor"):
             value = getattr(single, name)
-            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max())
+            np.testing.assert_allclose(
+                getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max()
+            )
         assert found.shown == pytest.approx(single.shown)
-    np.testing.assert_allclose(Stack(there, "cpu:0").values(levels), Stack(alone).values(levels), rtol=1e-9)
-    bare = [Stack([marginal.without_effects(g) for g in own], device) for own, device in ((there, "cpu:0"), (alone, "cpu"))]
-    np.testing.assert_allclose(bare[0].look(levels)[1], bare[1].look(levels)[1], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        Stack(there, "cpu:0").values(levels), Stack(alone).values(levels), rtol=1e-9
+    )
+    bare = [
+        Stack([marginal.without_effects(g) for g in own], device)
+        for own, device in ((there, "cpu:0"), (alone, "cpu"))
+    ]
+    np.testing.assert_allclose(
+        bare[0].look(levels)[1], bare[1].look(levels)[1], rtol=1e-6, atol=1e-6
+    )
     changed = replace(there[0], inner=2.0 * there[0].inner)
     assert changed.placed is changed.inner
 
@@ -151,8 +214,20 @@ def test_other_residuals_leave_the_information(fitted):
     known = marginal.gather(grams, shares, np.zeros(len(floors)))
     other = [replace(g, cross=0.5 * g.cross, square=0.25 * g.square) for g in grams]
     shares = integrals(other, levels).shares(other, levels)
-    plain, again = marginal.gather(other, shares, theta), marginal.rescored(known, other, shares, theta)
-    for name in ("flights", "information", "score", "square", "samples", "theta", "absolute", "absolute_square"):
+    plain, again = (
+        marginal.gather(other, shares, theta),
+        marginal.rescored(known, other, shares, theta),
+    )
+    for name in (
+        "flights",
+        "information",
+        "score",
+        "square",
+        "samples",
+        "theta",
+        "absolute",
+        "absolute_square",
+    ):
         np.testing.assert_allclose(getattr(again, name), getattr(plain, name), rtol=1e-12)
     assert not np.allclose(again.score, known.score)
 
@@ -167,9 +242,13 @@ def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
 
     def value(time: float) -> float:
         shaped = [marginal.correlated(g, w, time) for g, w in zip(grams, windows)]
-        return noise.maximised(shaped, replace(noise._first_guess(shaped), correlation_time=time), "cpu")[1]
+        return noise.maximised(
+            shaped, replace(noise._first_guess(shaped), correlation_time=time), "cpu"
+        )[1]
 
-    found = noise.fit(windows, [marginal.gram_of(w, floors, 2) for w in windows])[0].correlation_time
+    found = noise.fit(windows, [marginal.gram_of(w, floors, 2) for w in windows])[
+        0
+    ].correlation_time
     assert found == max(noise.CORRELATION_TIMES, key=value)
 
 
@@ -178,7 +257,10 @@ def test_derivatives_are_laid_side_by_side_once(fitted):
     inner = [gram.inner for gram in fitted[4]]
     kept = stacks._ON_GPU(designs.Same(inner), tuple([1] * len(inner)), "cpu")
     assert stacks._ON_GPU(designs.Same(list(inner)), tuple([1] * len(inner)), "cpu") is kept
-    assert stacks._ON_GPU(designs.Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu") is not kept
+    assert (
+        stacks._ON_GPU(designs.Same([inner[0].copy(), *inner[1:]]), tuple([1] * len(inner)), "cpu")
+        is not kept
+    )
 
 
 def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):
@@ -189,13 +271,20 @@ def test_a_point_of_some_windows_is_the_point_that_they_give(fitted):
     whole = linearise(problem, np.zeros(len(EFFECTS)), windows=windows)
     part, begin = only(whole, left), noise.only(whole.noise, [whole.grams[w] for w in left], left)
     again = linearise(problem.only(left), np.zeros(len(EFFECTS)), begin, windows)
-    assert {phase for _, phase in part.noise.latent_sd} == {w.phase for w in part.windows} < {w.phase for w in windows}
+    assert (
+        {phase for _, phase in part.noise.latent_sd}
+        == {w.phase for w in part.windows}
+        < {w.phase for w in windows}
+    )
     np.testing.assert_allclose(part.information, again.information, rtol=1e-3)
 
 
 def test_broken_derivatives_are_told_with_their_window(fitted):
     gram = fitted[4][3]
-    with pytest.raises(DiagnoseError, match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular"):
+    with pytest.raises(
+        DiagnoseError,
+        match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular",
+    ):
         Stack([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)]).values(fitted[3])
 
 
@@ -203,14 +292,19 @@ def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
     """Initial states are vague: a shift of 0.1 m changes the score by rounding alone."""
     _, windows, floors, levels, grams = fitted
     shifted = windows[0].residual + windows[0].nuisance @ np.full(12, 0.1)
-    plain, moved = (alone(g, levels, 0) for g in (grams[0], marginal.with_residual(grams[0], windows[0], floors, shifted)))
+    plain, moved = (
+        alone(g, levels, 0)
+        for g in (grams[0], marginal.with_residual(grams[0], windows[0], floors, shifted))
+    )
     own = np.sqrt(np.diag(plain.information))
     assert np.max(np.abs(moved.score - plain.score) / own) < 0.1
 
 
 def test_gradients_of_the_likelihood_are_its_differences(fitted):
     _, _, _, levels, grams = fitted
-    levels = replace(levels, share=levels.share * np.random.default_rng(0).uniform(0.7, 1.4, levels.share.shape))
+    levels = replace(
+        levels, share=levels.share * np.random.default_rng(0).uniform(0.7, 1.4, levels.share.shape)
+    )
     layout = noise._Layout.of(grams, levels)
     x = layout.pack(levels)
     stack = Stack(grams)
@@ -223,7 +317,9 @@ def test_gradients_of_the_likelihood_are_its_differences(fitted):
         return noise._likelihood(stack, layout.unpack(moved, levels), layout)[0]
 
     for i in [*range(first), first, first + 7, len(x) - 2, len(x) - 1]:
-        assert (value(i, step) - value(i, -step)) / (2 * step) == pytest.approx(slope[i], rel=1e-3, abs=0.1)
+        assert (value(i, step) - value(i, -step)) / (2 * step) == pytest.approx(
+            slope[i], rel=1e-3, abs=0.1
+        )
 
 
 @pytest.mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
@@ -251,7 +347,9 @@ def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted, devi
     spoilt = windows[0].residual.copy()
     spoilt[[40, 201]] += 0.2
     given = [replace(windows[0], residual=spoilt), windows[1]]
-    first, second = noise.without_outliers(given, [marginal.gram_of(w, floors, 2) for w in given], floors, device)
+    first, second = noise.without_outliers(
+        given, [marginal.gram_of(w, floors, 2) for w in given], floors, device
+    )
     assert set(np.flatnonzero(first.sigma > windows[0].sigma)) == {40, 201}
     assert second is windows[1]
 
@@ -261,8 +359,12 @@ def bad_window(fitted):
     """Number of the window, levels and grams."""
     _, windows, floors, _, _ = fitted
     bad = next(i for i, w in enumerate(windows) if w.phase == "throw")
-    push = windows[bad].latent @ np.random.default_rng(0).normal(0.0, 1.0, windows[bad].latent.shape[1])
-    spoilt = [replace(w, residual=w.residual + push) if i == bad else w for i, w in enumerate(windows)]
+    push = windows[bad].latent @ np.random.default_rng(0).normal(
+        0.0, 1.0, windows[bad].latent.shape[1]
+    )
+    spoilt = [
+        replace(w, residual=w.residual + push) if i == bad else w for i, w in enumerate(windows)
+    ]
     return bad, *noise.fit(spoilt, [marginal.gram_of(w, floors, 2) for w in spoilt])
 
 
@@ -274,7 +376,9 @@ def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted, bad_window
 
 
 def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
-    """Two models may only differ by what they explain, not by how far the levels of their bad windows were sought."""
+    """Two models may only differ by what they explain, not by how far the levels of their bad
+    windows were sought.
+    """
     _, found, grams = bad_window
 
     def value(levels) -> float:
@@ -287,7 +391,9 @@ def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
 
 
 def test_rounding_of_huge_derivatives_does_not_spoil_the_curvature(fitted):
-    """Columns of 1e5 deviations once took -50 degrees of freedom from three samples, and the levels' step had no solution."""
+    """Columns of 1e5 deviations once took -50 degrees of freedom from three samples, and the
+    levels' step had no solution.
+    """
     _, _, _, levels, grams = fitted
     gram, deviation = grams[0], levels.deviation(grams[0], 0)
     size = len(deviation)
@@ -299,11 +405,16 @@ def test_rounding_of_huge_derivatives_does_not_spoil_the_curvature(fitted):
     assert np.abs(curvature).max() <= 2.0 * max(gram.count.max(), gram.latents)
 
 
-@pytest.mark.parametrize("spoil", [
-    lambda w: replace(w, residual=np.full_like(w.residual, np.nan)), lambda w: replace(w, sigma=np.zeros_like(w.sigma)),
-    lambda w: replace(w, channel=w.channel + 2), lambda w: replace(w, time=w.time[:-1]),
-    lambda w: replace(w, effects=w.effects[:, :-1]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda w: replace(w, residual=np.full_like(w.residual, np.nan)),
+        lambda w: replace(w, sigma=np.zeros_like(w.sigma)),
+        lambda w: replace(w, channel=w.channel + 2),
+        lambda w: replace(w, time=w.time[:-1]),
+        lambda w: replace(w, effects=w.effects[:, :-1]),
+    ],
+)
 def test_broken_windows_are_named(fitted, spoil):
     _, windows, floors, _, _ = fitted
     with pytest.raises(DiagnoseError, match="window of flight 0"):
@@ -314,18 +425,32 @@ def test_a_model_without_latent_forces_works():
     rng = np.random.default_rng(0)
     n = 50
     s, x = rng.normal(size=(n, 2)), np.ones((n, 1))
-    window = Window(0, "swing", np.arange(n) / 50.0, np.zeros(n, dtype=int), s @ [0.3, 0.0] + rng.normal(size=n) * 0.1,
-                    np.full(n, 0.1), s, x, np.ones(1), latent=np.zeros((n, 0)))  # fmt: skip
+    window = Window(
+        0,
+        "swing",
+        np.arange(n) / 50.0,
+        np.zeros(n, dtype=int),
+        s @ [0.3, 0.0] + rng.normal(size=n) * 0.1,
+        np.full(n, 0.1),
+        s,
+        x,
+        np.ones(1),
+        latent=np.zeros((n, 0)),
+    )
     levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
     part = alone(grams[0], levels, 0)
     assert np.linalg.solve(part.information, part.score) == pytest.approx([0.3, 0.0], abs=0.05)
 
 
 def test_rounding_leaves_no_negative_information(fitted):
-    """Two effects that are one but for rounding: a wide prior would turn the negative eigenvalue into evidence."""
+    """Two effects that are one but for rounding: a wide prior would turn the negative eigenvalue
+    into evidence.
+    """
     *_, levels, grams = fitted
     part = alone(grams[0], levels, 0)
     nearly = np.array([[1.0, 1.0 + 1e-7], [1.0 + 1e-7, 1.0]])
-    found = marginal.gather(grams[:1], [replace(part, information=1e6 * nearly, score=np.zeros(2))], np.zeros(2))
+    found = marginal.gather(
+        grams[:1], [replace(part, information=1e6 * nearly, score=np.zeros(2))], np.zeros(2)
+    )
     assert np.linalg.eigvalsh(1e6 * nearly).min() < 0.0
     assert np.linalg.eigvalsh(found.information.sum(0)).min() >= 0.0

@@ -1,4 +1,6 @@
-"""The small models against physics of another hand: scipy's integrator, closed forms, and planted parameters found again."""
+"""The small models against physics of another hand: scipy's integrator, closed forms, and planted
+parameters found again.
+"""
 
 import json
 from dataclasses import replace
@@ -30,25 +32,54 @@ BALL = BallParams(G, 0.0, 0.02, 0.3, 1)
 SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
 STAND = StandParams(1.5e-6, 2e-8, 0.0, 0.1, 11.0, 0.02, 0.01, 0.05, 0.02, 100.0)
 FLYER = FlyerParams(
-    "motor_command", "pos_w", "quat_wb", 0.03, G, (0.0, 0.06, 0.1), 0.03, 0.0, 3.8, 0.0, 0.0, 0.0, -10.0, 1.0, 0.02, 1, 40
+    "motor_command",
+    "pos_w",
+    "quat_wb",
+    0.03,
+    G,
+    (0.0, 0.06, 0.1),
+    0.03,
+    0.0,
+    3.8,
+    0.0,
+    0.0,
+    0.0,
+    -10.0,
+    1.0,
+    0.02,
+    1,
+    40,
 )
 
 
-def swing_log(length=0.2, viscous=0.0, coulomb=0.0, quadratic=0.0, offset=0.0, noise=2e-4, seconds=12.0) -> FlightLog:
+def swing_log(
+    length=0.2, viscous=0.0, coulomb=0.0, quadratic=0.0, offset=0.0, noise=2e-4, seconds=12.0
+) -> FlightLog:
     def slope(_, state):
         angle, rate = state
         friction = viscous * rate + coulomb * np.tanh(rate / 0.02) + quadratic * abs(rate) * rate
         return [rate, -G / length * np.sin(angle) - friction]
 
     time = np.arange(0.0, seconds, 0.005)
-    angle = solve_ivp(slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10).y[0]
-    return FlightLog({"angle": Channel(time, angle + offset + np.random.default_rng(1).normal(0, noise, len(time)), "rad")})
+    angle = solve_ivp(
+        slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10
+    ).y[0]
+    return FlightLog(
+        {
+            "angle": Channel(
+                time, angle + offset + np.random.default_rng(1).normal(0, noise, len(time)), "rad"
+            )
+        }
+    )
 
 
 def found(model, names) -> dict[str, tuple[float, float]]:
     """Estimates and deviations."""
     result = fitting.fit(model, names)
-    return {n: (float(result.theta[i]), float(np.sqrt(result.covariance[i, i]))) for i, n in enumerate(names)}
+    return {
+        n: (float(result.theta[i]), float(np.sqrt(result.covariance[i, i])))
+        for i, n in enumerate(names)
+    }
 
 
 def near(estimates, name, truth, sigmas=3.0) -> bool:
@@ -65,7 +96,9 @@ class TestBall:
     def test_what_flies_is_found(self):
         logs = [ball_log(drag=0.04, seed=i, heading=2.1 * i) for i in range(4)]
         assert len(BallModel(logs, BALL).stretches) == 4
-        estimates = found(BallModel(logs, BALL), ["ball_drag", "frame_tilt_x", "frame_tilt_y", "top_spin"])
+        estimates = found(
+            BallModel(logs, BALL), ["ball_drag", "frame_tilt_x", "frame_tilt_y", "top_spin"]
+        )
         assert estimates["ball_drag"][0] == pytest.approx(0.04, rel=0.03)
         assert near(estimates, "ball_drag", 0.04)
         assert near(estimates, "top_spin", 0.0)
@@ -76,13 +109,18 @@ class TestBall:
         assert estimates["side_spin"][0] == pytest.approx(0.3, rel=0.05)
 
     def test_wind_shows_where_the_drag_is(self):
-        """Without drag there is no wind: derivatives of the model as it stands say nothing of it."""
+        """Without drag there is no wind: derivatives of the model as it stands say
+        nothing of it.
+        """
         truth, stamps, paths = beside_aeroid.world(240000100)
         seen = paths + np.random.default_rng(1).normal(0.0, 5e-4, paths.shape)
         diagnosis = search.explain(beside_aeroid.model_of(stamps, seen), laws=False)
         assert diagnosis.overall == "KNOWN"
         assert set(diagnosis.theta) == set(truth)
-        assert all(abs(diagnosis[name].estimate - size) < 3.0 * diagnosis[name].sd for name, size in truth.items())
+        assert all(
+            abs(diagnosis[name].estimate - size) < 3.0 * diagnosis[name].sd
+            for name, size in truth.items()
+        )
         unseen = paths + np.random.default_rng(2).normal(0.0, 5e-4, paths.shape)
         others = beside_aeroid.model_of(stamps, unseen)
         errors = on_others(others, others, diagnosis.theta, diagnosis)
@@ -108,10 +146,21 @@ class TestPendulum:
 
     def test_frictions_are_told_apart(self):
         log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
-        names = ["pendulum_length", "viscous_friction", "coulomb_friction", "quadratic_drag", "encoder_offset"]
+        names = [
+            "pendulum_length",
+            "viscous_friction",
+            "coulomb_friction",
+            "quadratic_drag",
+            "encoder_offset",
+        ]
         estimates = found(PendulumModel([log], SWING), names)
-        truth = {"pendulum_length": 0.01, "viscous_friction": 0.05, "coulomb_friction": 0.1, "quadratic_drag": 0.02,
-                 "encoder_offset": 0.01}  # fmt: skip
+        truth = {
+            "pendulum_length": 0.01,
+            "viscous_friction": 0.05,
+            "coulomb_friction": 0.1,
+            "quadratic_drag": 0.02,
+            "encoder_offset": 0.01,
+        }
         assert all(near(estimates, name, truth[name]) for name in names), estimates
         assert estimates["pendulum_length"][0] == pytest.approx(0.01, rel=0.02)
 
@@ -124,9 +173,15 @@ class TestStand:
         current = (volts - np.sqrt(volts**2 - 0.4 * power)) / 0.2
         time = 2.0 * np.arange(12)
         rng = np.random.default_rng(seed)
-        values = {"thrust": (thrust * (1 + rng.normal(0, 0.005, 12)), "N"), "rotor_speed": (speed, "rad/s"),
-                  "supply_voltage": (np.full(12, volts), "V"), "current": (current, "A")}  # fmt: skip
-        return FlightLog({name: Channel(time, column, unit) for name, (column, unit) in values.items()})
+        values = {
+            "thrust": (thrust * (1 + rng.normal(0, 0.005, 12)), "N"),
+            "rotor_speed": (speed, "rad/s"),
+            "supply_voltage": (np.full(12, volts), "V"),
+            "current": (current, "A"),
+        }
+        return FlightLog(
+            {name: Channel(time, column, unit) for name, (column, unit) in values.items()}
+        )
 
     def test_curve_and_zero_are_found(self):
         logs = [self.log(k_1=3e-4, zero=0.1, seed=i) for i in range(4)]
@@ -145,12 +200,27 @@ class TestStand:
         (tmp_path / "mine.toml").write_text(config.dumps(setup))
         logs = [str(tmp_path / f"{i}.csv") for i in range(3)]
         out = tmp_path / "out"
-        assert cli.main(["diagnose", "fit", *logs, "--config", str(tmp_path / "mine.toml"), "--out", str(out)]) == 0
+        assert (
+            cli.main(
+                [
+                    "diagnose",
+                    "fit",
+                    *logs,
+                    "--config",
+                    str(tmp_path / "mine.toml"),
+                    "--out",
+                    str(out),
+                ]
+            )
+            == 0
+        )
         assert "thrust_gain" in capsys.readouterr().out
         assert cli.main(["config", "vehicle", str(out / "vehicle.toml")]) == 0
         vehicle = config.load(fitting.VehicleParams, out / "vehicle.toml")
         speed = 1000.0
-        assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == pytest.approx(1.7, rel=0.03)
+        assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == pytest.approx(
+            1.7, rel=0.03
+        )
         record = json.loads((out / "fit.json").read_text())
         assert np.shape(record["covariance"]) == (len(record["effects"]),) * 2
         assert len(record["logs"]) == 3
@@ -172,9 +242,17 @@ class TestFlyer:
 
     @pytest.mark.parametrize("phase", [0.0, 0.003, 0.0085])
     def test_held_commands_pass_the_motors_lag_exactly(self, phase):
-        """Closed form: thrust falls to each command by itself, wherever in a step of the integration that one comes."""
+        """Closed form: thrust falls to each command by itself, wherever in a step of the
+        integration that one comes.
+        """
         rng, fine, tau, mass = np.random.default_rng(3), 1e-4, 0.03, 0.03
-        params = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0), mass=mass, motor_time_constant=tau)
+        params = replace(
+            FLYER,
+            input="thrust_command",
+            thrust_map=(0.0, 1.0, 0.0),
+            mass=mass,
+            motor_time_constant=tau,
+        )
         time = np.arange(0.0, 4.0, fine)
         sent = np.arange(-phase, 4.0, 0.01)
         told = mass * FLYER.gravity * (1.0 + 0.3 * rng.normal(size=len(sent)))
@@ -182,15 +260,23 @@ class TestFlyer:
         thrust[0], held = told[0], told[np.searchsorted(sent, time, "right") - 1]
         for i in range(1, len(time)):
             thrust[i] = held[i - 1] + (thrust[i - 1] - held[i - 1]) * np.exp(-fine / tau)
-        speed = np.concatenate([[0.0], np.cumsum(0.5 * (thrust[1:] + thrust[:-1]) / mass - FLYER.gravity) * fine])
+        speed = np.concatenate(
+            [[0.0], np.cumsum(0.5 * (thrust[1:] + thrust[:-1]) / mass - FLYER.gravity) * fine]
+        )
         height = 5.0 + np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * fine])
         seen, zero = time[::100], np.zeros(len(time[::100]))
-        log = FlightLog({
-            "pos_w": Channel(seen, np.column_stack([zero, zero, height[::100]]), "m", "world"),
-            "quat_wb": Channel(seen, np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1)), "1", "world"),
-            "thrust_command": Channel(sent, told[:, None], "N"),
-        })  # fmt: skip
-        assert np.abs(np.concatenate(FlyerModel([log], params).residuals({}))).max() < 1e-4  # motion capture has more noise
+        log = FlightLog(
+            {
+                "pos_w": Channel(seen, np.column_stack([zero, zero, height[::100]]), "m", "world"),
+                "quat_wb": Channel(
+                    seen, np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1)), "1", "world"
+                ),
+                "thrust_command": Channel(sent, told[:, None], "N"),
+            }
+        )
+        assert (
+            np.abs(np.concatenate(FlyerModel([log], params).residuals({}))).max() < 1e-4
+        )  # motion capture has more noise
 
     def test_a_law_is_looked_for(self):
         logs = [fly(6.0, swirl=0.008, seed=i) for i in range(3)]
@@ -206,13 +292,17 @@ class TestFlyer:
         assert any("noise alone" in reason for reason in diagnosis.reasons)
 
     def test_nothing_is_told_where_nothing_is(self):
-        diagnosis = search.explain(FlyerModel([fly(6.0, seed=i) for i in range(3)], replace(FLYER, command_delay=LATE)))
+        diagnosis = search.explain(
+            FlyerModel([fly(6.0, seed=i) for i in range(3)], replace(FLYER, command_delay=LATE))
+        )
         assert diagnosis.overall == "NO EFFECT"
 
     @pytest.mark.slow
     def test_gain_drag_and_battery_are_found(self):
         names = ["thrust_gain", "rotor_drag_xy", "battery_sag", "cmd_delay", "frame_tilt_x"]
-        estimates = found(FlyerModel([fly(8.0, gain=1.05, drag=0.02, volts_slope=0.08)], FLYER), names)
+        estimates = found(
+            FlyerModel([fly(8.0, gain=1.05, drag=0.02, volts_slope=0.08)], FLYER), names
+        )
         assert near(estimates, "thrust_gain", 0.05), estimates
         assert near(estimates, "rotor_drag_xy", 0.02), estimates
         assert near(estimates, "battery_sag", 0.08), estimates
@@ -223,34 +313,59 @@ class TestFlyer:
         log = fly(6.0, drag=0.03, wind=1.5, late=0.02, fade=-0.004)
         params = FlyerParams(**{**vars(FLYER), "drag_xy": 0.03})
         dark = FlightLog({k: v for k, v in log.channels.items() if k != "battery_voltage"})
-        estimates = found(FlyerModel([dark], params), ["wind_x", "wind_y", "attitude_delay", "thrust_fade", "cmd_delay", "thrust_gain"])
-        truth = {"wind_x": 1.5, "wind_y": 0.0, "attitude_delay": 0.02, "thrust_fade": -0.004, "cmd_delay": LATE}
+        estimates = found(
+            FlyerModel([dark], params),
+            ["wind_x", "wind_y", "attitude_delay", "thrust_fade", "cmd_delay", "thrust_gain"],
+        )
+        truth = {
+            "wind_x": 1.5,
+            "wind_y": 0.0,
+            "attitude_delay": 0.02,
+            "thrust_fade": -0.004,
+            "cmd_delay": LATE,
+        }
         assert all(near(estimates, name, size) for name, size in truth.items()), estimates
 
     def test_an_estimate_that_takes_drag_for_tilt(self):
-        """The log's attitude leans by a filter of the test's own: a' = rate (F_xy / F_z - a), and by a gyro's offset over the rate."""
+        """The log's attitude leans by a filter of the test's own: a' = rate (F_xy / F_z - a), and
+        by a gyro's offset over the rate.
+        """
         log, rate, offset = fly(8.0, drag=0.03), 1.5, np.array([0.012, -0.009, 0.0])
         time = log["pos_w"].time
         true, speed = attitude(time), np.gradient(log["pos_w"].values, time, axis=0)
         acc_w = np.gradient(speed, time, axis=0)
-        force = true.inv().apply(np.convolve(acc_w[:, 2], np.ones(9) / 9, "same")[:, None] * [0, 0, 1] + [0, 0, G])
+        force = true.inv().apply(
+            np.convolve(acc_w[:, 2], np.ones(9) / 9, "same")[:, None] * [0, 0, 1] + [0, 0, G]
+        )
         force[:, :2] = -0.03 / 0.03 * true.inv().apply(speed)[:, :2]  # drag over mass
         lean = np.zeros((len(time), 2))
         for i in range(1, len(time)):
             share = force[i, :2] / force[i, 2]
             lean[i] = lean[i - 1] + (time[i] - time[i - 1]) * rate * (share - lean[i - 1])
         lean = lean + [offset[1] / rate, -offset[0] / rate]
-        turn = np.column_stack([-lean[:, 1], lean[:, 0], 0.0 * time])  # the estimate's axis stands where the force points
+        turn = np.column_stack(
+            [-lean[:, 1], lean[:, 0], 0.0 * time]
+        )  # the estimate's axis stands where the force points
         leaning = true * Rotation.from_rotvec(turn)
         step = leaning[:-1].inv() * leaning[1:]
-        gyro = step.as_rotvec() / np.diff(time)[:, None] + offset  # in the mean of the flight the lean does not change
+        gyro = (
+            step.as_rotvec() / np.diff(time)[:, None] + offset
+        )  # in the mean of the flight the lean does not change
         channels = {
-            "quat_wb": Channel(time, leaning.as_quat(), "1", "world"), "acc_b": Channel(time, force, "m/s^2", "body"),
+            "quat_wb": Channel(time, leaning.as_quat(), "1", "world"),
+            "acc_b": Channel(time, force, "m/s^2", "body"),
             "rate_b": Channel(time[1:], gyro, "rad/s", "body"),
-        }  # fmt: skip
+        }
         params = FlyerParams(**{**vars(FLYER), "estimator_rate": rate})
         model = FlyerModel([FlightLog({**log.channels, **channels})], params)
-        names = ["estimator_lean", "rotor_drag_xy", "cmd_delay", "thrust_gain", "marker_rot_x", "marker_rot_y"]
+        names = [
+            "estimator_lean",
+            "rotor_drag_xy",
+            "cmd_delay",
+            "thrust_gain",
+            "marker_rot_x",
+            "marker_rot_y",
+        ]
         estimates = found(model, names)
         assert estimates["estimator_lean"][0] == pytest.approx(1.0, abs=0.1), estimates
         assert estimates["rotor_drag_xy"][0] == pytest.approx(0.03, rel=0.1), estimates
@@ -268,14 +383,27 @@ class TestFlyer:
 
     @pytest.mark.slow
     def test_a_vehicle_fitted_alone_holds_with_a_payload_below(self):
-        """Fit of flights without payload; with the payload nothing of the vehicle needs to change."""
-        result = fitting.fit(FlyerModel([fly(8.0, gain=1.05, drag=0.02)], FLYER), ["thrust_gain", "rotor_drag_xy", "cmd_delay"])
+        """Fit of flights without payload; with the payload nothing of the vehicle needs
+        to change.
+        """
+        result = fitting.fit(
+            FlyerModel([fly(8.0, gain=1.05, drag=0.02)], FLYER),
+            ["thrust_gain", "rotor_drag_xy", "cmd_delay"],
+        )
         gain, drag, delay = result.theta
         scaled = tuple(float(c * (1.0 + gain)) for c in FLYER.thrust_map)
         cable = CableParams(0.5, 0.008)
-        changes = {"thrust_map": scaled, "drag_xy": float(drag), "command_delay": float(delay), "cable": cable}
+        changes = {
+            "thrust_map": scaled,
+            "drag_xy": float(drag),
+            "command_delay": float(delay),
+            "cable": cable,
+        }
         params = FlyerParams(**{**vars(FLYER), **changes})
-        estimates = found(FlyerModel([fly(6.0, gain=1.05, drag=0.02, cable=0.5, seed=4)], params), ["thrust_gain", "rotor_drag_xy"])
+        estimates = found(
+            FlyerModel([fly(6.0, gain=1.05, drag=0.02, cable=0.5, seed=4)], params),
+            ["thrust_gain", "rotor_drag_xy"],
+        )
         assert near(estimates, "thrust_gain", 0.0), estimates
         assert near(estimates, "rotor_drag_xy", 0.0), estimates
         assert estimates["thrust_gain"][1] < 0.01
@@ -297,20 +425,35 @@ class TestFlyer:
                 sides.append(model._off(moved, np.array([start] + list(model._start[1:])))[0])
             slope = -(sides[0] - sides[1]) / (2 * step)
             scale = np.max(np.abs(slope)) + 1e-12
-            assert window.effects[:, k] / scale == pytest.approx(slope / scale, abs=0.02), effect.name
+            assert window.effects[:, k] / scale == pytest.approx(slope / scale, abs=0.02), (
+                effect.name
+            )
         assert window.latent.shape[1] == len(window.latent_block) == len(window.latent_time)
 
     def test_motor_gains_from_rates(self):
-        """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body mechanics says."""
+        """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body
+        mechanics says.
+        """
         torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
         params = FlyerParams(**{**vars(FLYER), "torque": torque})
         log = fly(5.0)
         time = log["pos_w"].time
         u = log["motor_command"].values[:, 0]
         lost = 0.1 * (0.06 * u + 0.1 * u * u)  # of the front left motor
-        spin = np.cumsum(np.column_stack([-0.03 * lost / 2e-5, 0.03 * lost / 2e-5, -0.006 * lost / 3e-5]), axis=0) * 0.01
+        spin = (
+            np.cumsum(
+                np.column_stack([-0.03 * lost / 2e-5, 0.03 * lost / 2e-5, -0.006 * lost / 3e-5]),
+                axis=0,
+            )
+            * 0.01
+        )
         rates = Channel(time, 1e-4 * spin, "rad/s", "body")  # small: gyroscopic terms vanish
-        weak = FlyerParams(**{**vars(params), "torque": TorqueParams((0.2, 0.2, 0.3), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))})
+        weak = FlyerParams(
+            **{
+                **vars(params),
+                "torque": TorqueParams((0.2, 0.2, 0.3), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0)),
+            }
+        )
         model = FlyerModel([FlightLog({**log.channels, "rate_b": rates})], weak)
         right = [s.channel == 1 for s in model.stretches]
         truth, nothing = model.residuals({"motor_fl": -0.1}), model.residuals({})
@@ -320,9 +463,17 @@ class TestFlyer:
 
     def test_missing_channels_are_named(self):
         with pytest.raises(LogError, match="missing everywhere: quat_wb"):
-            FlyerModel([FlightLog({k: v for k, v in fly(3.0).channels.items() if k != "quat_wb"})], FLYER)
+            FlyerModel(
+                [FlightLog({k: v for k, v in fly(3.0).channels.items() if k != "quat_wb"})], FLYER
+            )
         with pytest.raises(ConfigError, match="single motors"):
-            FlyerParams(**{**vars(FLYER), "input": "thrust_command", "torque": TorqueParams((1, 1, 1), 1, 1, 1, (1, 1, 1, 1))})
+            FlyerParams(
+                **{
+                    **vars(FLYER),
+                    "input": "thrust_command",
+                    "torque": TorqueParams((1, 1, 1), 1, 1, 1, (1, 1, 1, 1)),
+                }
+            )
 
     def test_without_voltage_the_battery_cannot_be_seen(self):
         log = fly(3.0)
@@ -333,9 +484,25 @@ class TestFlyer:
 
 
 TRIM = TrimParams(
-    "motor_command", "pos_w", "vel_w", 0.03, G, (0.0, 0.15, 0.0), 3.8, 0.0, (1.0, 1.0, 1.0, 1.0), 0.03, 0.006,
-    (1.0, -1.0, -1.0, 1.0), 0.2, 0.5, 0.5, 0.003, 0.01, 5e-4,
-)  # fmt: skip
+    "motor_command",
+    "pos_w",
+    "vel_w",
+    0.03,
+    G,
+    (0.0, 0.15, 0.0),
+    3.8,
+    0.0,
+    (1.0, 1.0, 1.0, 1.0),
+    0.03,
+    0.006,
+    (1.0, -1.0, -1.0, 1.0),
+    0.2,
+    0.5,
+    0.5,
+    0.003,
+    0.01,
+    5e-4,
+)
 
 
 def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
@@ -344,20 +511,28 @@ def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
     time = np.arange(0, 8, 0.01)
     command = 0.03 * G / 4 / 0.15 * np.array(shares) + rng.normal(0, 0.004, (len(time), 4))
     pos = np.tile([0, 0, 0.6], (len(time), 1)) + rng.normal(0, 1e-3, (len(time), 3))
-    return FlightLog({
-        "pos_w": Channel(time, pos, "m", "world"), "vel_w": Channel(time, rng.normal(0, 0.01, (len(time), 3)), "m/s", "world"),
-        "motor_command": Channel(time, command, "1"),
-    })  # fmt: skip
+    return FlightLog(
+        {
+            "pos_w": Channel(time, pos, "m", "world"),
+            "vel_w": Channel(time, rng.normal(0, 0.01, (len(time), 3)), "m/s", "world"),
+            "motor_command": Channel(time, command, "1"),
+        }
+    )
 
 
 class TestTrim:
     def test_one_weak_motor(self):
-        estimates = found(TrimModel([hover_log((1.0, 1.0, 1.25, 1.0))], TRIM), ["motor_fl", "motor_fr", "motor_rl", "motor_rr"])
+        estimates = found(
+            TrimModel([hover_log((1.0, 1.0, 1.25, 1.0))], TRIM),
+            ["motor_fl", "motor_fr", "motor_rl", "motor_rr"],
+        )
         assert estimates["motor_rl"][0] == pytest.approx(-0.2, abs=0.02)
         assert all(near(estimates, f"motor_{name}", 0.0) for name in ("fl", "fr", "rr"))
 
     def test_a_weight_at_a_motor(self):
-        """2 g at a rotor of a 30 g vehicle: levers give 3/4 of it to that motor, -1/4 to the opposite one, 1/4 to the others."""
+        """2 g at a rotor of a 30 g vehicle: levers give 3/4 of it to that motor, -1/4 to the
+        opposite one, 1/4 to the others.
+        """
         extra = 2.0 / 30.0
         log = hover_log((1 + extra, 1 - extra, 1 + 3 * extra, 1 + extra))
         estimates = found(TrimModel([log], TRIM), ["added_rl"])
@@ -367,16 +542,25 @@ class TestTrim:
 
 
 class TestGimbal:
-    PARAMS = GimbalParams((0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0)
+    PARAMS = GimbalParams(
+        (0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0
+    )
 
     def logs(self, tilt=(0.0, 0.0, 0.0), focal=1.0, delay=0.0) -> list[FlightLog]:
-        """A payload that swings below a vehicle that looks down; the marker by a chain of rotations of scipy's."""
+        """A payload that swings below a vehicle that looks down; the marker by a chain of rotations
+        of scipy's.
+        """
         rng = np.random.default_rng(2)
         time = np.arange(0, 20, 1 / 30)
 
         def seen(t):
-            turn = Rotation.from_euler("ZYX", np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]))
-            gap = np.column_stack([0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)])
+            turn = Rotation.from_euler(
+                "ZYX",
+                np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]),
+            )
+            gap = np.column_stack(
+                [0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)]
+            )
             gimbal = Rotation.from_euler("XY", [0.05, np.pi / 2])
             local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
             return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
@@ -384,12 +568,19 @@ class TestGimbal:
         turn, gap, _ = seen(time)
         point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
         gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
-        return [FlightLog({
-            "pos_w": Channel(time, np.tile([0, 0, 4.0], (len(time), 1)), "m", "world"),
-            "quat_wb": Channel(time, turn.as_quat(), "1", "world"), "payload_pos_w": Channel(time, gap + [0, 0, 4], "m", "world"),
-            "marker_pos_c": Channel(time, point + rng.normal(0, 0.005, point.shape), "m", "camera"),
-            "gimbal": Channel(time, gimbal, "rad", "body"),
-        })]  # fmt: skip
+        return [
+            FlightLog(
+                {
+                    "pos_w": Channel(time, np.tile([0, 0, 4.0], (len(time), 1)), "m", "world"),
+                    "quat_wb": Channel(time, turn.as_quat(), "1", "world"),
+                    "payload_pos_w": Channel(time, gap + [0, 0, 4], "m", "world"),
+                    "marker_pos_c": Channel(
+                        time, point + rng.normal(0, 0.005, point.shape), "m", "camera"
+                    ),
+                    "gimbal": Channel(time, gimbal, "rad", "body"),
+                }
+            )
+        ]
 
     def test_geometry(self):
         residual = np.concatenate(GimbalModel(self.logs(), self.PARAMS).residuals({}))
@@ -398,12 +589,25 @@ class TestGimbal:
 
     def test_tilt_delay_and_focal_length_are_found(self):
         model = GimbalModel(self.logs((0.02, -0.015, 0.01), 0.97, 0.06), self.PARAMS)
-        estimates = found(model, ["camera_tilt_x", "camera_tilt_y", "camera_tilt_z", "camera_delay", "focal_scale"])
-        truth = {"camera_tilt_x": 0.02, "camera_tilt_y": -0.015, "camera_tilt_z": 0.01, "camera_delay": 0.06, "focal_scale": -0.03}
-        assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items()), estimates
+        estimates = found(
+            model,
+            ["camera_tilt_x", "camera_tilt_y", "camera_tilt_z", "camera_delay", "focal_scale"],
+        )
+        truth = {
+            "camera_tilt_x": 0.02,
+            "camera_tilt_y": -0.015,
+            "camera_tilt_z": 0.01,
+            "camera_delay": 0.06,
+            "focal_scale": -0.03,
+        }
+        assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items()), (
+            estimates
+        )
 
     def test_camera_tilt_and_marker_rotation_are_one(self):
-        """With the gimbal at rest a turned camera and a turned marker frame are the same to the last digit."""
+        """With the gimbal at rest a turned camera and a turned marker frame are the same to the
+        last digit.
+        """
         window = GimbalModel(self.logs(), self.PARAMS).windows({})[0]
         names = [e.name for e in GimbalModel(self.logs(), self.PARAMS).effects]
         tilts = window.effects[:, [names.index(f"camera_tilt_{a}") for a in "xyz"]]

@@ -13,12 +13,22 @@ from visthrow.diagnose.select import search
 @pytest.fixture(scope="module")
 def degenerate():
     """Two effects that do the same."""
-    model = SyntheticModel(effects=catalogue(12), truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    model = SyntheticModel(
+        effects=catalogue(12),
+        truth={"effect_03": 12.0},
+        same={"effect_07": ("effect_03", 0.5)},
+        seed=2,
+    )
     return search.explain(model, laws=False)
 
 
 def test_a_session_holds_what_separates_more_than_what_stands_before_it():
-    said = (("circle", (("a", "b"), ("a", "c"))), ("swing", (("a", "c"),)), ("hover", ()), ("weigh", (("a", "d"),)))
+    said = (
+        ("circle", (("a", "b"), ("a", "c"))),
+        ("swing", (("a", "c"),)),
+        ("hover", ()),
+        ("weigh", (("a", "d"),)),
+    )
     proposals = [plan.Proposal(name, "", 10.0, 12.0, separates, 1, "") for name, separates in said]
     assert [p.name for p in plan.session(proposals)] == ["circle", "weigh"]
 
@@ -27,7 +37,9 @@ def test_a_member_that_is_far_behind_is_no_truth_to_plan_for(degenerate):
     """Flights that show only the other member promise what they show of it."""
     names, aim = [f.name for f in degenerate.findings], plan.Aim(degenerate)
     pair = names.index("effect_03"), names.index("effect_07")
-    base, new = (np.diag(np.isin(np.arange(len(names)), which).astype(float)) for which in (pair, pair[:1]))
+    base, new = (
+        np.diag(np.isin(np.arange(len(names)), which).astype(float)) for which in (pair, pair[:1])
+    )
     for behind, planned in ((6.0, False), (0.5, True)):  # score of the other member
         score = np.zeros(len(names))
         score[list(pair)] = 6.0, behind

@@ -1,7 +1,9 @@
-"""Recorded data of others: what is said of each, and what is not. The reasons stand in docs/explanation/real_data.md.
+"""Recorded data of others: what is said of each, and what is not.
 
-With the environment variable VISTHROW_REAL_DATA naming a folder of the full data sets, all of their files are looked at.
-"""
+The reasons stand in docs/explanation/real_data.md.
+
+With the environment variable VISTHROW_REAL_DATA naming a folder of the full data sets, all of their
+files are looked at."""
 
 import gzip
 import os
@@ -13,7 +15,15 @@ import pytest
 
 from visthrow import cli
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.diagnose.select.result import CANDIDATE, FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT, UNKNOWN
+from visthrow.diagnose.select.result import (
+    CANDIDATE,
+    FOUND,
+    IN_PART,
+    KNOWN,
+    NAMED,
+    NO_EFFECT,
+    UNKNOWN,
+)
 from visthrow.diagnose.select.search import explain
 from visthrow.logs import read_all
 from visthrow.logs.check.run import check, contradictions
@@ -22,10 +32,16 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 REAL = DATA / "real"
 FULL = Path(os.environ.get("VISTHROW_REAL_DATA", REAL))
 SETUPS = {
-    "betaflight_bbl": None, "crazypad_faults": "crazypad", "jugglebot_throws": "jugglebot", "motor_prop_stand": "motor_stand",
-    "nanobench_cf21": "nanobench_cf21", "payload_cf_single": "cf_payload", "payload_cf_two_drones": "cf_payload_pair",
-    "pendulum_single": "pendulum_encoder", "slungload_camera": "slungload_camera",
-}  # fmt: skip
+    "betaflight_bbl": None,
+    "crazypad_faults": "crazypad",
+    "jugglebot_throws": "jugglebot",
+    "motor_prop_stand": "motor_stand",
+    "nanobench_cf21": "nanobench_cf21",
+    "payload_cf_single": "cf_payload",
+    "payload_cf_two_drones": "cf_payload_pair",
+    "pendulum_single": "pendulum_encoder",
+    "slungload_camera": "slungload_camera",
+}
 
 pytestmark = pytest.mark.slow
 
@@ -38,7 +54,11 @@ def explained(setup: str, *paths: str | Path):
 
     def rms(theta, channel=0):
         own = [s.channel == channel for s in model.stretches]
-        return float(np.sqrt(np.mean(np.concatenate([r[o] for r, o in zip(model.residuals(theta), own)]) ** 2)))
+        return float(
+            np.sqrt(
+                np.mean(np.concatenate([r[o] for r, o in zip(model.residuals(theta), own)]) ** 2)
+            )
+        )
 
     return diagnosis, named, rms
 
@@ -52,8 +72,13 @@ def test_every_file_gets_a_verdict(folder):
         logs = setups.read_logs([path], SETUPS[folder]) if SETUPS[folder] else read_all([path])
         for checked in check(logs):
             assert checked.verdict in ("ok", "warn", "bad")
-            assert not [reason for reason in contradictions([checked]) if "idle" not in reason and "place" not in reason
-                        and "no sign of flight" not in reason]  # fmt: skip
+            assert not [
+                reason
+                for reason in contradictions([checked])
+                if "idle" not in reason
+                and "place" not in reason
+                and "no sign of flight" not in reason
+            ]
 
 
 def _spoiled(lines: list[str], how: str) -> list[str]:
@@ -65,15 +90,21 @@ def _spoiled(lines: list[str], how: str) -> list[str]:
         "one row again and again": lambda: rows[:1] * 400,
         "backwards": lambda: rows[::-1],
         "shuffled": lambda: [rows[i] for i in rng.permutation(len(rows))],
-        "holes": lambda: [",".join("" if rng.random() < 0.3 else cell for cell in row.split(",")) for row in rows],
-        "huge": lambda: [",".join("1e30" if rng.random() < 0.05 else cell for cell in row.split(",")) for row in rows],
+        "holes": lambda: [
+            ",".join("" if rng.random() < 0.3 else cell for cell in row.split(",")) for row in rows
+        ],
+        "huge": lambda: [
+            ",".join("1e30" if rng.random() < 0.05 else cell for cell in row.split(","))
+            for row in rows
+        ],
         "zeros": lambda: [",".join(["0"] * width)] * len(rows),
     }[how]()
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
-    "how", ["three rows", "one row again and again", "backwards", "shuffled", "holes", "huge", "zeros"]
+    "how",
+    ["three rows", "one row again and again", "backwards", "shuffled", "holes", "huge", "zeros"],
 )
 @pytest.mark.parametrize(
     ("setup", "path"),
@@ -85,11 +116,13 @@ def _spoiled(lines: list[str], how: str) -> list[str]:
         ("crazypad", REAL / "crazypad_faults" / "tape_on_propeller_M3__E8_log00.csv.gz"),
         ("jugglebot", REAL / "jugglebot_throws" / "session7.csv.gz"),
     ],
-)  # fmt: skip
+)
 def test_spoiled_tables_get_a_verdict_or_an_error(setup, path, how, tmp_path, capsys):
     lines = gzip.decompress(path.read_bytes()).decode().splitlines()[:2000]
     (tmp_path / "a.csv").write_text("\n".join(_spoiled(lines, how)) + "\n")
-    code = cli.main(["diagnose", "check", str(tmp_path / "a.csv"), "--config", setup, "--no-pictures"])
+    code = cli.main(
+        ["diagnose", "check", str(tmp_path / "a.csv"), "--config", setup, "--no-pictures"]
+    )
     said = capsys.readouterr()
     assert code in (0, 1) or said.err.startswith("visthrow: error:")
     if how in ("three rows", "one row again and again", "zeros") and setup != "motor_stand":
@@ -111,13 +144,23 @@ def test_two_drones_run_on_two_clocks():
 
 
 def test_streams_of_nanobench_are_not_aligned_to_half_a_millisecond():
-    (checked,) = check(setups.read_logs([REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"], "nanobench_cf21"))
-    drift = [row for row in checked.rows if row.channel == "pos_w, est_pos_w" and "delays_s" in row.figures]
+    (checked,) = check(
+        setups.read_logs(
+            [REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"], "nanobench_cf21"
+        )
+    )
+    drift = [
+        row
+        for row in checked.rows
+        if row.channel == "pos_w, est_pos_w" and "delays_s" in row.figures
+    ]
     assert np.ptp(drift[0].figures["delays_s"]) > 5e-3
 
 
 def test_pendulum_has_three_frictions():
-    diagnosis, named, rms = explained("pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz")
+    diagnosis, named, rms = explained(
+        "pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz"
+    )
     assert diagnosis.overall == IN_PART  # what is left is a hundred times the encoder's noise
     assert {"pendulum_length", "coulomb_friction", "quadratic_drag"} <= named
     assert diagnosis["pendulum_length"].estimate == pytest.approx(-0.0167, abs=3e-4)
@@ -133,7 +176,9 @@ def test_ball_has_drag_and_sideways_forces_cannot_be_told_apart():
 
 def test_a_cut_propeller_is_found_and_tape_is_not():
     folder = REAL / "crazypad_faults"
-    diagnosis, named, _ = explained("crazypad", folder / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz")
+    diagnosis, named, _ = explained(
+        "crazypad", folder / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
+    )
     assert diagnosis.overall == KNOWN
     assert "motor_rl" in named
     assert diagnosis["motor_rl"].estimate == pytest.approx(-0.15, abs=0.04)
@@ -144,9 +189,22 @@ def test_a_cut_propeller_is_found_and_tape_is_not():
 
 
 def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
-    """Windows of one sample without a state at their start: the motor that is named predicts the parts that were left out."""
+    """Windows of one sample without a state at their start: the motor that is named predicts the
+    parts that were left out.
+    """
     flight = REAL / "crazypad_faults" / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
-    code = cli.main(["diagnose", "explain", str(flight), "--config", "crazypad", "--no-blind", "--out", str(tmp_path)])
+    code = cli.main(
+        [
+            "diagnose",
+            "explain",
+            str(flight),
+            "--config",
+            "crazypad",
+            "--no-blind",
+            "--out",
+            str(tmp_path),
+        ]
+    )
     assert code == 0
     said = capsys.readouterr().out
     assert re.search(r"held-out error of motor_wanted: 0.066\d? -> 0.02\d+, [56]\d % less", said)
@@ -159,13 +217,19 @@ def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
     diagnosis, named, rms = explained("cf_payload", *flights)
     assert named & {"rope_length", "marker_z"}
     assert named & {"thrust_gain", "mass_quad"}
-    length = next(f for f in diagnosis.findings if f.name in ("rope_length", "marker_z") and f.verdict in NAMED)
+    length = next(
+        f
+        for f in diagnosis.findings
+        if f.name in ("rope_length", "marker_z") and f.verdict in NAMED
+    )
     assert length.estimate == pytest.approx(0.010, abs=2e-3)
     assert rms(diagnosis.theta, 1) < 0.5 * rms({}, 1)
 
 
 def test_thrust_map_drag_and_battery_of_nanobench():
-    diagnosis, named, rms = explained("nanobench_cf21", REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz")
+    diagnosis, named, rms = explained(
+        "nanobench_cf21", REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
+    )
     assert named & {"thrust_gain", "mass_quad"}
     assert named & {"rotor_drag_xy", "parasitic"}
     assert rms(diagnosis.theta) < 0.2 * rms({})
@@ -184,9 +248,13 @@ def test_a_motor_idles_and_a_hundred_motors_are_not_one():
 
 
 def test_the_camera_sees_the_load_nearer_the_axis():
-    diagnosis, named, rms = explained("slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz")))
+    diagnosis, named, rms = explained(
+        "slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz"))
+    )
     assert "focal_scale" in named
-    assert diagnosis["focal_scale"].estimate == pytest.approx(-0.12, abs=0.025)  # -0.11 in these pieces, -0.13 in the whole bags
+    assert diagnosis["focal_scale"].estimate == pytest.approx(
+        -0.12, abs=0.025
+    )  # -0.11 in these pieces, -0.13 in the whole bags
     assert named & {"camera_tilt_x", "marker_rot_y"}
     assert named & {"camera_tilt_y", "marker_rot_x"}
     assert rms(diagnosis.theta) < 0.6 * rms({})

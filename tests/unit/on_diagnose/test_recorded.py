@@ -11,18 +11,27 @@ SWING = [0.1, 0.2, 0.3]
 
 
 def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> FlightLog:
-    """Ten seconds whose body rates swing at 10 Hz, seen at so many samples a second, none in the gap."""
+    """Ten seconds whose body rates swing at 10 Hz, seen at so many samples a second, none in the
+    gap.
+    """
     at, seen = np.arange(0.0, 10.0, 0.005), np.arange(0.0, 10.0, 1.0 / rate)
     seen = seen[(seen <= gap[0]) | (seen >= gap[1])]
     values = np.sin(2.0 * np.pi * 10.0 * seen)[:, None] * SWING
     values += noise * np.random.default_rng(0).standard_normal(values.shape)
     still = np.zeros((len(at), 3)) + 1e-4 * np.random.default_rng(1).standard_normal((len(at), 3))
-    quat = np.column_stack((1e-4 * np.random.default_rng(2).standard_normal((len(at), 3)), np.ones(len(at))))
-    return FlightLog({
-        "pos_w": Channel(at, still, "m", "world"), "quat_wb": Channel(at, quat, "1", "world"),
-        "command": Channel(at[::4], np.tile([4.0, 0.0, 0.0, 0.0], (len(at[::4]), 1)), "N, rad/s", "body"),
-        "rate_b": Channel(seen, values, "rad/s", "body"),
-    })  # fmt: skip
+    quat = np.column_stack(
+        (1e-4 * np.random.default_rng(2).standard_normal((len(at), 3)), np.ones(len(at)))
+    )
+    return FlightLog(
+        {
+            "pos_w": Channel(at, still, "m", "world"),
+            "quat_wb": Channel(at, quat, "1", "world"),
+            "command": Channel(
+                at[::4], np.tile([4.0, 0.0, 0.0, 0.0], (len(at[::4]), 1)), "N, rad/s", "body"
+            ),
+            "rate_b": Channel(seen, values, "rad/s", "body"),
+        }
+    )
 
 
 def test_a_gyro_of_1_kHz_is_as_good_in_a_quarter_of_its_samples():
@@ -35,7 +44,11 @@ def test_a_gyro_of_1_kHz_is_as_good_in_a_quarter_of_its_samples():
     left = gyro.values - np.sin(2.0 * np.pi * 10.0 * gyro.time)[:, None] * SWING
     assert np.std(left) == pytest.approx(0.0101, rel=0.05)
     assert abs(np.corrcoef(left[:-1].ravel(), left[1:].ravel())[0, 1]) < 0.08
-    swing = np.sin(2.0 * np.pi * 10.0 * gyro.time) @ gyro.values / np.sum(np.sin(2.0 * np.pi * 10.0 * gyro.time) ** 2)
+    swing = (
+        np.sin(2.0 * np.pi * 10.0 * gyro.time)
+        @ gyro.values
+        / np.sum(np.sin(2.0 * np.pi * 10.0 * gyro.time) ** 2)
+    )
     np.testing.assert_allclose(swing, SWING, rtol=5e-3)
 
 
@@ -46,11 +59,17 @@ def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
 
 
 def test_a_gyro_of_which_a_third_is_lost_or_stale_still_tells_all():
-    """Samples that lack here and there shift no time: the motion is all there, with as little noise as those that came allow."""
+    """Samples that lack here and there shift no time: the motion is all there, with as little noise
+    as those that came allow.
+    """
     log, rng = flight(1000.0, 0.02), np.random.default_rng(3)
     rate = log["rate_b"]
     came = np.flatnonzero(rng.random(len(rate.time)) > 0.33)
-    gyro = record_of(FlightLog({**log.channels, "rate_b": Channel(rate.time[came], rate.values[came], "rad/s", "body")})).gyro
+    gyro = record_of(
+        FlightLog(
+            {**log.channels, "rate_b": Channel(rate.time[came], rate.values[came], "rad/s", "body")}
+        )
+    ).gyro
     assert len(gyro.time) > 0.9 * len(came) / 4
     left = gyro.values - np.sin(2.0 * np.pi * 10.0 * gyro.time)[:, None] * SWING
     assert np.std(left) == pytest.approx(0.0101, rel=0.1)

@@ -1,4 +1,6 @@
-"""Recordings of other tools: written by the formats' own writers, or byte by byte; read, mapped, checked."""
+"""Recordings of other tools: written by the formats' own writers, or byte by byte; read, mapped,
+checked.
+"""
 
 import json
 import struct
@@ -19,13 +21,20 @@ TIME = COLUMNS["time"]
 
 def card(path: Path, version: int) -> None:
     """A Crazyflie's card: two events with clocks of their own."""
-    events = {0: ("fixedFrequency", ["acc.x", "acc.y", "acc.z"]), 7: ("estPosition", ["x", "y", "z"])}
+    events = {
+        0: ("fixedFrequency", ["acc.x", "acc.y", "acc.z"]),
+        7: ("estPosition", ["x", "y", "z"]),
+    }
     data = bytes([0xBC]) + struct.pack("<HH", version, len(events))
     for number, (name, fields) in events.items():
         data += struct.pack("<H", number) + name.encode() + b"\x00" + struct.pack("<H", len(fields))
         data += b"".join(f"{field}(f)".encode() + b"\x00" for field in fields)
     for i, t in enumerate(TIME):
-        stamp = struct.pack("<I", round(1e3 * t) + 5000) if version == 1 else struct.pack("<Q", round(1e6 * t) + 5_000_000)
+        stamp = (
+            struct.pack("<I", round(1e3 * t) + 5000)
+            if version == 1
+            else struct.pack("<Q", round(1e6 * t) + 5_000_000)
+        )
         data += struct.pack("<H", 0) + stamp + struct.pack("<fff", *COLUMNS["acc_b"][i] / 9.80665)
         if i % 2:
             data += struct.pack("<H", 7) + stamp + struct.pack("<fff", *COLUMNS["pos_w"][i])
@@ -35,13 +44,25 @@ def card(path: Path, version: int) -> None:
 def hdf5(path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
-        file["time"], file["drone/pos"], file["imu/acc"] = TIME, COLUMNS["pos_w"], COLUMNS["acc_b"].T
+        file["time"], file["drone/pos"], file["imu/acc"] = (
+            TIME,
+            COLUMNS["pos_w"],
+            COLUMNS["acc_b"].T,
+        )
 
 
 def matlab(path: Path) -> None:
     from scipy.io import savemat
 
-    savemat(path, {"time": TIME, "drone": {"pos": COLUMNS["pos_w"]}, "imu": {"acc": COLUMNS["acc_b"]}, "note": "a flight"})
+    savemat(
+        path,
+        {
+            "time": TIME,
+            "drone": {"pos": COLUMNS["pos_w"]},
+            "imu": {"acc": COLUMNS["acc_b"]},
+            "note": "a flight",
+        },
+    )
 
 
 def mcap(path: Path) -> None:
@@ -50,11 +71,18 @@ def mcap(path: Path) -> None:
         writer = writer_of.Writer(file)
         writer.start()
         schema = writer.register_schema(name="any", encoding="jsonschema", data=b"{}")
-        topics = {name: writer.register_channel(topic=f"/{name}", message_encoding="json", schema_id=schema) for name in ("pose", "imu")}
+        topics = {
+            name: writer.register_channel(
+                topic=f"/{name}", message_encoding="json", schema_id=schema
+            )
+            for name in ("pose", "imu")
+        }
         for i, t in enumerate(TIME):
             stamp = round(1e9 * t) + 1_700_000_000_000_000_000
-            for name, value in (("pose", {"position": dict(zip("xyz", COLUMNS["pos_w"][i]))}),
-                                ("imu", {"acc": dict(zip("xyz", COLUMNS["acc_b"][i]))})):  # fmt: skip
+            for name, value in (
+                ("pose", {"position": dict(zip("xyz", COLUMNS["pos_w"][i]))}),
+                ("imu", {"acc": dict(zip("xyz", COLUMNS["acc_b"][i]))}),
+            ):
                 if name == "imu" or i % 2:
                     writer.add_message(topics[name], stamp, json.dumps(value).encode(), stamp)
         writer.finish()
@@ -69,11 +97,18 @@ def bag(path: Path, ros: int = 1) -> None:
     writer_of = module.Writer(path) if ros == 1 else module.Writer(path.with_suffix(""), version=8)
     pose, imu = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/Imu"
     with writer_of as writer:
-        topics = {kind: writer.add_connection(topic, kind, typestore=store) for topic, kind in (("/drone/pose", pose), ("/imu", imu))}
+        topics = {
+            kind: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in (("/drone/pose", pose), ("/imu", imu))
+        }
         for i, t in enumerate(TIME):
             pack = store.serialize_ros1 if ros == 1 else store.serialize_cdr
             for kind, message in zip((pose, imu), messages(store, ros, i, t)):
-                writer.write(topics[kind], 1_000_000_000_000 + round(1e9 * t) + 3_000_000, pack(message, kind))
+                writer.write(
+                    topics[kind],
+                    1_000_000_000_000 + round(1e9 * t) + 3_000_000,
+                    pack(message, kind),
+                )
     if ros == 2:
         (made,) = path.with_suffix("").glob("*.db3")
         path.with_suffix("").joinpath("metadata.yaml").rename(path.parent / "metadata.yaml")
@@ -83,19 +118,28 @@ def bag(path: Path, ros: int = 1) -> None:
 def messages(store, ros: int, i: int, t: float) -> tuple:
     """A pose and an IMU's message of one instant."""
     types = store.types
-    vector, point, turn = (types[f"geometry_msgs/msg/{n}"] for n in ("Vector3", "Point", "Quaternion"))
+    vector, point, turn = (
+        types[f"geometry_msgs/msg/{n}"] for n in ("Vector3", "Point", "Quaternion")
+    )
     stamp = types["builtin_interfaces/msg/Time"](1000 + int(t), round(1e9 * (t % 1.0)))
     head = types["std_msgs/msg/Header"](*([i] if ros == 1 else []), stamp, "world")
     attitude = turn(*COLUMNS["quat_wb"][i])
     forces = vector(*COLUMNS["rate_b"][i]), np.zeros(9), vector(*COLUMNS["acc_b"][i]), np.zeros(9)
     placed = types["geometry_msgs/msg/Pose"](point(*COLUMNS["pos_w"][i]), attitude)
-    return types["geometry_msgs/msg/PoseStamped"](head, placed), types["sensor_msgs/msg/Imu"](head, attitude, np.zeros(9), *forces)
+    return types["geometry_msgs/msg/PoseStamped"](head, placed), types["sensor_msgs/msg/Imu"](
+        head, attitude, np.zeros(9), *forces
+    )
 
 
 WRITERS = {
-    "log00": lambda p: card(p, 2), "log01": lambda p: card(p, 1), "a.h5": hdf5, "a.mat": matlab, "a.mcap": mcap, "a.bag": bag,
+    "log00": lambda p: card(p, 2),
+    "log01": lambda p: card(p, 1),
+    "a.h5": hdf5,
+    "a.mat": matlab,
+    "a.mcap": mcap,
+    "a.bag": bag,
     "a.db3": lambda p: bag(p, 2),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -106,10 +150,14 @@ def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     (log,) = read(path, found.mapping)
     assert {"pos_w", "acc_b"} <= set(log.channels)
     every = 2 if name in ("log00", "log01", "a.mcap") else 1
-    assert log["pos_w"].values == pytest.approx(COLUMNS["pos_w"][1::2] if every == 2 else COLUMNS["pos_w"], abs=1e-5)
+    assert log["pos_w"].values == pytest.approx(
+        COLUMNS["pos_w"][1::2] if every == 2 else COLUMNS["pos_w"], abs=1e-5
+    )
     assert log["acc_b"].values == pytest.approx(COLUMNS["acc_b"], abs=1e-4)
     assert np.median(np.diff(log["pos_w"].time)) == pytest.approx(0.01 * every, rel=1e-3)
-    assert (found.mapping.clocks is not None) == (name not in ("a.h5", "a.mat")), "tables with clocks of their own"
+    assert (found.mapping.clocks is not None) == (name not in ("a.h5", "a.mat")), (
+        "tables with clocks of their own"
+    )
     with pytest.raises(LogError, match="needs a mapping"):
         read(path)
 

@@ -1,4 +1,6 @@
-"""Real logs with a channel empty, in another unit or with exchanged axes: an error that says so before anything is named."""
+"""Real logs with a channel empty, in another unit or with exchanged axes: an error that says so
+before anything is named.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -37,10 +39,18 @@ def times(factor: float, *names: str) -> Callable[[table.Table], dict]:
     [
         (SWING, nothing("theta_rad"), "no stretch of these logs"),
         (SWING, times(180.0 / np.pi, "theta_rad"), "degrees, or another zero"),
-        (CABLE, nothing(*(f"stateEstimateZ.p{axis}" for axis in "xyz")), "missing everywhere: payload_pos_w"),
+        (
+            CABLE,
+            nothing(*(f"stateEstimateZ.p{axis}" for axis in "xyz")),
+            "missing everywhere: payload_pos_w",
+        ),
         (CABLE, times(1e3, "ctrlLee.thrustSI"), "times the weight"),
         (CAMERA, nothing("l_px", "l_py", "l_pz"), "no stretch of these logs"),
-        (CAMERA, lambda t: {"d_px": t["d_py"], "d_py": t["d_px"]}, "other axes, another unit, or another marker"),
+        (
+            CAMERA,
+            lambda t: {"d_px": t["d_py"], "d_py": t["d_px"]},
+            "other axes, another unit, or another marker",
+        ),
     ],
 )
 def test_spoiled_channels_are_refused(data, change, words):
@@ -53,7 +63,11 @@ def test_a_channel_of_few_samples_has_a_noise_all_the_same():
     first = np.arange(4000)  # of 250 a second; the payload is seen a few times in it
 
     def few(t: table.Table) -> dict:
-        held = {name: np.where(first_rows(t) % 90 == 0, t[name], np.nan) for name in t if name.startswith("stateEstimateZ.p")}
+        held = {
+            name: np.where(first_rows(t) % 90 == 0, t[name], np.nan)
+            for name in t
+            if name.startswith("stateEstimateZ.p")
+        }
         return {name: values for name, values in held.items() if name[-2:] in ("px", "py", "pz")}
 
     def first_rows(t: table.Table) -> np.ndarray:
@@ -66,9 +80,14 @@ def test_a_channel_of_few_samples_has_a_noise_all_the_same():
 
 def test_a_spring_at_the_joint_is_told_from_nothing_else_but_the_scale():
     swing = model(*SWING, lambda _: {})
-    window = swing.windows({"pendulum_length": -0.0168, "coulomb_friction": 0.21, "quadratic_drag": 0.0038})[0]
+    window = swing.windows(
+        {"pendulum_length": -0.0168, "coulomb_friction": 0.21, "quadratic_drag": 0.0038}
+    )[0]
     names = [effect.name for effect in swing.effects]
-    spring, scale = window.effects[:, names.index("joint_stiffness")], window.effects[:, names.index("encoder_scale")]
+    spring, scale = (
+        window.effects[:, names.index("joint_stiffness")],
+        window.effects[:, names.index("encoder_scale")],
+    )
     basis = np.column_stack((window.nuisance, window.effects[:, names.index("pendulum_length")]))
     left = [x - basis @ np.linalg.lstsq(basis, x, rcond=None)[0] for x in (spring, scale)]
     assert abs(np.dot(*left)) > 0.9 * np.linalg.norm(left[0]) * np.linalg.norm(left[1])

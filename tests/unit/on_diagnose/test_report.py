@@ -21,7 +21,13 @@ from visthrow.diagnose.throw.landing import Landings
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view import page
 
-SWING = str(Path(__file__).resolve().parents[2] / "data" / "real" / "pendulum_single" / "single_pendulum_id.csv.gz")
+SWING = str(
+    Path(__file__).resolve().parents[2]
+    / "data"
+    / "real"
+    / "pendulum_single"
+    / "single_pendulum_id.csv.gz"
+)
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
 
@@ -31,13 +37,19 @@ ARMS = {"effect_03": 2.0, "effect_04": 5.0}
 
 
 class Throwing(SyntheticModel):
-    """Also predicts where throws land: off by what the effects' sizes miss of the truth, and by 2 mm at random."""
+    """Also predicts where throws land: off by what the effects' sizes miss of the truth, and by 2
+    mm at random.
+    """
 
     def landings(self, theta, flights=None):
         """See :meth:`visthrow.diagnose.throw.throw_model.ThrowModel.landings`."""
-        numbers = np.array(sorted({w.flight for w in self._windows}) if flights is None else list(flights))
+        numbers = np.array(
+            sorted({w.flight for w in self._windows}) if flights is None else list(flights)
+        )
         floors = {e.name: e.floor for e in self.effects}
-        missing = np.array([ARMS[n] * (size * floors[n] - theta.get(n, 0.0)) for n, size in self.truth.items()])
+        missing = np.array(
+            [ARMS[n] * (size * floors[n] - theta.get(n, 0.0)) for n, size in self.truth.items()]
+        )
         scatter = np.array([np.random.default_rng(int(n)).normal(0.0, 2e-3, 3) for n in numbers])
         off = np.tile([*missing, 0.0], (len(numbers), 1)) + scatter
         return Landings(numbers, np.zeros_like(off), off, 0.1 * off)
@@ -50,7 +62,9 @@ def found():
 
 
 def test_landings_are_told_in_millimetres(found, measured):
-    """Before, after with causes sized by the other flights, and by each cause alone; in sentences too."""
+    """Before, after with causes sized by the other flights, and by each cause alone; in sentences
+    too.
+    """
     floors = {e.name: e.floor for e in EFFECTS}
     alone = {n: abs(ARMS[n] * size * floors[n]) for n, size in TRUTH.items()}
     landing = measured.landing
@@ -77,7 +91,9 @@ def test_gain_comes_near_what_knowing_the_truth_would_bring(found, measured):
     work = diagnosis.work
     floors = {e.name: e.floor for e in EFFECTS}
     oracle = [w.residual for w in model.windows({n: s * floors[n] for n, s in TRUTH.items()})]
-    best = forms.errors(work.after.windows, [w.flight for w in work.after.windows], work.after.noise, oracle, 2)
+    best = forms.errors(
+        work.after.windows, [w.flight for w in work.after.windows], work.after.noise, oracle, 2
+    )
     for c, channel in enumerate(measured.channels):
         sigma = np.median(work.after.windows[0].sigma[work.after.windows[0].channel == c])
         own = np.sqrt(best.square[:, c].sum() / best.count[:, c].sum()) * sigma
@@ -93,7 +109,9 @@ def test_gain_comes_near_what_knowing_the_truth_would_bring(found, measured):
 
 
 def test_shortfall_is_the_likelihood_ratio_of_a_linear_model(found):
-    """Moving from the truth by d costs d' I d / 2 less d' s nats; the same by the statistics at the truth."""
+    """Moving from the truth by d costs d' I d / 2 less d' s nats; the same by the statistics at the
+    truth.
+    """
     model, diagnosis = found
     problem = replace(diagnosis.work.problem, kept=tuple(range(len(model.windows({})))))
     theta = np.array([TRUTH.get(e.name, 0.0) for e in EFFECTS])
@@ -124,24 +142,35 @@ def test_errors_are_those_of_the_samples_ahead_added_up(found):
         for c in range(2):
             for h in range(len(forms.HORIZONS)):
                 rows = [(w.channel == c) & (horizon == h) for w, _, _, horizon in parts]
-                assert own.square[row, c, h] == pytest.approx(sum((left[at] ** 2).sum() for at, (_, left, _, _) in zip(rows, parts)))
-                assert own.floor[row, c, h] == pytest.approx(sum(floor[at].sum() for at, (_, _, floor, _) in zip(rows, parts)))
+                assert own.square[row, c, h] == pytest.approx(
+                    sum((left[at] ** 2).sum() for at, (_, left, _, _) in zip(rows, parts))
+                )
+                assert own.floor[row, c, h] == pytest.approx(
+                    sum(floor[at].sum() for at, (_, _, floor, _) in zip(rows, parts))
+                )
                 assert own.count[row, c, h] == sum(at.sum() for at in rows)
 
 
 def test_noise_that_lasts_leaves_more_than_white_noise_does(found):
-    """The floor of a prediction against draws of the noise, in the head that the initial state is fitted to and ahead of it."""
+    """The floor of a prediction against draws of the noise, in the head that the initial state is
+    fitted to and ahead of it.
+    """
     _, diagnosis = found
     point, draws = diagnosis.work.after, 4000
     white = replace(point.windows[0], correlated=())
     (window,) = with_correlations([white], {0: Correlation(0.05, 0.95, 2)})
-    drawn = np.random.default_rng(0).normal(size=(len(window.time), draws)) * point.noise.scale[window.channel, None]
+    drawn = (
+        np.random.default_rng(0).normal(size=(len(window.time), draws))
+        * point.noise.scale[window.channel, None]
+    )
     for rows, factor in window.correlated:
         for own in rows.T:
             drawn[own] = factor @ drawn[own]
     left, floor, horizon = forms.predicted(window, point.noise, drawn * window.sigma[:, None])
     rows = (window.channel == 0) & (horizon >= 0)
-    np.testing.assert_allclose(floor[rows], (left[rows] ** 2).mean(1), rtol=5.0 * np.sqrt(2.0 / draws))  # five deviations
+    np.testing.assert_allclose(
+        floor[rows], (left[rows] ** 2).mean(1), rtol=5.0 * np.sqrt(2.0 / draws)
+    )  # five deviations
     assert floor[rows].sum() > 1.5 * forms.predicted(white, point.noise, drawn)[1][rows].sum()
 
 
@@ -150,7 +179,10 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     point = diagnosis.work.after
     window = point.windows[0]
     late = window.time > window.time.min() + 0.7
-    plain, spoilt = (forms.predicted(window, point.noise, residual)[0] for residual in (window.residual, window.residual + late))
+    plain, spoilt = (
+        forms.predicted(window, point.noise, residual)[0]
+        for residual in (window.residual, window.residual + late)
+    )
     np.testing.assert_allclose(spoilt[~late], plain[~late])
     np.testing.assert_allclose((spoilt - plain)[late], 1.0 / window.sigma[late])
 
@@ -164,9 +196,16 @@ class Means(SyntheticModel):
 
     def _mean(self, window):
         at = np.flatnonzero(window.time == window.time[20])
-        cut = {name: getattr(window, name)[at] for name in ("time", "channel", "sigma", "effects", "latent")}
-        seen = self._answer(cut["effects"], self.truth) + cut["sigma"] * self._draw.normal(size=len(at))
-        return replace(window, **cut, residual=seen, nuisance=np.zeros((len(at), 0)), nuisance_sd=np.zeros(0))
+        cut = {
+            name: getattr(window, name)[at]
+            for name in ("time", "channel", "sigma", "effects", "latent")
+        }
+        seen = self._answer(cut["effects"], self.truth) + cut["sigma"] * self._draw.normal(
+            size=len(at)
+        )
+        return replace(
+            window, **cut, residual=seen, nuisance=np.zeros((len(at), 0)), nuisance_sd=np.zeros(0)
+        )
 
 
 def test_windows_without_states_are_predicted_whole(found):
@@ -203,7 +242,9 @@ def test_no_black_box_where_no_latent_force_acts(found):
     assert blackbox.table_of(still, np.random.default_rng(0)) is None
 
 
-@pytest.mark.parametrize(("share", "text"), [(-1e-6, "0"), (0.0, "0"), (-0.0, "0"), (0.496, "50"), (-0.02, "-2")])
+@pytest.mark.parametrize(
+    ("share", "text"), [(-1e-6, "0"), (0.0, "0"), (-0.0, "0"), (0.496, "50"), (-0.02, "-2")]
+)
 def test_nothing_has_no_sign(share, text):
     assert report.percent(share) == text
 
@@ -219,7 +260,9 @@ def test_two_flights_are_halved_instead():
 
 @pytest.mark.parametrize("flights", [3, 10])
 def test_intervals_of_the_gain_hold_what_they_promise_and_stay_finite(flights):
-    """Ratios of sums over flights with lognormal sizes, as flights have; 95 % intervals cover 90 to 99 %."""
+    """Ratios of sums over flights with lognormal sizes, as flights have; 95 % intervals cover 90 to
+    99 %.
+    """
     rng = np.random.default_rng(0)
     inside, widest = 0, 0.0
     for _ in range(200):
@@ -248,10 +291,14 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
 
 @pytest.mark.slow
 def test_limits_hold_for_effects_hidden_in_the_measurements(hidden):
-    """Twice the limit is found by the whole search, half of it is not: the statistics' promise, kept by the simulation."""
+    """Twice the limit is found by the whole search, half of it is not: the statistics' promise,
+    kept by the simulation.
+    """
     model = SyntheticModel(effects=EFFECTS, seed=7)
     limit = blind.hide(search.explain(model, laws=False), draws=60)["effect_09"].limit
-    assert search.explain(blind.Hidden(model, {"effect_09": 2.0 * limit}), laws=False).named == ("effect_09",)
+    assert search.explain(blind.Hidden(model, {"effect_09": 2.0 * limit}), laws=False).named == (
+        "effect_09",
+    )
     assert not search.explain(blind.Hidden(model, {"effect_09": 0.4 * limit}), laws=False).theta
 
 
@@ -272,10 +319,14 @@ def degenerate():
 
 def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     apart = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
-    alike = SyntheticModel(effects=EFFECTS, same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9)
+    alike = SyntheticModel(
+        effects=EFFECTS, same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9
+    )
     aim = plan.Aim(degenerate)
     models = {"hover": alike, "circle": apart}
-    told = [(m, aim.information(models[m.name])) for m in manoeuvres.catalogue() if m.name in models]
+    told = [
+        (m, aim.information(models[m.name])) for m in manoeuvres.catalogue() if m.name in models
+    ]
     ranked = plan.propose(aim, told)
     assert [p.name for p in ranked] == ["circle", "hover"]
     assert ranked[0].nats > plan.DECISIVE > ranked[1].nats
@@ -286,7 +337,9 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
 
 def test_the_promise_of_the_plan_is_kept(degenerate):
     """Flown together with the manoeuvre that separates, the class becomes a name."""
-    first = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    first = SyntheticModel(
+        effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
+    )
     more = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
     from dataclasses import replace
 
@@ -304,9 +357,13 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     monkeypatch.setattr(plan, "MEASUREMENTS", (scale,))
     (proposal,) = plan.propose(plan.Aim(degenerate, ("effect_03",)), [])
     assert proposal.name == "weigh"
-    assert {frozenset(pair) for pair in proposal.separates} == {frozenset(("effect_03", "effect_07"))}
+    assert {frozenset(pair) for pair in proposal.separates} == {
+        frozenset(("effect_03", "effect_07"))
+    }
     assert not plan.propose(plan.Aim(degenerate, ("effect_00",)), [])
-    model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    model = SyntheticModel(
+        effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
+    )
     model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
     assert search.explain(model, laws=False)["effect_03"].verdict == result.FOUND
 
@@ -330,10 +387,11 @@ def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
 
 
 def swung(reference: manoeuvres.Reference, rope: float) -> tuple[float, float]:
-    """Largest angle [deg] of a point pendulum from the axis of a vehicle that follows exactly, and the least tension in weights.
+    """Largest angle [deg] of a point pendulum from the axis of a vehicle that follows exactly, and
+    the least tension in weights.
 
-    In the vehicle's frame gravity is g - a, along which the rotors' axis lies: n' = w x n, w' = n x (g - a) / rope.
-    """
+    In the vehicle's frame gravity is g - a, along which the rotors' axis lies: n' = w x n, w' = n x
+    (g - a) / rope."""
     gravity, parts = np.array([0.0, 0.0, -9.81]), 6
     rows = int(np.argmax(reference.release)) if reference.release.any() else len(reference.time)
     felt = gravity - reference.acc_w[:rows]
@@ -348,22 +406,32 @@ def swung(reference: manoeuvres.Reference, rope: float) -> tuple[float, float]:
     return angle, tension
 
 
-@pytest.mark.parametrize("manoeuvre", [m for m in manoeuvres.catalogue() if m.payload], ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    "manoeuvre", [m for m in manoeuvres.catalogue() if m.payload], ids=lambda m: m.name
+)
 def test_no_manoeuvre_swings_the_payload_near_the_rotors_or_slackens_its_rope(manoeuvre):
-    angle, tension = swung(manoeuvre.reference(), rope=0.38)  # the paper's, with the payload's radius
+    angle, tension = swung(
+        manoeuvre.reference(), rope=0.38
+    )  # the paper's, with the payload's radius
     assert angle < 60.0  # a controller that lags adds some
     assert tension > 0.2
 
 
 def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
-    """With the rope level, and the vehicle tilted by a tenth of a turn towards it, the swing is 54 degrees; upright it is 90."""
+    """With the rope level, and the vehicle tilted by a tenth of a turn towards it, the swing is 54
+    degrees; upright it is 90.
+    """
 
     def level(turn: float) -> fly_manoeuvres.Flight:
         chosen = next(m for m in manoeuvres.catalogue() if m.name == "throw at 2 m/s")
         reference = chosen.reference()
         rows = 4 * len(reference.time)
         place = np.repeat(reference.pos_w, 4, axis=0)
-        hangs = np.where(np.arange(rows)[:, None] < 4 * np.argmax(reference.release), [-0.38, 0.0, 0.0], [0.0, 0.0, 5.0])  # then let go
+        hangs = np.where(
+            np.arange(rows)[:, None] < 4 * np.argmax(reference.release),
+            [-0.38, 0.0, 0.0],
+            [0.0, 0.0, 5.0],
+        )  # then let go
         quat = np.tile([0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)], (rows, 1))
         truth = {"pos_w": place, "payload_pos_w": place + hangs, "quat_wb": quat}
         return fly_manoeuvres.Flight(chosen, reference, None, truth, None, None)
@@ -373,12 +441,24 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
     assert [flight.simulated(lambda _: "a model").model for flight in flights] == [None, "a model"]
 
 
-def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measured, hidden, degenerate):
+def test_the_report_holds_sentences_pictures_and_numbers(
+    tmp_path, found, measured, hidden, degenerate
+):
     _, diagnosis = found
-    made = report.sections(diagnosis, measured, hidden, step_check={"pos_w": 0.03}, about={"logs": 7})
+    made = report.sections(
+        diagnosis, measured, hidden, step_check={"pos_w": 0.03}, about={"logs": 7}
+    )
     paths = page.write(tmp_path, "A report", report.sentence_of(diagnosis), made)
     written = paths[0].read_text(encoding="utf-8")
-    for text in ("KNOWN", "effect_03", "cause 4", "Held-out prediction error", "noise alone", "circle", "finer steps"):
+    for text in (
+        "KNOWN",
+        "effect_03",
+        "cause 4",
+        "Held-out prediction error",
+        "noise alone",
+        "circle",
+        "finer steps",
+    ):
         assert text in written
     assert written.count("data:image/png;base64") >= 6
     assert "http" not in written.replace("http-equiv", "")  # self-contained
@@ -395,16 +475,25 @@ def test_the_report_holds_sentences_pictures_and_numbers(tmp_path, found, measur
 def test_a_candidate_is_on_the_page_too(found, measured):
     _, diagnosis = found
     line = "the flights ask for it"
-    findings = tuple(replace(f, verdict=result.CANDIDATE, sentence=line) if f.name == "effect_03" else f for f in diagnosis.findings)
+    findings = tuple(
+        replace(f, verdict=result.CANDIDATE, sentence=line) if f.name == "effect_03" else f
+        for f in diagnosis.findings
+    )
     shaky = replace(diagnosis, findings=findings)
     verdict = report.sections(shaky, measured)[0]
-    assert any(part.text.startswith(f"**CANDIDATE.** {line}") for part in verdict.parts if hasattr(part, "text"))
+    assert any(
+        part.text.startswith(f"**CANDIDATE.** {line}")
+        for part in verdict.parts
+        if hasattr(part, "text")
+    )
     assert f"CANDIDATE {line}" in report.summary(shaky, measured)
     assert "CANDIDATE" not in report.summary(diagnosis, measured)
 
 
 def test_an_event_is_left_out_or_weighs_little(found):
-    """A flight that was left out has no windows any more; one whose window is far rougher than others has."""
+    """A flight that was left out has no windows any more; one whose window is far rougher than
+    others has.
+    """
     _, diagnosis = found
     flights = {w.flight for w in diagnosis.work.after.windows}
     told = replace(diagnosis, events=(min(flights), max(flights) + 1))
@@ -422,18 +511,26 @@ def test_errors_are_told_in_millimetres(found, measured):
     channel = measured["pos_w"]
     line = f"held-out error of pos_w: {1e3 * channel.before:.3g} -> {1e3 * channel.after:.3g} mm,"
     assert line in report.summary(found[1], measured)
-    (grid, _) = next(s for s in report.sections(found[1], measured) if s.name == "gain").parts
+    grid, _ = next(s for s in report.sections(found[1], measured) if s.name == "gain").parts
     assert grid.rows[0][1:3] == ("mm", f"{1e3 * channel.before:.3g}")
-    odd = replace(measured, channels=(replace(channel, channel="current", unit="A", blackbox=float("nan")),))
+    odd = replace(
+        measured, channels=(replace(channel, channel="current", unit="A", blackbox=float("nan")),)
+    )
     text = report.summary(found[1], odd)
     assert f"held-out error of current: {channel.before:.3g} -> {channel.after:.3g} A," in text
     assert "nan" not in text
 
 
-@pytest.mark.parametrize(("low", "high", "most", "ticks"), [
-    (0.9, 60.0, 9, [1, 2, 5, 10, 20, 50]), (0.9, 6e3, 9, [1, 3, 10, 30, 100, 300, 1000, 3000]), (0.0, 140.0, 9, None),
-    (-11.0, 12.0, 16, [-10, -5, -2, -1, 0, 1, 2, 5, 10]), (2.1, 4.9, 9, []),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("low", "high", "most", "ticks"),
+    [
+        (0.9, 60.0, 9, [1, 2, 5, 10, 20, 50]),
+        (0.9, 6e3, 9, [1, 3, 10, 30, 100, 300, 1000, 3000]),
+        (0.0, 140.0, 9, None),
+        (-11.0, 12.0, 16, [-10, -5, -2, -1, 0, 1, 2, 5, 10]),
+        (2.1, 4.9, 9, []),
+    ],
+)
 def test_ticks_are_plain_numbers_that_fit(low, high, most, ticks):
     found = pictures.plain_ticks(low, high, most)
     assert found == ([0, 1, 2, 5, 10, 20, 50, 100] if ticks is None else ticks)
@@ -442,23 +539,34 @@ def test_ticks_are_plain_numbers_that_fit(low, high, most, ticks):
 def test_many_steps_stand_in_rows_that_can_be_read(found):
     def size(count: int) -> tuple[int, int]:
         picture = pictures.ladder(replace(found[1], steps=found[1].steps[:1] * count))
-        return int.from_bytes(picture[16:20], "big"), int.from_bytes(picture[20:24], "big")  # of a PNG's head
+        return int.from_bytes(picture[16:20], "big"), int.from_bytes(
+            picture[20:24], "big"
+        )  # of a PNG's head
 
     assert size(6)[0] == size(1)[0]
     assert size(3)[1] == size(1)[1]
     assert size(6)[1] > 1.9 * size(3)[1]
 
 
-@pytest.mark.parametrize(("channel", "unit"), [
-    ("pos_w", "m"), ("quat_wb", "rad"), ("marker_pos_c", "m"), ("current", "A"), ("motor_wanted", ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("channel", "unit"),
+    [
+        ("pos_w", "m"),
+        ("quat_wb", "rad"),
+        ("marker_pos_c", "m"),
+        ("current", "A"),
+        ("motor_wanted", ""),
+    ],
+)
 def test_residuals_have_units(channel, unit):
     assert forms.unit_of(channel) == unit
 
 
 def test_the_report_of_nothing_is_whole_too(tmp_path):
     diagnosis = search.explain(SyntheticModel(effects=EFFECTS, throws=3))
-    paths = page.write(tmp_path, "Nothing", report.sentence_of(diagnosis), report.sections(diagnosis))
+    paths = page.write(
+        tmp_path, "Nothing", report.sentence_of(diagnosis), report.sections(diagnosis)
+    )
     assert "NO EFFECT" in paths[0].read_text(encoding="utf-8")
 
 
@@ -469,20 +577,36 @@ def test_the_recording_is_written(tmp_path, found):
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    (["explain", "nothing.npz"], "nothing.npz"), (["blind", "nothing.npz"], "nothing.npz"),
-    (["plan", "nothing.npz"], "nothing.npz"),
-    (["explain", "nothing.npz", "--config", "nobody"], "nobody"), (["map", "."], "a folder, expected a file"),
-    (["plan", "nothing.npz", "--hall", "nan,5,3"], "--hall nan,5,3: expected lengths above 0"),
-    (["plan", "nothing.npz", "--hall", "5,5,0.5"], "a height above 0.8 m"),
-    (["plan", "nothing.npz", "--manoeuvres", "hoover"], "did you mean 'hover'"),
-    (["explain", SWING, "--config", "pendulum_encoder", "--only", ""], "no effect ''"),
-    (["explain", SWING, "--config", "pendulum_encoder", "--test", "other.csv", "--no-report"], "other.csv: no such file"),
-    (["explain", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
-    (["blind", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
-    (["plan", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
-    (["check", "nothing.npz", "--json", "."], "it is a folder; expected a file"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["explain", "nothing.npz"], "nothing.npz"),
+        (["blind", "nothing.npz"], "nothing.npz"),
+        (["plan", "nothing.npz"], "nothing.npz"),
+        (["explain", "nothing.npz", "--config", "nobody"], "nobody"),
+        (["map", "."], "a folder, expected a file"),
+        (["plan", "nothing.npz", "--hall", "nan,5,3"], "--hall nan,5,3: expected lengths above 0"),
+        (["plan", "nothing.npz", "--hall", "5,5,0.5"], "a height above 0.8 m"),
+        (["plan", "nothing.npz", "--manoeuvres", "hoover"], "did you mean 'hover'"),
+        (["explain", SWING, "--config", "pendulum_encoder", "--only", ""], "no effect ''"),
+        (
+            [
+                "explain",
+                SWING,
+                "--config",
+                "pendulum_encoder",
+                "--test",
+                "other.csv",
+                "--no-report",
+            ],
+            "other.csv: no such file",
+        ),
+        (["explain", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
+        (["blind", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
+        (["plan", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
+        (["check", "nothing.npz", "--json", "."], "it is a folder; expected a file"),
+    ],
+)
 def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):
     from visthrow.cli import main
 

@@ -1,4 +1,6 @@
-"""What varies from flight to flight: found where it does, silent where it does not, and handed on to training."""
+"""What varies from flight to flight: found where it does, silent where it does not, and handed on
+to training.
+"""
 
 from dataclasses import replace
 
@@ -17,7 +19,9 @@ LEAST = 4.0
 
 
 def flights(rng, count=10, **deviation):
-    """Statistics of flights in which effects are drawn anew with these deviations, in their units; common sizes below floors."""
+    """Statistics of flights in which effects are drawn anew with these deviations, in their units;
+    common sizes below floors.
+    """
     K, F = len(NAMES), np.arange(count)
     mix = rng.normal(size=(count, K, K)) * 0.3 + np.eye(K)
     information = 4.0 * np.einsum("fij,fkj->fik", mix, mix)
@@ -29,15 +33,24 @@ def flights(rng, count=10, **deviation):
 
 
 def campaign(rng, days, by_day, by_flight):
-    """Flights of some days, three a day, whose release lag is drawn anew each day and each flight with these deviations."""
+    """Flights of some days, three a day, whose release lag is drawn anew each day and each flight
+    with these deviations.
+    """
     found, floor = flights(rng, 3 * days, release_lag=by_flight), PRIORS.floor[0]
     own = np.repeat(rng.normal(size=days) * by_day / floor, 3)
-    return replace(found, score=found.score + found.information[:, :, 0] * own[:, None]), np.repeat(np.arange(days), 3).tolist()
+    return (
+        replace(found, score=found.score + found.information[:, :, 0] * own[:, None]),
+        np.repeat(np.arange(days), 3).tolist(),
+    )
 
 
 def on_days(rng, *deviations):
     statistics, days = campaign(rng, 5, *deviations)
-    return next(s for s in varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST, days=days) if s.name == "lag_jitter")
+    return next(
+        s
+        for s in varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST, days=days)
+        if s.name == "lag_jitter"
+    )
 
 
 def test_what_is_drawn_anew_each_day_drifts():
@@ -61,7 +74,10 @@ def test_a_mean_is_as_sure_as_there_are_days():
     """Three flights of a day tell no more of what all days share than one does."""
     statistics, days = campaign(np.random.default_rng(10), 5, 0.012, 0.0)
     size = {0: 6.0}  # floors
-    by_flight, by_day = freed(statistics, Varies(days, flights=size)), freed(statistics, Varies(days, drifts=size))
+    by_flight, by_day = (
+        freed(statistics, Varies(days, flights=size)),
+        freed(statistics, Varies(days, drifts=size)),
+    )
     assert len(by_day.flights) == 5
     sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
     np.testing.assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
@@ -77,7 +93,10 @@ def test_shares_of_days_come_before_those_of_flights():
 
 
 def told(rng, **deviation):
-    return {s.name: s for s in varying(flights(rng, **deviation), np.zeros(len(NAMES)), PRIORS, NAMES, LEAST)}
+    return {
+        s.name: s
+        for s in varying(flights(rng, **deviation), np.zeros(len(NAMES)), PRIORS, NAMES, LEAST)
+    }
 
 
 def test_deviations_are_found_with_their_size():
@@ -105,9 +124,15 @@ def test_three_flights_say_nothing():
 
 def test_training_draws_what_varies():
     for v in random_effects():
-        assert all(catalogue()[name].unit == v.unit and catalogue()[name].block == v.block for name in v.of)
-    report = {"scatter": [{"name": "lag_jitter", "found": True, "size": 0.01, "of": ["release_lag"]},
-                          {"name": "gust", "found": False, "size": 0.2, "of": ["wind_x"]}]}  # fmt: skip
+        assert all(
+            catalogue()[name].unit == v.unit and catalogue()[name].block == v.block for name in v.of
+        )
+    report = {
+        "scatter": [
+            {"name": "lag_jitter", "found": True, "size": 0.01, "of": ["release_lag"]},
+            {"name": "gust", "found": False, "size": 0.2, "of": ["wind_x"]},
+        ]
+    }
     theta, covariance = patch.with_scatter({"rope_length": 0.01}, [[1e-8]], report)
     assert theta == {"rope_length": 0.01, "release_lag": 0.0}
     np.testing.assert_allclose(covariance, np.diag([1e-8, 1e-4]))

@@ -9,7 +9,9 @@ from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.scatter import varying
 
 BENT = 0.1
-"""A release early by a floor tells so much more of itself than its derivative says, and twice as much by two."""
+"""A release early by a floor tells so much more of itself than its derivative says, and twice as
+much by two.
+"""
 TRUTH = 0.012
 """Deviation of the release's lag [s]: 6 floors."""
 INFORMATION = 30.0
@@ -29,11 +31,23 @@ def world(seed: int, count: int = 12):
     information[:, 0, 0] = INFORMATION
     score = np.zeros((count, K))
     score[:, 0] = INFORMATION * seen
-    found = Statistics(np.arange(count), information, score, INFORMATION * seen**2, np.full(count, 500), np.zeros(K))
+    found = Statistics(
+        np.arange(count),
+        information,
+        score,
+        INFORMATION * seen**2,
+        np.full(count, 500),
+        np.zeros(K),
+    )
 
     def again(theta):
         left = seen - answer(theta[0])
-        there = replace(found, square=INFORMATION * left**2, score=INFORMATION * left[:, None] * np.eye(1, K), theta=theta)
+        there = replace(
+            found,
+            square=INFORMATION * left**2,
+            score=INFORMATION * left[:, None] * np.eye(1, K),
+            theta=theta,
+        )
         return there if abs(theta[0]) < 40.0 else None
 
     return found, again
@@ -48,9 +62,13 @@ def test_flights_far_apart_are_told_by_simulations_where_they_lie():
     with_it = [jitter(*world(seed)) for seed in range(40)]
     without = [jitter(world(seed)[0], None) for seed in range(40)]
     assert all(s.found for s in with_it)
-    inside, outside = (np.mean([s.low <= TRUTH <= s.high for s in told]) for told in (with_it, without))
+    inside, outside = (
+        np.mean([s.low <= TRUTH <= s.high for s in told]) for told in (with_it, without)
+    )
     assert inside > 0.85, inside  # 95 %, less three deviations of 40 draws
-    assert outside < 0.7, outside  # the derivatives alone take early releases for still earlier ones
+    assert outside < 0.7, (
+        outside
+    )  # the derivatives alone take early releases for still earlier ones
     assert abs(np.median([s.size for s in with_it]) / TRUTH - 1.0) < 0.15
     assert np.median([s.size for s in without]) > 1.15 * TRUTH
 

@@ -1,4 +1,6 @@
-"""What all flights share of an effect is no scatter: it is named, with its size, whether the effect varies beside it or not."""
+"""What all flights share of an effect is no scatter: it is named, with its size, whether the effect
+varies beside it or not.
+"""
 
 from dataclasses import replace
 
@@ -21,21 +23,34 @@ class Drawn(SyntheticModel):
 
     def __post_init__(self):
         super().__post_init__()
-        self._windows = [replace(w, residual=w.residual + self._answer(w.effects, {"cmd_delay": self.sizes[w.flight]}))
-                         for w in self._windows]  # fmt: skip
+        self._windows = [
+            replace(
+                w,
+                residual=w.residual + self._answer(w.effects, {"cmd_delay": self.sizes[w.flight]}),
+            )
+            for w in self._windows
+        ]
 
 
 def drawn(sizes, **options) -> SyntheticModel:
-    return type("Own", (Drawn,), {"sizes": tuple(sizes)})(effects=EFFECTS, throws=len(sizes) - 1, free=1, **options)
+    return type("Own", (Drawn,), {"sizes": tuple(sizes)})(
+        effects=EFFECTS, throws=len(sizes) - 1, free=1, **options
+    )
 
 
 def told(mean: float, deviation: float, seed: int):
-    """Verdict on a release that is late by so much in all flights and by so much more or less in each [s]."""
+    """Verdict on a release that is late by so much in all flights and by so much more or less in
+    each [s].
+    """
     found = flights(np.random.default_rng(seed), release_lag=deviation)
     common = np.zeros(len(NAMES))
     common[0] = mean / PRIORS.floor[0]
     found = replace(found, score=found.score + found.information @ common)
-    return next(s for s in varying(found, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST) if s.name == "lag_jitter")
+    return next(
+        s
+        for s in varying(found, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST)
+        if s.name == "lag_jitter"
+    )
 
 
 def jitter(diagnosis):
@@ -64,7 +79,11 @@ def test_what_flights_have_of_their_own_is_integrated_out():
         return -2.0 * there @ score + np.einsum("xi,ij,xj->x", there, own, there)
 
     x = np.linspace(-12.0 * size, 12.0 * size, 20001)
-    density = np.exp(-0.5 * (misfit(x) - misfit(np.zeros(1))) - 0.5 * (x / size) ** 2) / np.sqrt(2.0 * np.pi) / size
+    density = (
+        np.exp(-0.5 * (misfit(x) - misfit(np.zeros(1))) - 0.5 * (x / size) ** 2)
+        / np.sqrt(2.0 * np.pi)
+        / size
+    )
     whole = found.square[0] + misfit(np.zeros(1))[0] - 2.0 * np.log(density.sum() * (x[1] - x[0]))
     told = left.square[0] - 2.0 * theta @ left.score[0] + theta @ left.information[0] @ theta
     np.testing.assert_allclose(told, whole, rtol=1e-9)
@@ -88,7 +107,9 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
     assert diagnosis.named == ("cmd_delay",)
     found, varies = diagnosis["cmd_delay"], jitter(diagnosis)
     assert found.low < 14.0 * FLOOR < found.high
-    assert found.sd > deviation * FLOOR / np.sqrt(16) * 0.8  # no mean is known better than its flights scatter
+    assert (
+        found.sd > deviation * FLOOR / np.sqrt(16) * 0.8
+    )  # no mean is known better than its flights scatter
     assert varies.found
     assert varies.low < deviation * FLOOR < varies.high
 

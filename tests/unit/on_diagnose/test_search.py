@@ -1,4 +1,6 @@
-"""The search on flights whose truth is known: names, sizes, classes, events, copies; and that each guard is needed."""
+"""The search on flights whose truth is known: names, sizes, classes, events, copies; and that each
+guard is needed.
+"""
 
 from dataclasses import replace
 
@@ -41,7 +43,9 @@ def altered(change, **options) -> SyntheticModel:
 
 
 def pushed(model, window, size: float):
-    return replace(window, residual=window.residual + model._answer(window.effects, {"effect_03": size}))
+    return replace(
+        window, residual=window.residual + model._answer(window.effects, {"effect_03": size})
+    )
 
 
 def test_nothing_is_found_where_nothing_is():
@@ -91,7 +95,9 @@ def test_names_come_one_by_one_where_a_law_is_a_candidate(law):
         problem, (nominal,) = terms.extended(problem, [nominal], [term])
     own = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
     several = own._several(with_all_effects_noise(problem, nominal), own._usable())
-    assert [{own.name(j) for j in move.active} for move in several] == ([] if law else [set(TRIPLE)])
+    assert [{own.name(j) for j in move.active} for move in several] == (
+        [] if law else [set(TRIPLE)]
+    )
 
 
 def hiding(own: float, **options) -> SyntheticModel:
@@ -101,7 +107,11 @@ def hiding(own: float, **options) -> SyntheticModel:
         columns = window.effects.copy()
         columns[:, 7] = own * columns[:, 7] - columns[:, 3]
         window = replace(window, effects=columns)
-        return replace(window, residual=window.residual + model._answer(columns, {"effect_03": 14.0, "effect_07": 14.0}))
+        return replace(
+            window,
+            residual=window.residual
+            + model._answer(columns, {"effect_03": 14.0, "effect_07": 14.0}),
+        )
 
     return altered(change, seed=3, **options)
 
@@ -124,8 +134,13 @@ def test_a_law_is_not_shared_out_among_two_effects_that_hide_each_other():
     """They would take what it does in one phase, and leave the rest unexplained."""
 
     def change(model, window):
-        columns, by_law = window.effects.copy(), model.by_law[[w is window for w in model._windows].index(True)]
-        columns[:, 7] = (by_law / (14.0 * EFFECTS[7].floor) if window.phase == "flight" else 0.0) - columns[:, 3]
+        columns, by_law = (
+            window.effects.copy(),
+            model.by_law[[w is window for w in model._windows].index(True)],
+        )
+        columns[:, 7] = (
+            by_law / (14.0 * EFFECTS[7].floor) if window.phase == "flight" else 0.0
+        ) - columns[:, 3]
         return replace(window, effects=columns)
 
     model = altered(change, seed=3, law="swirl", law_size=0.1)
@@ -140,7 +155,9 @@ def test_mirror_config_is_wrong_instead_of_the_world():
     right = search.explain(world(truth={"effect_04": 10.0}, seed=6), laws=False)
     mirrored = search.explain(world(truth={"effect_04": -10.0}, seed=6), laws=False)
     assert right.named == mirrored.named == ("effect_04",)
-    assert right.theta["effect_04"] == pytest.approx(-mirrored.theta["effect_04"], abs=2 * EFFECTS[4].floor)
+    assert right.theta["effect_04"] == pytest.approx(
+        -mirrored.theta["effect_04"], abs=2 * EFFECTS[4].floor
+    )
 
 
 def test_idempotence_what_was_found_is_not_found_again():
@@ -157,7 +174,10 @@ def test_idempotence_what_was_found_is_not_found_again():
             return model.residuals(self._sum(theta))
 
         def _sum(self, theta):
-            return {name: first.theta.get(name, 0.0) + theta.get(name, 0.0) for name in {*first.theta, *theta}}
+            return {
+                name: first.theta.get(name, 0.0) + theta.get(name, 0.0)
+                for name in {*first.theta, *theta}
+            }
 
     assert search.explain(Applied(), laws=False).overall == result.NO_EFFECT
 
@@ -176,17 +196,24 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
 
 
 def test_two_effects_that_do_as_two_others_are_classes_with_both():
-    """Two motors across, as weak as each other, do as less thrust and a trim of the yaw; no one of these does as one of those."""
+    """Two motors across, as weak as each other, do as less thrust and a trim of the yaw; no one of
+    these does as one of those.
+    """
     truth, others = {"effect_03": 14.0, "effect_09": 14.0}, {"effect_01", "effect_07"}
 
     def change(model, window):
         columns = window.effects.copy()
         columns[:, 7] = columns[:, 9] - columns[:, 1]
         columns[:, 1] += columns[:, 3]
-        return replace(window, effects=columns, residual=window.residual + model._answer(columns, truth))
+        return replace(
+            window, effects=columns, residual=window.residual + model._answer(columns, truth)
+        )
 
     diagnosis = search.explain(altered(change, seed=3), laws=False)
-    assert {frozenset(names) for names, _ in diagnosis.sets} == {frozenset(truth), frozenset(others)}
+    assert {frozenset(names) for names, _ in diagnosis.sets} == {
+        frozenset(truth),
+        frozenset(others),
+    }
     for name in (*truth, *others):
         beside = set(truth) if name in truth else others
         assert diagnosis[name].verdict == result.CLASS
@@ -204,7 +231,9 @@ def test_a_class_may_have_a_dozen_members():
 
 def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     model = world(truth={"effect_03": 12.0}, seed=2)
-    model.effects = tuple(replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS)
+    model.effects = tuple(
+        replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS
+    )
     diagnosis = search.explain(model, laws=False)
     assert diagnosis["effect_05"].verdict == result.UNOBSERVABLE
     assert diagnosis["effect_05"].missing == ("battery_voltage",)
@@ -213,7 +242,9 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
 
 @pytest.mark.slow
 def test_an_effect_that_was_not_excited_is_not_identifiable():
-    quiet = altered(lambda m, w: replace(w, effects=w.effects * np.where(np.arange(12) == 6, 1e-5, 1.0)))
+    quiet = altered(
+        lambda m, w: replace(w, effects=w.effects * np.where(np.arange(12) == 6, 1e-5, 1.0))
+    )
     diagnosis = search.explain(quiet, laws=False)
     assert diagnosis["effect_06"].verdict == result.NOT_IDENTIFIABLE
     assert diagnosis["effect_06"].manoeuvres == ("swing",)
@@ -231,7 +262,9 @@ def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
     diagnosis = search.explain(model, laws=False)
     assert not diagnosis.theta
-    assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [("effect_03_by_flight", ("effect_03",))]
+    assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [
+        ("effect_03_by_flight", ("effect_03",))
+    ]
     assert diagnosis.overall == result.KNOWN
 
 
@@ -241,7 +274,9 @@ def test_flights_disagree_by_more_than_form_and_noise():
     def verdict(sizes, share=INEXACT):
         own = np.full((8, 1, 1), 4.0)  # information: half a floor's deviation each
         none = np.zeros(8)
-        statistics = Statistics(np.arange(8), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1))
+        statistics = Statistics(
+            np.arange(8), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
+        )
         return disagreement(statistics, priors, Varies(), [0], 0, 5.0, share)
 
     sizes = np.array([9.0, 11.0, 8.0, 12.0, 10.0, 9.5, 10.5, 10.0])
@@ -270,32 +305,50 @@ def test_a_simulation_that_fails_is_out_of_domain():
 
 @pytest.mark.slow
 def test_a_few_windows_that_fail_are_left_out():
-    some = altered(lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w, truth={"effect_03": 10.0})
+    some = altered(
+        lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w,
+        truth={"effect_03": 10.0},
+    )
     assert search.explain(some, laws=False).named == ("effect_03",)
 
 
 def test_an_estimate_stays_within_its_physical_bounds():
     model = world(truth={"effect_03": 12.0}, seed=2)
     floor = EFFECTS[3].floor
-    model.effects = tuple(replace(e, bounds=(-5 * floor, 8 * floor)) if e.name == "effect_03" else e for e in EFFECTS)
+    model.effects = tuple(
+        replace(e, bounds=(-5 * floor, 8 * floor)) if e.name == "effect_03" else e for e in EFFECTS
+    )
     diagnosis = search.explain(model, laws=False)
-    assert all(f.low >= -5 * floor - 1e-12 and f.high <= 8 * floor + 1e-12 for f in diagnosis.findings if f.name == "effect_03")
+    assert all(
+        f.low >= -5 * floor - 1e-12 and f.high <= 8 * floor + 1e-12
+        for f in diagnosis.findings
+        if f.name == "effect_03"
+    )
     assert abs(diagnosis.theta.get("effect_03", 0.0)) <= 8 * floor + 1e-12
-    assert diagnosis.overall == result.UNKNOWN  # it pushes on against its bound: the form is another
+    assert (
+        diagnosis.overall == result.UNKNOWN
+    )  # it pushes on against its bound: the form is another
 
 
 def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
     model = world(truth={"effect_03": -5.0}, seed=2)
-    model.effects = tuple(replace(e, bounds=(-0.0, 1.0)) if e.name == "effect_03" else e for e in EFFECTS)
+    model.effects = tuple(
+        replace(e, bounds=(-0.0, 1.0)) if e.name == "effect_03" else e for e in EFFECTS
+    )
     found = search.explain(model, laws=False)["effect_03"]
     assert found.verdict == result.BOUNDED
     assert (found.low, found.high) == (0.0, 0.0)
-    assert found.sentence == "effect_03: on its bound of 0 N; these flights ask for less than is possible."
+    assert (
+        found.sentence
+        == "effect_03: on its bound of 0 N; these flights ask for less than is possible."
+    )
 
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_answer():
-    one, two = (search.explain(world(truth={"effect_03": 8.0}), seed=5, laws=False) for _ in range(2))
+    one, two = (
+        search.explain(world(truth={"effect_03": 8.0}), seed=5, laws=False) for _ in range(2)
+    )
     assert one.theta == two.theta
     assert one.threshold == two.threshold
 
@@ -334,7 +387,9 @@ def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds(
     few, many = (_threshold(count) for count in (4, 400))
     assert few < many
     information, priors, least = _information(40), _priors(40), _threshold(40)
-    best = evidence.additions(information, evidence.null_draws(information, 2000, rng), priors, ()).max(axis=1)
+    best = evidence.additions(
+        information, evidence.null_draws(information, 2000, rng), priors, ()
+    ).max(axis=1)
     assert np.mean(best > least) < 0.012  # half a per cent, with the scatter of two finite samples
 
 
@@ -344,32 +399,56 @@ def _information(count: int) -> np.ndarray:
 
 
 def _priors(count: int) -> Priors:
-    return Priors(np.ones(count), np.full(count, 10.0), np.full(count, -np.inf), np.full(count, np.inf), np.ones(count, bool))
+    return Priors(
+        np.ones(count),
+        np.full(count, 10.0),
+        np.full(count, -np.inf),
+        np.full(count, np.inf),
+        np.ones(count, bool),
+    )
 
 
 def _threshold(count: int) -> float:
     information = _information(count)[None]
     one = np.zeros((1, count))
-    return evidence.threshold(Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]), _priors(count),
-                              np.random.default_rng(1))  # fmt: skip
+    return evidence.threshold(
+        Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]),
+        _priors(count),
+        np.random.default_rng(1),
+    )
 
 
 def test_additions_are_differences_of_the_evidence():
     rng = np.random.default_rng(2)
-    information, priors = _information(8), replace(_priors(8), low=np.full(8, -4.0), high=np.full(8, 30.0))
+    information, priors = (
+        _information(8),
+        replace(_priors(8), low=np.full(8, -4.0), high=np.full(8, 30.0)),
+    )
     score = rng.normal(size=8) * 20.0
     gain = evidence.additions(information, score, priors, [2])
     assert gain[2] == -np.inf
-    own = np.arange(8) == 2  # the named one's bounds stay out of it: its marginal mass changes with every addition
-    free = replace(priors, low=np.where(own, -np.inf, priors.low), high=np.where(own, np.inf, priors.high))
+    own = (
+        np.arange(8) == 2
+    )  # the named one's bounds stay out of it: its marginal mass changes with every addition
+    free = replace(
+        priors, low=np.where(own, -np.inf, priors.low), high=np.where(own, np.inf, priors.high)
+    )
     base = evidence.log_evidence(information, score, free, [2])
     for j in (0, 5):
-        assert gain[j] == pytest.approx(evidence.log_evidence(information, score, free, [2, j]) - base, abs=1e-8)
-    pairs = evidence.pair_additions(information, score, replace(priors, visible=np.arange(8) != 6), [2])
+        assert gain[j] == pytest.approx(
+            evidence.log_evidence(information, score, free, [2, j]) - base, abs=1e-8
+        )
+    pairs = evidence.pair_additions(
+        information, score, replace(priors, visible=np.arange(8) != 6), [2]
+    )
     np.testing.assert_allclose(pairs, pairs.T)
-    np.testing.assert_array_equal(np.isinf(pairs).sum(1), [3, 3, 8, 3, 3, 3, 8, 3])  # itself, the one named, the one not visible
+    np.testing.assert_array_equal(
+        np.isinf(pairs).sum(1), [3, 3, 8, 3, 3, 3, 8, 3]
+    )  # itself, the one named, the one not visible
     for i, j in ((0, 5), (7, 1)):
-        assert pairs[i, j] == pytest.approx(evidence.log_evidence(information, score, free, [2, i, j]) - base, abs=1e-8)
+        assert pairs[i, j] == pytest.approx(
+            evidence.log_evidence(information, score, free, [2, i, j]) - base, abs=1e-8
+        )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -3.0])
@@ -377,8 +456,12 @@ def test_additions_are_differences_of_the_evidence():
 def test_information_that_no_flights_can_give_is_refused(bad, where):
     information = np.eye(3) * 4.0
     information[where] = information[where[::-1]] = 9.0 * bad
-    priors = evidence.Priors(np.ones(3), np.full(3, 6.0), np.full(3, -9.0), np.full(3, 9.0), np.ones(3, dtype=bool))
-    with pytest.raises(DiagnoseError, match="information on the effects is not finite or not positive"):
+    priors = evidence.Priors(
+        np.ones(3), np.full(3, 6.0), np.full(3, -9.0), np.full(3, 9.0), np.ones(3, dtype=bool)
+    )
+    with pytest.raises(
+        DiagnoseError, match="information on the effects is not finite or not positive"
+    ):
         evidence.log_evidence(information, np.ones(3), priors, [0, 1])
 
 
@@ -387,15 +470,25 @@ def test_evidence_is_the_integral():
     from scipy.integrate import quad
 
     information, score = np.array([[0.3]]), np.array([1.7])
-    priors = Priors(np.ones(1), np.array([6.0]), np.array([-1.0]), np.array([9.0]), np.ones(1, bool))
+    priors = Priors(
+        np.ones(1), np.array([6.0]), np.array([-1.0]), np.array([9.0]), np.ones(1, bool)
+    )
 
     def integral(sd, low, high):
-        weight = lambda x: np.exp(score[0] * x - 0.5 * information[0, 0] * x * x - 0.5 * (x / sd) ** 2)  # noqa: E731
-        mass = lambda x: np.exp(-0.5 * (x / sd) ** 2)  # noqa: E731
+        def weight(x):
+            return np.exp(score[0] * x - 0.5 * information[0, 0] * x * x - 0.5 * (x / sd) ** 2)
+
+        def mass(x):
+            return np.exp(-0.5 * (x / sd) ** 2)
+
         return np.log(quad(weight, low, high)[0] / quad(mass, low, high)[0])
 
-    assert evidence.log_evidence(information, score, priors, []) == pytest.approx(integral(evidence.SPIKE, -6, 6), abs=1e-6)
-    assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(integral(6.0, -1.0, 9.0), abs=1e-6)
+    assert evidence.log_evidence(information, score, priors, []) == pytest.approx(
+        integral(evidence.SPIKE, -6, 6), abs=1e-6
+    )
+    assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(
+        integral(6.0, -1.0, 9.0), abs=1e-6
+    )
 
 
 def test_a_window_that_no_force_explains_is_left_out():
@@ -404,7 +497,10 @@ def test_a_window_that_no_force_explains_is_left_out():
     def spoil(model, window):
         if window is not model._windows[3]:
             return window
-        return replace(window, residual=window.residual + 10.0 * window.sigma * rng.standard_normal(len(window.sigma)))
+        return replace(
+            window,
+            residual=window.residual + 10.0 * window.sigma * rng.standard_normal(len(window.sigma)),
+        )
 
     model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
     diagnosis = search.explain(model, laws=False)
@@ -414,15 +510,21 @@ def test_a_window_that_no_force_explains_is_left_out():
 
 def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
     sure = selector.Selector.sure
-    refusing = lambda self, point, active, j: self.name(j) != "effect_03" and sure(self, point, active, j)  # noqa: E731
+
+    def refusing(self, point, active, j):
+        return self.name(j) != "effect_03" and sure(self, point, active, j)
+
     monkeypatch.setattr(selector.Selector, "sure", refusing)
-    diagnosis = search.explain(world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False)
+    diagnosis = search.explain(
+        world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False
+    )
     assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]
     assert "effect_03" not in diagnosis.theta  # nor is it exchanged for what was named
 
 
 def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
-    """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that hold it, stay a fifth too small.
+    """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that
+    hold it, stay a fifth too small.
 
     Where one flight alone can tell, none that was held out can confirm it: that is not asked here.
     """
@@ -447,4 +549,6 @@ def test_windows_side_by_side_give_the_same_diagnosis():
     assert set(first.named) == set(truth)
     assert [s.named for s in second.steps] == [s.named for s in first.steps]
     assert second.theta == pytest.approx(first.theta, rel=1e-6)
-    assert [f.nats for f in second.findings] == pytest.approx([f.nats for f in first.findings], rel=1e-6, abs=1e-6)
+    assert [f.nats for f in second.findings] == pytest.approx(
+        [f.nats for f in first.findings], rel=1e-6, abs=1e-6
+    )

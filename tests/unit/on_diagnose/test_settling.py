@@ -1,4 +1,6 @@
-"""Initial states and derivatives of replay windows: gusts do not enter states, long steps tell what nominal ones do."""
+"""Initial states and derivatives of replay windows: gusts do not enter states, long steps tell what
+nominal ones do.
+"""
 
 import dataclasses
 
@@ -14,21 +16,38 @@ from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import FlightLog
 
 SWAY = 0.02 * np.array([1.0, 1.0, 1.0]), np.array([0.7, 0.9, 0.5]), np.array([0.0, 1.0, 2.0])
-"""Of vehicle and payload alike, as slow gusts bring it: amplitude [m], frequency [Hz], phase [rad]."""
+"""Of vehicle and payload alike, as slow gusts bring it: amplitude [m], frequency [Hz], phase [rad].
+"""
 RATE_KEPT = 0.2
-"""By which that sway may change the body rates of fitted states [rad/s], rms: 0.07 found, 0.64 if no gust is thought possible."""
+"""By which that sway may change the body rates of fitted states [rad/s], rms: 0.07 found, 0.64 if
+no gust is thought possible.
+"""
 ROUGH = 0.01
-"""Of a column's norm, by which one of twice as long steps may differ in a free flight: 0.005 found, for the command delay."""
+"""Of a column's norm, by which one of twice as long steps may differ in a free flight: 0.005 found,
+for the command delay.
+"""
 EITHER_WAY = 1e-3
 """Of a steady torque's column, by which pushes to either side may differ."""
-NAMES = ["rope_length", "mass_payload", "cmd_delay", "motor_tau", "com_x", "release_lag", "wind_x", "mocap_delay_quad", "d_filter"]
+NAMES = [
+    "rope_length",
+    "mass_payload",
+    "cmd_delay",
+    "motor_tau",
+    "com_x",
+    "release_lag",
+    "wind_x",
+    "mocap_delay_quad",
+    "d_filter",
+]
 
 
 def swayed(log: FlightLog) -> FlightLog:
     """The log with :data:`SWAY` added to what was measured."""
     size, rate, phase = SWAY
     moved = {
-        name: dataclasses.replace(c, values=c.values + size * np.sin(2.0 * np.pi * rate * c.time[:, None] + phase))
+        name: dataclasses.replace(
+            c, values=c.values + size * np.sin(2.0 * np.pi * rate * c.time[:, None] + phase)
+        )
         for name, c in log.channels.items()
         if name in ("pos_w", "payload_pos_w")
     }
@@ -36,8 +55,9 @@ def swayed(log: FlightLog) -> FlightLog:
 
 
 BENDING = 0.1
-"""Of a rope in the model that is 6 mm too long, where it was taut all the time [rad]: 0.07 found, 0.34 with the prior of one that
-has just come taut."""
+"""Of a rope in the model that is 6 mm too long, where it was taut all the time [rad]: 0.07 found,
+0.34 with the prior of one that has just come taut.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +66,10 @@ def logs():
 
 
 def test_gusts_do_not_take_the_place_of_states(logs):
-    calm, shaken = (ThrowModel(found, paper_plant(), only=["rope_length"]).begun({})[1] for found in (logs, map(swayed, logs)))
+    calm, shaken = (
+        ThrowModel(found, paper_plant(), only=["rope_length"]).begun({})[1]
+        for found in (logs, map(swayed, logs))
+    )
     away = shaken["rate_b"] - calm["rate_b"]
     assert np.sqrt(np.mean(away**2)) < RATE_KEPT
 
@@ -78,7 +101,11 @@ def test_long_steps_tell_derivatives_as_well(logs, monkeypatch):
 
 def test_what_long_steps_do_not_tell_keeps_the_nominal_ones(logs):
     model = ThrowModel(logs, paper_plant())
-    assert {name for name, e in model.entries.items() if exact(e)} == {"d_filter", "payload_inertia", "step_error"}
+    assert {name for name, e in model.entries.items() if exact(e)} == {
+        "d_filter",
+        "payload_inertia",
+        "step_error",
+    }
 
 
 def test_long_steps_stay_stable():
@@ -92,10 +119,14 @@ def test_long_steps_stay_stable():
 
 
 def test_derivatives_by_latent_torques_hold_either_way(logs, monkeypatch):
-    """A steady torque is controlled away; what a long step's second order leaves would look alike for all axes."""
+    """A steady torque is controlled away; what a long step's second order leaves would look alike
+    for all axes.
+    """
     model = ThrowModel(logs, paper_plant(), only=["rope_length"])
     there = model.windows({})
-    monkeypatch.setattr(linearising, "LATENT_SIZES", tuple(-size for size in linearising.LATENT_SIZES))
+    monkeypatch.setattr(
+        linearising, "LATENT_SIZES", tuple(-size for size in linearising.LATENT_SIZES)
+    )
     for a, b in zip(there, model.windows({})):
         for axis in range(3):
             of = (a.latent_block == 1) & (a.latent_axis == axis)
@@ -113,8 +144,11 @@ def bend(states) -> np.ndarray:
 
 def test_a_rope_that_is_too_long_does_not_bend_until_it_fits():
     """It would whip, and what whips tells nothing of what is wrong."""
-    model = ThrowModel(fly(setting_with({"rope_length": -6e-3}), noise=1.0, free=1, throws=0, seconds=3.0), paper_plant(),
-                       only=["rope_length"])  # fmt: skip
+    model = ThrowModel(
+        fly(setting_with({"rope_length": -6e-3}), noise=1.0, free=1, throws=0, seconds=3.0),
+        paper_plant(),
+        only=["rope_length"],
+    )
     assert bend(model.begun({})[1]).max() < BENDING
 
 

@@ -23,31 +23,45 @@ def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
 
 
 def test_the_catalogue_says_which_effects_are_switches():
-    assert {name for name, e in shipped().items() if e.switch} == {name for name, e in shipped().items() if not e.changes}
+    assert {name for name, e in shipped().items() if e.switch} == {
+        name for name, e in shipped().items() if not e.changes
+    }
     assert shipped()["controller_kind"].switch
 
 
 class Promising(SyntheticModel):
-    """Another kind of block that explains the flights by its derivative, and not once it is simulated."""
+    """Another kind of block that explains the flights by its derivative, and not once it is
+    simulated.
+    """
 
     def _there(self, theta, residuals):
         off = np.random.default_rng(5)
         on = theta.get("effect_03", 0.0) != 0.0
-        return [r + on * 2.0 * w.sigma * off.normal(size=len(r)) for r, w in zip(residuals, self._windows)]
+        return [
+            r + on * 2.0 * w.sigma * off.normal(size=len(r))
+            for r, w in zip(residuals, self._windows)
+        ]
 
     def residuals(self, theta, about=None):
         return self._there(theta, super().residuals(theta))
 
     def windows(self, theta):
         found = super().windows(theta)
-        return [replace(w, residual=r) for w, r in zip(found, self._there(theta, [w.residual for w in found]))]
+        return [
+            replace(w, residual=r)
+            for w, r in zip(found, self._there(theta, [w.residual for w in found]))
+        ]
 
 
 def test_another_kind_of_block_must_explain_the_flights_itself():
-    """Its derivative where it is off promises some hundred nats; with it on, the flights are explained worse than without."""
+    """Its derivative where it is off promises some hundred nats; with it on, the flights are
+    explained worse than without.
+    """
     floor = EFFECTS[3].floor
     truth = {"effect_03": 1.0 / floor}
-    assert search.explain(SyntheticModel(effects=EFFECTS, truth=truth, seed=4), laws=False).named == ("effect_03",)
+    assert search.explain(
+        SyntheticModel(effects=EFFECTS, truth=truth, seed=4), laws=False
+    ).named == ("effect_03",)
     assert not search.explain(Promising(effects=EFFECTS, truth=truth, seed=4), laws=False).named
 
 
@@ -60,6 +74,8 @@ def test_a_part_of_another_kind_of_block_is_not_named_and_not_linearised_twice()
             taken.append(dict(theta))
             return super().windows(theta)
 
-    diagnosis = search.explain(Counting(effects=EFFECTS, truth={"effect_03": 0.4 / EFFECTS[3].floor}, seed=4), laws=False)
+    diagnosis = search.explain(
+        Counting(effects=EFFECTS, truth={"effect_03": 0.4 / EFFECTS[3].floor}, seed=4), laws=False
+    )
     assert "effect_03" not in diagnosis.named
     assert len(taken) == len({tuple(at.items()) for at in taken}) == 2

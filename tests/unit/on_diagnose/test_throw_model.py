@@ -1,4 +1,6 @@
-"""The throw as a model to diagnose: silent at the truth, derivatives that are derivatives, planted effects recovered."""
+"""The throw as a model to diagnose: silent at the truth, derivatives that are derivatives, planted
+effects recovered.
+"""
 
 import dataclasses
 
@@ -29,16 +31,32 @@ from visthrow.diagnose.throw.states import hover_state
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
-LATENT = np.array([5e-4, 5e-6, 5e-5])  # deviations of the latent forces of each block, which absorb what the step leaves
-PLANTED = {"rope_length": 0.006, "cmd_delay": 0.006, "mass_payload": 0.002, "wind_x": 0.25, "com_y": 8e-4, "release_lag": 0.015}
-"""Some 10 floors each, but the payload's mass: small enough for the linear estimate, of every block one."""
+LATENT = np.array(
+    [5e-4, 5e-6, 5e-5]
+)  # deviations of the latent forces of each block, which absorb what the step leaves
+PLANTED = {
+    "rope_length": 0.006,
+    "cmd_delay": 0.006,
+    "mass_payload": 0.002,
+    "wind_x": 0.25,
+    "com_y": 8e-4,
+    "release_lag": 0.015,
+}
+"""Some 10 floors each, but the payload's mass: small enough for the linear estimate, of every block
+one.
+"""
 
 
 def estimate(windows, keep):
-    """Linear estimate of some effects and its deviation, initial states and latent forces integrated out."""
+    """Linear estimate of some effects and its deviation, initial states and latent forces
+    integrated out.
+    """
     information, score = np.zeros((len(keep), len(keep))), np.zeros(len(keep))
     for w in windows:
-        known = np.hstack((w.nuisance * w.nuisance_sd, w.latent * LATENT[w.latent_block])) / w.sigma[:, None]
+        known = (
+            np.hstack((w.nuisance * w.nuisance_sd, w.latent * LATENT[w.latent_block]))
+            / w.sigma[:, None]
+        )
         inner = np.linalg.inv(np.eye(known.shape[1]) + known.T @ known)
         columns, residual = w.effects[:, keep] / w.sigma[:, None], w.residual / w.sigma
         information += columns.T @ columns - (columns.T @ known) @ inner @ (known.T @ columns)
@@ -67,7 +85,9 @@ def test_planted_effects_are_recovered(planted):
 def test_silent_at_the_truth(planted):
     _, model = planted
     for w in model.windows(PLANTED):
-        start = w.nuisance * w.nuisance_sd / w.sigma[:, None]  # states are fitted with gusts in mind, of which there are none
+        start = (
+            w.nuisance * w.nuisance_sd / w.sigma[:, None]
+        )  # states are fitted with gusts in mind, of which there are none
         z = w.residual / w.sigma
         z = z - start @ np.linalg.lstsq(start, z, rcond=None)[0]
         assert np.mean(z**2) < 1.3, (w.phase, np.mean(z**2))
@@ -78,16 +98,23 @@ def test_silent_at_the_truth(planted):
 
 
 def test_a_log_that_begins_in_flight_is_followed_from_its_first_window_on():
-    """Of before nothing is known: which command acted, and what the integrals hold, here against a centre of mass that lies off."""
+    """Of before nothing is known: which command acted, and what the integrals hold, here against a
+    centre of mass that lies off.
+    """
     setting = setting_with({"motor_mixing": 1.0, "com_y": 4e-3})
     (log,) = fly(setting, noise=0.2, free=1, throws=0, seconds=2.6)
     late = {
-        name: dataclasses.replace(c, time=c.time[c.time > 1.0], values=c.values[c.time > 1.0], valid=c.valid[c.time > 1.0])
+        name: dataclasses.replace(
+            c, time=c.time[c.time > 1.0], values=c.values[c.time > 1.0], valid=c.valid[c.time > 1.0]
+        )
         for name, c in log.channels.items()
     }
     model = ThrowModel([FlightLog(late, {})], setting.plant, only=["rope_length"])
     first = model.windows({})[0]
-    start, z = first.nuisance * first.nuisance_sd / first.sigma[:, None], first.residual / first.sigma
+    start, z = (
+        first.nuisance * first.nuisance_sd / first.sigma[:, None],
+        first.residual / first.sigma,
+    )
     z = z - start @ np.linalg.lstsq(start, z, rcond=None)[0]
     assert np.mean(z**2) < 1.3, np.mean(z**2)
 
@@ -97,13 +124,17 @@ def test_rough_steps_are_as_short_as_the_controllers_filters_ask(blocks):
     """Betaflight's gyro filters of 250 and 500 Hz, D's of 150: 2 ms."""
     setting = setting_with(blocks)
     vehicle = setting.plant.vehicle
-    quick = dataclasses.replace(vehicle, controller=dataclasses.replace(vehicle.controller, gyro_time_constant=2e-3))
+    quick = dataclasses.replace(
+        vehicle, controller=dataclasses.replace(vehicle.controller, gyro_time_constant=2e-3)
+    )
     setting = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=quick))
     assert rough_step(setting, 2e-3) == pytest.approx(STABLE * 2e-3)
 
 
 def test_derivatives_are_derivatives(planted):
-    """Central differences of the residuals, with a step four times that of the columns: commands' switches make kinks."""
+    """Central differences of the residuals, with a step four times that of the columns: commands'
+    switches make kinks.
+    """
     _, model = planted
     windows = model.windows({})
     for k, e in enumerate(model.effects):
@@ -116,14 +147,21 @@ def test_derivatives_are_derivatives(planted):
 
 
 def test_landings_are_predicted_from_before_the_throw(planted):
-    """Open loop over a second: right at the truth, and off by what the effects do to the throw without them."""
+    """Open loop over a second: right at the truth, and off by what the effects do to the throw
+    without them.
+    """
     logs, model = planted
     wrong, right = model.landings({}), model.landings(PLANTED)
     assert list(right.flights) == [1]
     ball = logs[1]["payload_pos_w"]
-    last, rate = ball.values[ball.valid][-1], np.diff(ball.values[ball.valid][-6::5], axis=0)[0] / 0.025
+    last, rate = (
+        ball.values[ball.valid][-1],
+        np.diff(ball.values[ball.valid][-6::5], axis=0)[0] / 0.025,
+    )
     fall = (last[2] - paper_plant().release.landing_height) / -rate[2]
-    assert np.abs(right.measured[0] - (last + fall * rate)).max() < 4e-3  # a chord over five samples of the path
+    assert (
+        np.abs(right.measured[0] - (last + fall * rate)).max() < 4e-3
+    )  # a chord over five samples of the path
     assert right.measured[0, 2] == pytest.approx(paper_plant().release.landing_height)
     assert right.released_errors[0] < 5e-3
     assert right.errors[0] < 0.02
@@ -133,7 +171,9 @@ def test_landings_are_predicted_from_before_the_throw(planted):
 
 
 def test_dampings_tried_at_once_settle_states_sooner(planted, monkeypatch):
-    """With the same cost in the end: a window that falls short of its promise looks for its damping in one round."""
+    """With the same cost in the end: a window that falls short of its promise looks for its damping
+    in one round.
+    """
     logs, rounds, costs, seen, tried = planted[0], [], [], [], InitialFit._tried
     monkeypatch.setattr(InitialFit, "_tried", lambda self, *a: seen.append(1) or tried(self, *a))
     for ladder in (initial_fit.LADDER, initial_fit.LADDER[:1]):
@@ -142,7 +182,12 @@ def test_dampings_tried_at_once_settle_states_sooner(planted, monkeypatch):
         model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
         (states, _), windows = model._fitted(), np.arange(len(model.flights.cuts))
         fit = model._initial_fit(model.setting)
-        costs.append(sum(fit._cost(w, residual) for w, residual in zip(windows, fit._residuals(states, windows))))
+        costs.append(
+            sum(
+                fit._cost(w, residual)
+                for w, residual in zip(windows, fit._residuals(states, windows))
+            )
+        )
         rounds.append(len(seen))
     assert rounds[0] < 0.8 * rounds[1]
     assert costs[0] < 1.01 * costs[1]
@@ -155,7 +200,11 @@ def test_one_throw_s_landing_rests_on_what_was_fitted_to_all(monkeypatch):
     alone = ThrowModel(logs, paper_plant(), only=list(PLANTED)).landings(wrong, [1])
     model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
     model.landings({})
-    monkeypatch.setattr(InitialFit, "fit", lambda self, *a: fits.append(self.simulation.settings[0]) or fit(self, *a))
+    monkeypatch.setattr(
+        InitialFit,
+        "fit",
+        lambda self, *a: fits.append(self.simulation.settings[0]) or fit(self, *a),
+    )
     among = model.landings(wrong, [1])
     assert model.setting not in fits
     assert len(fits) == 2  # before the throw, and up to the separation
@@ -179,12 +228,17 @@ def test_windows_are_whole(planted):
 
 
 def test_initial_states_follow_the_effects(planted):
-    """A centre of mass elsewhere needs other rotors, integrators and attitudes to begin with, or a transient hides what it does."""
+    """A centre of mass elsewhere needs other rotors, integrators and attitudes to begin with, or a
+    transient hides what it does.
+    """
     model = ThrowModel(planted[0], paper_plant(), only=["com_y"])
     windows = model.windows({})
     problem = Problem(model, tuple(range(len(windows))))
     nominal, there = linearise(problem, np.zeros(1), windows=windows), np.array([15.0])
-    follow, behind = (moved(problem, point, there) for point in (nominal, dataclasses.replace(nominal, about=None)))
+    follow, behind = (
+        moved(problem, point, there)
+        for point in (nominal, dataclasses.replace(nominal, about=None))
+    )
     assert curvature(problem, nominal, follow) < 0.2 * curvature(problem, nominal, behind)
     back = moved(problem, follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
@@ -192,10 +246,14 @@ def test_initial_states_follow_the_effects(planted):
 
 
 def test_rotors_begin_a_window_where_the_commands_left_them(planted):
-    """Fitted without gusts they would take the gusts' place; they stay free to be told by the data."""
+    """Fitted without gusts they would take the gusts' place; they stay free to be told
+    by the data.
+    """
     _, model = planted
     model.windows({})
-    assert np.array_equal(model._latest[frozenset()]["motor_speed"], model._through(model.setting)[0]["motor_speed"])
+    assert np.array_equal(
+        model._latest[frozenset()]["motor_speed"], model._through(model.setting)[0]["motor_speed"]
+    )
     assert "motor_speed" in {d.field for d in model._directions}
 
 
@@ -204,7 +262,10 @@ def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):
     monkeypatch.setattr(initial_fit, "ROUNDS", 0)
     good = model._fitted()[0]
     even = np.arange(len(good["pos_w"])) % 2 == 0
-    mixed = [{**good, "pos_w": good["pos_w"] + 0.05 * np.where(rows, 1.0, 0.0)[:, None]} for rows in (even, ~even)]
+    mixed = [
+        {**good, "pos_w": good["pos_w"] + 0.05 * np.where(rows, 1.0, 0.0)[:, None]}
+        for rows in (even, ~even)
+    ]
     found = model._initial_fit(model.setting).fit(mixed)
     told = model._retained
     assert {0, 1} == set((told % 2).tolist())
@@ -213,8 +274,12 @@ def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):
 
 
 def test_what_is_known_of_the_sensors_is_taken_off():
-    sensing = SensingParams(frame_tilt=(0.01, 0.0, 0.0), marker_offset=(0.02, 0.0, 0.01), vehicle_delay=0.01)
-    setting = setting_with({"frame_tilt_x": 0.01, "marker_off_x": 0.02, "marker_off_z": 0.01, "mocap_delay_quad": 0.01})
+    sensing = SensingParams(
+        frame_tilt=(0.01, 0.0, 0.0), marker_offset=(0.02, 0.0, 0.01), vehicle_delay=0.01
+    )
+    setting = setting_with(
+        {"frame_tilt_x": 0.01, "marker_off_x": 0.02, "marker_off_z": 0.01, "mocap_delay_quad": 0.01}
+    )
     logs = fly(setting, noise=0.2, free=1, throws=0, seconds=2.0)
     informed = ThrowModel(logs, paper_plant(), sensing=sensing, only=["rope_length"])
     left = informed.residuals({})
@@ -222,13 +287,17 @@ def test_what_is_known_of_the_sensors_is_taken_off():
 
 
 def test_a_fit_of_initial_states_is_no_prior_of_them(monkeypatch):
-    """What flights are worth does not depend on how far their states were fitted before derivatives are taken there."""
+    """What flights are worth does not depend on how far their states were fitted before derivatives
+    are taken there.
+    """
     logs = fly(setting_with({}), noise=1.0, free=1, throws=1, seconds=3.0)
 
     def reduced():
         model = ThrowModel(logs, paper_plant(), only=["joint_damping"])
         windows = model.windows({})
-        return correlated_of([hidden_gram(w, len(model.channels)) for w in windows], windows, 0.3, "cpu")
+        return correlated_of(
+            [hidden_gram(w, len(model.channels)) for w in windows], windows, 0.3, "cpu"
+        )
 
     fitted = reduced()
     monkeypatch.setattr(initial_fit, "ROUNDS", 1)
@@ -237,7 +306,10 @@ def test_a_fit_of_initial_states_is_no_prior_of_them(monkeypatch):
 
 
 def test_the_catalogue_is_sound():
-    plant = dataclasses.replace(generalised(setting_with({})), camera=config.load(CameraParams, config.find("camera", "fisheye")))
+    plant = dataclasses.replace(
+        generalised(setting_with({})),
+        camera=config.load(CameraParams, config.find("camera", "fisheye")),
+    )
     for name, e in catalogue().items():
         assert e.bounds[0] <= 0.0 <= e.bounds[1], name
         assert 0.0 < e.floor < 3.0 * e.prior_sd, name
@@ -250,15 +322,29 @@ def test_the_catalogue_is_sound():
             assert e.apply(plant, 0.0) == plant, name
 
 
-HIDDEN = {"camera_tilt_x": 0.02, "camera_latency": 0.012, "camera_focal": 0.03, "camera_line_time": 1.2e-5, "plane_height": 0.025}
+HIDDEN = {
+    "camera_tilt_x": 0.02,
+    "camera_latency": 0.012,
+    "camera_focal": 0.03,
+    "camera_line_time": 1.2e-5,
+    "plane_height": 0.025,
+}
 
 
 def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
-    """A log with what a camera with :data:`HIDDEN` saw of its poses, row by row, and where the payload landed."""
+    """A log with what a camera with :data:`HIDDEN` saw of its poses, row by row, and where the
+    payload landed.
+    """
     lens, turn = camera.fisheye, np.degrees(HIDDEN["camera_tilt_x"])
-    lens = dataclasses.replace(lens, fx=lens.fx * (1 + HIDDEN["camera_focal"]), fy=lens.fy * (1 + HIDDEN["camera_focal"]))
-    mount = dataclasses.replace(camera.mount, rpy_deg=tuple(np.add(camera.mount.rpy_deg, (turn, 0.0, 0.0))))
-    real = KeypointCamera(dataclasses.replace(camera, fisheye=lens, mount=mount), dtype=torch.float64)
+    lens = dataclasses.replace(
+        lens, fx=lens.fx * (1 + HIDDEN["camera_focal"]), fy=lens.fy * (1 + HIDDEN["camera_focal"])
+    )
+    mount = dataclasses.replace(
+        camera.mount, rpy_deg=tuple(np.add(camera.mount.rpy_deg, (turn, 0.0, 0.0)))
+    )
+    real = KeypointCamera(
+        dataclasses.replace(camera, fisheye=lens, mount=mount), dtype=torch.float64
+    )
     goal = np.array([1.5, -1.0, 0.0])  # far from below, so that rows differ
     pos, quat, ball = (log[name] for name in ("pos_w", "quat_wb", "payload_pos_w"))
     slerp = Slerp(quat.time, Rotation.from_quat(quat.values))
@@ -266,7 +352,9 @@ def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
     stamps = np.arange(pos.time[0] + 0.1, last - 0.05, 0.02)
 
     def project(time):
-        where = [np.column_stack([np.interp(time, c.time, x) for x in c.values.T]) for c in (pos, ball)]
+        where = [
+            np.column_stack([np.interp(time, c.time, x) for x in c.values.T]) for c in (pos, ball)
+        ]
         where[0] = where[0] + slerp(time).apply((0.0, PLANTED["com_y"], 0.0))
         given = where[0], slerp(time).as_matrix(), np.tile(goal, (len(time), 1)), where[1]
         points, valid = keypoints(real, *[torch.from_numpy(np.ascontiguousarray(x)) for x in given])
@@ -276,15 +364,27 @@ def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
     reach = lens.fy * np.radians(lens.fov_deg / 2.0)
     for k in range(points.shape[1]):  # each row at its own time
         row = lens.cy + points[:, k, 1] * reach
-        points[:, k] = project(stamps - HIDDEN["camera_latency"] + HIDDEN["camera_line_time"] * row)[0][:, k]
-    points *= 1 + HIDDEN["camera_focal"]  # pixels of this lens, in coordinates of the one that is believed
+        points[:, k] = project(
+            stamps - HIDDEN["camera_latency"] + HIDDEN["camera_line_time"] * row
+        )[0][:, k]
+    points *= (
+        1 + HIDDEN["camera_focal"]
+    )  # pixels of this lens, in coordinates of the one that is believed
     points += np.random.default_rng(1).normal(scale=2e-3, size=points.shape)
     extra = {
-        "keypoints": Channel(stamps, points, "1", "image"), "keypoints_valid": Channel(stamps, valid, "bool"),
+        "keypoints": Channel(stamps, points, "1", "image"),
+        "keypoints_valid": Channel(stamps, valid, "bool"),
         "goal_w": Channel(stamps, np.tile(goal, (len(stamps), 1)), "m", "world"),
-    }  # fmt: skip
+    }
     if not ball.valid.all():
-        down = np.array([[*ball.values[ball.valid][-1][:2], paper_plant().release.landing_height + HIDDEN["plane_height"]]])
+        down = np.array(
+            [
+                [
+                    *ball.values[ball.valid][-1][:2],
+                    paper_plant().release.landing_height + HIDDEN["plane_height"],
+                ]
+            ]
+        )
         extra["landing"] = Channel(np.array([last]), down, "m", "world")
     return FlightLog({**log.channels, **extra}, {})
 
@@ -307,7 +407,10 @@ def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
         assert abs(found - size) < 0.1 * size + 4.0 * sd, (name, found, sd)
         assert sd < 0.4 * size, name
     projected = [FlightLog(log.channels, {"config": {"keypoints": "projection"}}) for log in logs]
-    assert "keypoints" not in ThrowModel(projected, paper_plant(), camera=camera, only=["plane_height"]).channels
+    assert (
+        "keypoints"
+        not in ThrowModel(projected, paper_plant(), camera=camera, only=["plane_height"]).channels
+    )
 
 
 def test_mistakes_are_told(planted):
@@ -315,7 +418,10 @@ def test_mistakes_are_told(planted):
     with pytest.raises(DiagnoseError, match="no effect '"):
         ThrowModel(logs, paper_plant(), only=["no_such"])
     with pytest.raises(DiagnoseError, match="command"):
-        ThrowModel([type(logs[0])({k: v for k, v in logs[0].channels.items() if k != "command"}, {})], paper_plant())
+        ThrowModel(
+            [type(logs[0])({k: v for k, v in logs[0].channels.items() if k != "command"}, {})],
+            paper_plant(),
+        )
 
 
 @pytest.mark.slow
@@ -329,28 +435,45 @@ def test_mistakes_are_told(planted):
     ],
 )
 def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
-    """The paper's ablations: flights of the whole plant, a model without one block; that block explains them best."""
+    """The paper's ablations: flights of the whole plant, a model without one block; that block
+    explains them best.
+    """
     logs, plant = fly(setting_with({}), noise=1.0, free=1, throws=2, seconds=3.0), paper_plant()
     if kind is None:
         simple = dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=1))
     else:
         block = dataclasses.replace(getattr(plant.vehicle, part), kind=kind)
-        simple = dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, **{part: block}))
+        simple = dataclasses.replace(
+            plant, vehicle=dataclasses.replace(plant.vehicle, **{part: block})
+        )
     model = ThrowModel(logs, simple)
     plain, whole = model.windows({}), model.windows({name: 1.0})
-    wrong, right = (sum(np.sum((w.residual / w.sigma) ** 2) for w in windows) for windows in (plain, whole))
+    wrong, right = (
+        sum(np.sum((w.residual / w.sigma) ** 2) for w in windows) for windows in (plain, whole)
+    )
     assert right < 0.7 * wrong, (wrong, right)
-    states = {"aerodynamics": 0, "controller_kind": 3, "motor_lag": 4, "rope_flexible": 8}  # integrals, rotors, bends of the rope
+    states = {
+        "aerodynamics": 0,
+        "controller_kind": 3,
+        "motor_lag": 4,
+        "rope_flexible": 8,
+    }  # integrals, rotors, bends of the rope
     assert whole[0].nuisance.shape[1] - plain[0].nuisance.shape[1] == states[name]
 
 
 def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(planted):
-    """Where a controller makes up for no voltage: it carries the weight at the share of throttle, whatever a log begins with."""
+    """Where a controller makes up for no voltage: it carries the weight at the share of throttle,
+    whatever a log begins with.
+    """
     flight, plant = dataclasses.replace(record_of(planted[0][0]), voltage=None), paper_plant()
     climbing = dataclasses.replace(flight, command=flight.command * [2.0, 1.0, 1.0, 1.0])
     weight = 0.25 * plant.total_mass * GRAVITY
-    mixing = dataclasses.replace(plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5, mix_thrust=weight)
-    calibrated = dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, controller=mixing))
+    mixing = dataclasses.replace(
+        plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5, mix_thrust=weight
+    )
+    calibrated = dataclasses.replace(
+        plant, vehicle=dataclasses.replace(plant.vehicle, controller=mixing)
+    )
     told = hover_state(flight, calibrated, 1)
     assert told["voltage"][0] == pytest.approx(16.5, abs=0.02)
     assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]

@@ -1,4 +1,6 @@
-"""Traps made of real flights: what is wrong is named, with the right reason, and good flights stay free of it."""
+"""Traps made of real flights: what is wrong is named, with the right reason, and good flights stay
+free of it.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +18,10 @@ from visthrow.logs.check.run import check, contradictions, copies
 from visthrow.logs.flightlog import Channel, FlightLog
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "real"
-FLIGHTS = {n: setup.read_logs([REAL / "payload_cf_single" / f"log{n}.csv.gz"], "cf_payload")[0] for n in (204, 205, 206)}
+FLIGHTS = {
+    n: setup.read_logs([REAL / "payload_cf_single" / f"log{n}.csv.gz"], "cf_payload")[0]
+    for n in (204, 205, 206)
+}
 """Flights along x, along y, and in place."""
 CRAZYFLIE = setup.known("cf_payload")
 PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
@@ -24,18 +29,26 @@ LATE = 0.1
 
 
 def changed(log: FlightLog, names, change) -> FlightLog:
-    channels = {n: Channel(c.time, change(c.values.astype(float)), c.unit, c.frame, c.valid) for n in names for c in [log[n]]}
+    channels = {
+        n: Channel(c.time, change(c.values.astype(float)), c.unit, c.frame, c.valid)
+        for n in names
+        for c in [log[n]]
+    }
     return FlightLog({**log.channels, **channels}, log.meta)
 
 
 def shifted(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
-    channels = {n: Channel(c.time + by, c.values, c.unit, c.frame, c.valid) for n in names for c in [log[n]]}
+    channels = {
+        n: Channel(c.time + by, c.values, c.unit, c.frame, c.valid) for n in names for c in [log[n]]
+    }
     return FlightLog({**log.channels, **channels}, log.meta)
 
 
 def bad(log: FlightLog, known: Known = CRAZYFLIE) -> str:
     (checked,) = check([log], known)
-    return " | ".join(f"{row.topic} {row.channel}: {row.text}" for row in checked.rows if row.verdict == "bad")
+    return " | ".join(
+        f"{row.topic} {row.channel}: {row.text}" for row in checked.rows if row.verdict == "bad"
+    )
 
 
 @pytest.mark.parametrize("number", FLIGHTS)
@@ -43,9 +56,13 @@ def test_flights_as_they_are(number):
     assert bad(FLIGHTS[number]) == ""
 
 
-@pytest.mark.parametrize("path", ["nanobench_cf21/B3_figure8_fast_rep1", "payload_cf_two_drones/coltrans_02_cf9"])
+@pytest.mark.parametrize(
+    "path", ["nanobench_cf21/B3_figure8_fast_rep1", "payload_cf_two_drones/coltrans_02_cf9"]
+)
 def test_other_flights_as_they_are(path):
-    name = {"nanobench_cf21": "nanobench_cf21", "payload_cf_two_drones": "cf_payload_pair"}[path.split("/")[0]]
+    name = {"nanobench_cf21": "nanobench_cf21", "payload_cf_two_drones": "cf_payload_pair"}[
+        path.split("/")[0]
+    ]
     (log,) = setup.read_logs([REAL / f"{path}.csv.gz"], name)
     assert bad(log, setup.known(name)) == ""
 
@@ -59,11 +76,15 @@ def test_exchanged_axes_are_named_with_their_evidence(number):
 
 
 def test_a_mirror_image_is_named():
-    assert "fit with (x,-y,z) of positions and velocities" in bad(changed(FLIGHTS[205], PATHS, lambda v: v * [1, -1, 1]))
+    assert "fit with (x,-y,z) of positions and velocities" in bad(
+        changed(FLIGHTS[205], PATHS, lambda v: v * [1, -1, 1])
+    )
 
 
 def test_an_exchanged_accelerometer_is_named():
-    assert "acc_b fits as (y,x,z)" in bad(changed(FLIGHTS[204], ["acc_b"], lambda v: v[:, [1, 0, 2]]))
+    assert "acc_b fits as (y,x,z)" in bad(
+        changed(FLIGHTS[204], ["acc_b"], lambda v: v[:, [1, 0, 2]])
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,20 +103,28 @@ def test_late_streams_are_named_with_their_offset(streams, row):
 
 
 def test_thrust_of_another_flight_is_refused():
-    found = bad(FlightLog({**FLIGHTS[205].channels, "thrust_command": FLIGHTS[204]["thrust_command"]}))
+    found = bad(
+        FlightLog({**FLIGHTS[205].channels, "thrust_command": FLIGHTS[204]["thrust_command"]})
+    )
     assert "the force does not follow the thrust" in found
     assert "thrust of another flight" in found
 
 
 def test_early_thrust_is_named():
-    assert "the stream of the thrust is about" in bad(shifted(FLIGHTS[206], "thrust_command", by=-LATE))
+    assert "the stream of the thrust is about" in bad(
+        shifted(FLIGHTS[206], "thrust_command", by=-LATE)
+    )
 
 
 @pytest.mark.parametrize(
     ("names", "factor", "words"),
     [
         (("thrust_command",), 101.97, "times the model's 0.0419 kg: in g of thrust"),
-        (("rate_b",), 57.3, "rate of quat_wb, rate_b: the second is 57.* times the first: one is in degrees"),
+        (
+            ("rate_b",),
+            57.3,
+            "rate of quat_wb, rate_b: the second is 57.* times the first: one is in degrees",
+        ),
         (("acc_b",), 1 / 9.80665, "not 9.81: one is in g"),
         (PATHS, 1000.0, "millimetres taken for metres"),
     ],
@@ -106,7 +135,8 @@ def test_units_are_named_by_their_ratio(names, factor, words):
 
 
 @pytest.mark.parametrize(
-    ("mass", "words"), [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")]
+    ("mass", "words"),
+    [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")],
 )
 def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
     found = bad(FLIGHTS[204], replace(CRAZYFLIE, mass=mass))
@@ -115,7 +145,9 @@ def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
 
 
 def test_the_cable_is_held_against_the_models():
-    assert "apart by +70.8 % of the model's cable of 0.3 m: another cable" in bad(FLIGHTS[204], Known(cable_length=0.3))
+    assert "apart by +70.8 % of the model's cable of 0.3 m: another cable" in bad(
+        FLIGHTS[204], Known(cable_length=0.3)
+    )
 
 
 def test_a_copy_counts_once():
@@ -131,11 +163,20 @@ def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(0.5, "rear left reads 0.50 of the others in flight: half"), (0.0, "sensor is dead"), (2.0, "twice")]
+    ("factor", "words"),
+    [
+        (0.5, "rear left reads 0.50 of the others in flight: half"),
+        (0.0, "sensor is dead"),
+        (2.0, "twice"),
+    ],
 )
 def test_a_rotor_sensor_that_reads_wrong(factor, words):
     columns = flight()
-    speed = 1500.0 * np.sqrt(columns["command"][:, :1] / 2.0) * (1.0 + 0.01 * np.random.default_rng(0).normal(size=(1200, 4)))
+    speed = (
+        1500.0
+        * np.sqrt(columns["command"][:, :1] / 2.0)
+        * (1.0 + 0.01 * np.random.default_rng(0).normal(size=(1200, 4)))
+    )
     rotors = Channel(columns["time"], speed, "rad/s")
     assert "reads" not in faults(log_of(columns, motor_speed=rotors))
     wrong = Channel(columns["time"], speed * [1.0, 1.0, factor, 1.0], "rad/s")
@@ -154,7 +195,11 @@ def test_jumps_in_every_channel_and_across_gaps():
     keep[400:430] = False
     whole = {name: values[keep] for name, values in columns.items()}
     assert "across gaps" not in faults(log_of(whole), "warn")
-    whole["pos_w"] = whole["pos_w"] + np.where(whole["time"] > 4.2, 2.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    whole["pos_w"] = whole["pos_w"] + np.where(whole["time"] > 4.2, 2.0, 0.0)[:, None] * [
+        1.0,
+        0.0,
+        0.0,
+    ]
     assert "1 jumps across gaps, the largest 2" in faults(log_of(whole), "warn")
 
 
@@ -169,21 +214,31 @@ def test_positions_at_10_hz_are_looked_at(tmp_path):
     columns, path = flight(), tmp_path / "a.BIN"
     imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
     flip = np.array([1.0, -1.0, -1.0])
-    rows = [("IMU", (int(1e6 * t), 0, *(w * flip), *(a * flip))) for t, w, a in zip(columns["time"], columns["rate_b"], columns["acc_b"])]
+    rows = [
+        ("IMU", (int(1e6 * t), 0, *(w * flip), *(a * flip)))
+        for t, w, a in zip(columns["time"], columns["rate_b"], columns["acc_b"])
+    ]
     rows += [
-        ("XKF1", (int(1e6 * t), 0, 0.0, 0.0, 0.0, *(v * flip), 0.0, *(p * flip), 0.0, 0.0, 0.0, 0.0))
+        (
+            "XKF1",
+            (int(1e6 * t), 0, 0.0, 0.0, 0.0, *(v * flip), 0.0, *(p * flip), 0.0, 0.0, 0.0, 0.0),
+        )
         for t, p, v in list(zip(columns["time"], columns["pos_w"], columns["vel_w"]))[::10]
     ]
     logfiles.write_bin(path, {"IMU": imu, "XKF1": logfiles.XKF1}, rows)
     (log,) = read(path)
     (checked,) = check([log])
     assert checked.verdict != "bad"
-    compared = [row for row in checked.rows if row.channel == "d(pos_w)/dt, vel_w" and row.topic == "frames"]
+    compared = [
+        row for row in checked.rows if row.channel == "d(pos_w)/dt, vel_w" and row.topic == "frames"
+    ]
     assert compared
     assert compared[0].figures["correlation"] > 0.95
     time, rate = relations.derivative(log["pos_w"].time, log["pos_w"].values)
     assert len(time) > 100
-    assert rate[:, 0] == pytest.approx(np.interp(time, log["vel_w"].time, log["vel_w"].values[:, 0]), abs=0.1)
+    assert rate[:, 0] == pytest.approx(
+        np.interp(time, log["vel_w"].time, log["vel_w"].values[:, 0]), abs=0.1
+    )
 
 
 def test_explain_leaves_a_copy_out(tmp_path, capsys):
@@ -192,7 +247,15 @@ def test_explain_leaves_a_copy_out(tmp_path, capsys):
     files = [REAL / "payload_cf_single" / "log204.csv.gz"]
     copy = tmp_path / "copy.csv.gz"
     copy.write_bytes(files[0].read_bytes())
-    names = [*map(str, files), str(copy), "--config", "cf_payload", "--only", "rotor_drag_xy", "--no-report"]
+    names = [
+        *map(str, files),
+        str(copy),
+        "--config",
+        "cf_payload",
+        "--only",
+        "rotor_drag_xy",
+        "--no-report",
+    ]
     assert cli.main(["diagnose", "explain", *names]) == 0
     out = capsys.readouterr().out
     assert "left out: copy.csv.gz: a copy of another log, which counts once" in out

@@ -1,4 +1,6 @@
-"""Laws outside the catalogue: terms with units, found and told from names; tables where no formula is asked for."""
+"""Laws outside the catalogue: terms with units, found and told from names; tables where no formula
+is asked for.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,10 +22,22 @@ from visthrow.diagnose.select.scatter import Varies
 
 EFFECTS = catalogue(12)
 IN_THE_BODY = ("vehicle torque", laws.JOINT)
-LEFT = 0.7  # of a hidden force after a table learnt from a dozen throws, in a throw that it has not seen: a table is no formula
+# of a hidden force after a table learnt from a dozen throws, in a throw that it has not seen: a
+# table is no formula
+LEFT = 0.7
 KNOTS = (
-    "time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust", "payload_pos_w", "payload_vel_w", "cable_dir_w", "tension", "mount_b",
-)  # fmt: skip
+    "time",
+    "pos_w",
+    "vel_w",
+    "quat_wb",
+    "rate_b",
+    "thrust",
+    "payload_pos_w",
+    "payload_vel_w",
+    "cable_dir_w",
+    "tension",
+    "mount_b",
+)
 
 
 def table(terms_: list, knots: dict) -> np.ndarray:
@@ -49,25 +63,39 @@ def random_knots(seed: int = 0) -> dict:
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)  # noqa: E731
     k = 6
     return {
-        "time": np.arange(k) * 0.1, "pos_w": rng.normal(size=(k, 3)) + [0, 0, 3], "vel_w": rng.normal(size=(k, 3)),
-        "quat_wb": unit(rng.normal(size=(k, 4))), "rate_b": rng.normal(size=(k, 3)), "thrust": rng.uniform(1, 4, k),
-        "payload_pos_w": rng.normal(size=(k, 3)), "payload_vel_w": rng.normal(size=(k, 3)),
-        "cable_dir_w": unit(rng.normal(size=(k, 3))), "tension": rng.uniform(0, 1, k),
+        "time": np.arange(k) * 0.1,
+        "pos_w": rng.normal(size=(k, 3)) + [0, 0, 3],
+        "vel_w": rng.normal(size=(k, 3)),
+        "quat_wb": unit(rng.normal(size=(k, 4))),
+        "rate_b": rng.normal(size=(k, 3)),
+        "thrust": rng.uniform(1, 4, k),
+        "payload_pos_w": rng.normal(size=(k, 3)),
+        "payload_vel_w": rng.normal(size=(k, 3)),
+        "cable_dir_w": unit(rng.normal(size=(k, 3))),
+        "tension": rng.uniform(0, 1, k),
         "mount_b": np.tile([0.01, 0.0, -0.02], (k, 1)),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("block", laws.BLOCKS)
 def test_terms_turn_with_the_world(block):
-    """Frame-covariant: forces turn with the world about the vertical, torques in the body do not notice."""
+    """Frame-covariant: forces turn with the world about the vertical, torques in the body do not
+    notice.
+    """
     knots, angle = random_knots(), 0.7
     c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) if block not in IN_THE_BODY else np.eye(3)
+    turn = (
+        np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        if block not in IN_THE_BODY
+        else np.eye(3)
+    )
     every = laws.terms_of(block, KNOTS)
     assert len(every) > 300
     values = table(every, knots)
     again = table(every, turned(knots, angle))
-    np.testing.assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
+    np.testing.assert_allclose(
+        again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max()
+    )
 
 
 @pytest.mark.parametrize("block", laws.BLOCKS)
@@ -96,7 +124,9 @@ def test_what_follows_from_knots_is_computed_once(monkeypatch):
 
 
 def test_a_torque_in_the_joint_acts_on_both_sides():
-    """No force is left over, and no moment but the one about the rope, which a rope without stiffness does not take."""
+    """No force is left over, and no moment but the one about the rope, which a rope without
+    stiffness does not take.
+    """
     knots = random_knots()
     terms = laws.terms_of(laws.JOINT, KNOTS)[:5]
     torque_b = table(terms, knots)
@@ -109,7 +139,10 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
     for i in range(len(terms)):
         on_vehicle = rotate(knots["quat_wb"], found["vehicle torque"][:, :, i])
         about_it = on_vehicle + np.cross(away, found["payload force"][:, :, i])
-        twist = np.einsum("ki,ki->k", rotate(knots["quat_wb"], torque_b[:, :, i]), along)[:, None] * along
+        twist = (
+            np.einsum("ki,ki->k", rotate(knots["quat_wb"], torque_b[:, :, i]), along)[:, None]
+            * along
+        )
         np.testing.assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
 
 
@@ -135,15 +168,22 @@ def test_hats_at_the_knots_follow_the_curve_between_them():
         np.testing.assert_array_equal(grammar.between(count), np.eye(count))
 
 
-@pytest.mark.parametrize(("term", "unit", "formula"), [
-    (laws.Term("vehicle force", ("speed",), "vel"), "kg m^-1", "F = c |v| v"),
-    (laws.Term("vehicle force", ("thrust", "speed_across_squared"), "body_z"), "m^-2 s^2", "F = c T v_xy² e_z"),
-    (laws.Term("payload force", (), "vertical_cross_vel"), "kg s^-1", "F_p = c (z x v_p)"),
-    (laws.Term("vehicle torque", ("thrust",), "axis_cross_vel"), "s", "M = c T (e_z x v)"),
-    (laws.Term("vehicle force", ("thrust",), "body_z"), "1", "F = c T e_z"),
-    (laws.Term(laws.JOINT, ("joint_rate",), "joint_rate"), "kg m^2", "M_j = c |Ω| Ω"),
-    (laws.Term(laws.JOINT, ("tension",), "friction"), "m", "M_j = c S Ω/|Ω|"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("term", "unit", "formula"),
+    [
+        (laws.Term("vehicle force", ("speed",), "vel"), "kg m^-1", "F = c |v| v"),
+        (
+            laws.Term("vehicle force", ("thrust", "speed_across_squared"), "body_z"),
+            "m^-2 s^2",
+            "F = c T v_xy² e_z",
+        ),
+        (laws.Term("payload force", (), "vertical_cross_vel"), "kg s^-1", "F_p = c (z x v_p)"),
+        (laws.Term("vehicle torque", ("thrust",), "axis_cross_vel"), "s", "M = c T (e_z x v)"),
+        (laws.Term("vehicle force", ("thrust",), "body_z"), "1", "F = c T e_z"),
+        (laws.Term(laws.JOINT, ("joint_rate",), "joint_rate"), "kg m^2", "M_j = c |Ω| Ω"),
+        (laws.Term(laws.JOINT, ("tension",), "friction"), "m", "M_j = c S Ω/|Ω|"),
+    ],
+)
 def test_units_and_formulas(term, unit, formula):
     assert term.unit == unit
     assert term.formula == formula
@@ -155,10 +195,14 @@ def test_terms_that_lack_their_knots_are_not_made():
         assert set(term.factors) <= {"speed"}
 
 
-@pytest.mark.parametrize(("law", "size", "formula"), [
-    ("speed", -0.01, "F = c |v| v"), pytest.param("swirl", 0.01, "F_p = c (z x v_p)", marks=pytest.mark.slow),
-    pytest.param("thrust", 0.012, "F = c T v_xy² e_z", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("law", "size", "formula"),
+    [
+        ("speed", -0.01, "F = c |v| v"),
+        pytest.param("swirl", 0.01, "F_p = c (z x v_p)", marks=pytest.mark.slow),
+        pytest.param("thrust", 0.012, "F = c T v_xy² e_z", marks=pytest.mark.slow),
+    ],
+)
 def test_hidden_laws_are_written_down(law, size, formula):
     model = SyntheticModel(effects=EFFECTS, law=law, law_size=abs(size), seed=3)
     diagnosis = search.explain(model)
@@ -172,13 +216,17 @@ def test_hidden_laws_are_written_down(law, size, formula):
 
 
 def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
-    model = SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3)
+    model = SyntheticModel(
+        effects=EFFECTS, law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3
+    )
     diagnosis = search.explain(model)
     assert diagnosis.overall == result.UNKNOWN
     assert diagnosis.block == "payload force"
     assert diagnosis.named == ("effect_03",)
     assert diagnosis["effect_03"].low < 12.0 * EFFECTS[3].floor < diagnosis["effect_03"].high
-    first = diagnosis.laws[0]  # the screen prefers S (z x v_p); joined by the right term it is worth nothing
+    first = diagnosis.laws[
+        0
+    ]  # the screen prefers S (z x v_p); joined by the right term it is worth nothing
     assert first.formula == "F_p = c (z x v_p)"
     assert abs(first.coefficient - 0.01) < 2.0 * first.sd
     formulas = [law.formula for law in diagnosis.laws]
@@ -186,16 +234,24 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
 
 
 def with_a_name_for_the_law(most: float) -> SyntheticModel:
-    """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and cannot exceed ``most``."""
+    """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and
+    cannot exceed ``most``.
+    """
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
-    model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=3e-3, bounds=(-0.1, most)), *EFFECTS[2:])
+    model.effects = (
+        EFFECTS[0],
+        replace(EFFECTS[1], floor=1e-3, prior_sd=3e-3, bounds=(-0.1, most)),
+        *EFFECTS[2:],
+    )
     for w, moved in zip(model._windows, model.by_law):
         w.effects[:, 1] = moved / model.law_size
     return model
 
 
 def test_a_law_takes_no_name_away_that_says_the_same():
-    """The name is far larger than usual and close to its bound, which costs it nats that the nameless term does not pay."""
+    """The name is far larger than usual and close to its bound, which costs it nats that the
+    nameless term does not pay.
+    """
     diagnosis = search.explain(with_a_name_for_the_law(0.0198))
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_01",)
@@ -216,36 +272,56 @@ def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> 
     problem = Problem(model, tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
     if told:
-        problem, (point,) = terms.extended(problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in told])
+        problem, (point,) = terms.extended(
+            problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in told]
+        )
     named = [*active, *range(len(model.effects), len(problem.priors.floor))]
-    return selector.Selector(problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named))
+    return selector.Selector(
+        problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named)
+    )
 
 
 @pytest.mark.parametrize("block", ["vehicle force", "payload force"])
 def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
-    """Information and score of a column that the windows' inner products were given, and of no further simulation."""
-    at = beside_a_law(SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1])
+    """Information and score of a column that the windows' inner products were given, and of no
+    further simulation.
+    """
+    at = beside_a_law(
+        SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
+    )
     known = [laws.Known(w.knots) for w in at.point.windows]
-    of = terms.screen(at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known)
+    of = terms.screen(
+        at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known
+    )
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        problem, (point,) = terms.extended(at.problem, [at.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
+        problem, (point,) = terms.extended(
+            at.problem, [at.point], [terms.as_effect(of.terms[i], 1.0, 0.0)]
+        )
         scale = problem.priors.floor[-1]
         assert point.information[-1, -1] == pytest.approx(scale**2 * of.own[i], rel=1e-6)
-        assert point.score[-1] == pytest.approx(scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i]))
+        assert point.score[-1] == pytest.approx(
+            scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i])
+        )
         cross, most = scale * of.cross, scale * np.abs(of.cross).max()
-        np.testing.assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
+        np.testing.assert_allclose(
+            point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most
+        )
 
 
 def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
     at = beside_a_law(with_a_name_for_the_law(0.1), [1])
     strongest = terms.strongest_forces(at.nominal)
-    found, beside = (terms.shortlist(at.problem, at.nominal, [], strongest, 4.0, names) for names in ([], [1]))
+    found, beside = (
+        terms.shortlist(at.problem, at.nominal, [], strongest, 4.0, names) for names in ([], [1])
+    )
     assert DRAG in [effect.term for effect in found]
     assert DRAG not in [effect.term for effect in beside]
 
 
 def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
-    """Appended to what the windows say it is the column that a linearisation gives; without it nothing has changed."""
+    """Appended to what the windows say it is the column that a linearisation gives; without it
+    nothing has changed.
+    """
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
     at, plain = beside_a_law(model, [3], DRAG), beside_a_law(model, [3])
     again = linearise(at.problem, np.zeros(len(EFFECTS) + 1))
@@ -262,13 +338,19 @@ def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}
-    at = beside_a_law(SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3), [3, 6], DRAG)
+    at = beside_a_law(
+        SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3),
+        [3, 6],
+        DRAG,
+    )
     assert acts_on(at.point, at.names) == ["vehicle force", "payload force"]
     assert at.law()[0] == {3}
 
 
 def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
-    """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is a force on the vehicle."""
+    """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is
+    a force on the vehicle.
+    """
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
     for w in model._windows:
         w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
@@ -279,12 +361,16 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
 
 
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3)
+    model = SyntheticModel(
+        effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3
+    )
     assert beside_a_law(model, [3, 6], DRAG).law()[0] == {3, 6}
 
 
 def test_known_causes_and_gusts_are_no_laws():
-    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, gust=2.0, seed=5))
+    diagnosis = search.explain(
+        SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, gust=2.0, seed=5)
+    )
     assert diagnosis.overall == result.KNOWN
     assert not diagnosis.laws
 
@@ -304,7 +390,9 @@ def test_the_table_takes_up_what_no_name_explains():
     truth = -0.02 * np.linalg.norm(velocity, axis=1)[:, None] * velocity
     assert np.linalg.norm(asked - truth) < LEFT * np.linalg.norm(truth)
     data = unexplained(point, 0)
-    again = Table(*(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"]))
+    again = Table(
+        *(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"])
+    )
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
     drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
     assert np.linalg.norm(drag - truth) < LEFT * np.linalg.norm(truth)
@@ -312,7 +400,9 @@ def test_the_table_takes_up_what_no_name_explains():
 
 def test_beside_a_law_a_name_must_be_sure_of_its_sign():
     """The least certain goes first: what it shared with another may make that one sure."""
-    priors = Priors(np.ones(3), np.full(3, 20.0), np.full(3, -np.inf), np.full(3, np.inf), np.ones(3, bool))
+    priors = Priors(
+        np.ones(3), np.full(3, 20.0), np.full(3, -np.inf), np.full(3, np.inf), np.ones(3, bool)
+    )
     information = np.diag([4.0, 0.5, 4.0])
     point = SimpleNamespace(information=information, score=information @ [8.0, 1.0, 0.3])
     assert verdicts._sure(point, priors, [0, 1, 2]) == [0]
@@ -321,7 +411,9 @@ def test_beside_a_law_a_name_must_be_sure_of_its_sign():
 
 @pytest.mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])
 def test_terms_are_screened_beside_what_varies(days):
-    """As if each were an effect of the problem: else what flights have of their own is taken for a law."""
+    """As if each were an effect of the problem: else what flights have of their own is taken for a
+    law.
+    """
     model = SyntheticModel(EFFECTS, law="swirl", law_size=0.02)
     problem = Problem.of(model, model.windows({}), range(14))
     varies = Varies(days, {0: 5.0}, {4: 2.0} if days else {})
@@ -330,7 +422,9 @@ def test_terms_are_screened_beside_what_varies(days):
     for i in (0, 1, 40):
         own = terms.as_effect(screen.terms[i], 0.1, 0.0)
         _, (wide,) = terms.extended(problem, [calm], [own])
-        np.testing.assert_allclose(screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
+        np.testing.assert_allclose(
+            screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6
+        )
         np.testing.assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
         cross = wide.information[-1, :-1] / own.floor
         np.testing.assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())

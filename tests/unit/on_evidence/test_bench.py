@@ -1,4 +1,6 @@
-"""Benchmarks run with tiny sizes, count what the kernel does, and keep well-formed records; no time is judged."""
+"""Benchmarks run with tiny sizes, count what the kernel does, and keep well-formed records; no time
+is judged.
+"""
 
 import importlib
 import json
@@ -76,7 +78,18 @@ def test_graph_replays_every_command(experiment):
 
 def test_bench_sim_against_mujoco_writes_a_record(kept, tmp_path, capsys):
     out = tmp_path / "figures.json"
-    arguments = ["--batch", "4", "--seconds", "1e-3", "--repeats", "1", "--json", str(out), "--record", "tiny"]
+    arguments = [
+        "--batch",
+        "4",
+        "--seconds",
+        "1e-3",
+        "--repeats",
+        "1",
+        "--json",
+        str(out),
+        "--record",
+        "tiny",
+    ]
     assert sim_cpu.main(arguments) == 0
     figures = json.loads(out.read_text())["figures"]
     assert figures["errors_m"]["ours"][0] < 1e-3
@@ -106,7 +119,12 @@ def test_mujoco_warp_runs_the_same_rope_as_c():
 
 
 def test_bench_camera_runs(kept, capsys):
-    assert bench_camera.main(["--environments", "16", "--repeats", "1", "--device", "cpu", "--record", "c"]) == 0
+    assert (
+        bench_camera.main(
+            ["--environments", "16", "--repeats", "1", "--device", "cpu", "--record", "c"]
+        )
+        == 0
+    )
     exact = measurements.load(kept / "c.json")["figures"]["accuracy"]
     assert max(exact["kornia_px"], exact["opencv_px"]) < 1e-9  # px; the bar of the camera
     assert "OpenCV" in capsys.readouterr().out
@@ -118,7 +136,13 @@ def test_bench_train_splits_an_iteration(kept, capsys):
     assert train.main([*arguments, *(word for s in small for word in ("--set", s))]) == 0
     figures = measurements.load(kept / "t.json")["figures"]
     assert figures["samples"] == 16
-    assert set(figures["seconds"]) == {"simulation", "environment", "inference", "storage", "learning"}
+    assert set(figures["seconds"]) == {
+        "simulation",
+        "environment",
+        "inference",
+        "storage",
+        "learning",
+    }
     capsys.readouterr()
 
 
@@ -142,7 +166,9 @@ RECORDS = sorted(measurements.FOLDER.glob("*.json"))
 
 @pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
 def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
-    """Its options are taken, its configurations are there and take their changes, its policies are there or made by the line before."""
+    """Its options are taken, its configurations are there and take their changes, its policies are
+    there or made by the line before.
+    """
     monkeypatch.setattr(start, "main", lambda parser, run, argv: parser.parse_args(argv))
     record = measurements.load(path)
     assert f"today, from a clone: `{record['today']}`" in measurements.origin(record)
@@ -159,7 +185,10 @@ def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
             names = getattr(args, "configs", [])
         for name in names:
             config.load(Experiment, config.find("train", name), args.overrides)
-        for name in {*getattr(args, "policies", []), *([args.policy] if hasattr(args, "policy") else [])} - {*made}:
+        for name in {
+            *getattr(args, "policies", []),
+            *([args.policy] if hasattr(args, "policy") else []),
+        } - {*made}:
             find_policy(name)
 
 
@@ -225,9 +254,16 @@ def test_a_training_to_an_error_is_told_as_it_ends(capsys):
 
 def test_of_a_fleet_is_kept_how_its_vehicles_spread_and_no_row_of_each():
     vehicles = [*map(str, range(41)), "x500"]
-    rows = [fleet.Row("any", v, t, 6, 6, 0.001 * i + 0.01 * t, 1.0) for i, v in enumerate(vehicles) for t in fleet.TARGETS]
+    rows = [
+        fleet.Row("any", v, t, 6, 6, 0.001 * i + 0.01 * t, 1.0)
+        for i, v in enumerate(vehicles)
+        for t in fleet.TARGETS
+    ]
     found = fleet._report(rows, {})
-    assert [row[:3] for row in found.tables[0].rows] == [("drawn", "any", "41"), ("x500", "any", "1")]
+    assert [row[:3] for row in found.tables[0].rows] == [
+        ("drawn", "any", "41"),
+        ("x500", "any", "1"),
+    ]
     (spread,) = found.figures["spread"]
     assert (spread["vehicles"], spread["n"]) == ("drawn", 41)
     assert spread["error"]["2"] == pytest.approx(0.02 + 0.04 * np.array(fleet.QUANTILES), abs=5e-5)

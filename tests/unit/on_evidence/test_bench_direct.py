@@ -1,4 +1,6 @@
-"""The fake's throw without a wire: the same bits for the same seed, poses as old as over the wire."""
+"""The fake's throw without a wire: the same bits for the same seed, poses as old as
+over the wire.
+"""
 
 import numpy as np
 import pytest
@@ -21,8 +23,11 @@ class Landing(LevelPlant):
     @property
     def landing(self):
         down = self.released is not None and self.time > self.released + 0.5
-        return {"landing_w": [1.97, 0.04, 0.04] if down else None, "landing_time": self.time if down else None,
-                "separation_time": None}  # fmt: skip
+        return {
+            "landing_w": [1.97, 0.04, 0.04] if down else None,
+            "landing_time": self.time if down else None,
+            "separation_time": None,
+        }
 
 
 def made(seed: int, action=(HOVER, 0.0, 0.0, 0.0, 1.0)) -> Direct:
@@ -51,7 +56,10 @@ def test_a_throw_is_scored_by_the_plants_landing():
     found = scored(report, params, report["start"])
     assert found["error"] == pytest.approx(0.05)
     assert found["duration"] == pytest.approx(0.5 + report["latch"] - report["start"], abs=0.01)
-    assert scored({"landing_w": None, "landing_time": None}, params, 0.0) == {"error": None, "duration": None}
+    assert scored({"landing_w": None, "landing_time": None}, params, 0.0) == {
+        "error": None,
+        "duration": None,
+    }
 
 
 def test_the_same_seed_gives_the_same_commands():

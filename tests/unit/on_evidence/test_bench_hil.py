@@ -1,4 +1,6 @@
-"""What ``tests.bench.runner`` makes of its measurements; and, slow, the measurements themselves over UDP."""
+"""What ``tests.bench.runner`` makes of its measurements; and, slow, the measurements themselves
+over UDP.
+"""
 
 import argparse
 import json
@@ -25,15 +27,18 @@ from visthrow.onboard.policy import Policy, find_policy
 
 SOAK_MINUTES = 1.0
 MOST_GROWTH = 100e3
-"""Of the runner's memory [bytes/s]: 6 MB a minute; a list of every tick's record would grow by more. A minute is short for a
-line, the recorder's buffers breathe."""
+"""Of the runner's memory [bytes/s]: 6 MB a minute; a list of every tick's record would grow by
+more. A minute is short for a line, the recorder's buffers breathe.
+"""
 
 
 def test_upper_bound_of_a_ratio_of_pairs():
     """Against the delta method, for pairs that go along with each other."""
     rng = np.random.default_rng(0)
     base = 0.03 + 0.01 * rng.random(400)
-    pairs = np.column_stack((1.1 * base + 0.004 * rng.standard_normal(400), base + 0.004 * rng.standard_normal(400)))
+    pairs = np.column_stack(
+        (1.1 * base + 0.004 * rng.standard_normal(400), base + 0.004 * rng.standard_normal(400))
+    )
     value, upper = hil.bootstrap_upper(pairs)
     rest = pairs[:, 0] - value * pairs[:, 1]
     deviation = rest.std() / pairs[:, 1].mean() / np.sqrt(len(pairs))
@@ -69,13 +74,21 @@ def test_an_interrupted_series_goes_on_where_it_was(tmp_path, monkeypatch):
         if seed == 2 and len(flown) == 3:
             raise KeyboardInterrupt
         return {
-            "way": "wire", "seed": seed, "error": None if seed == 3 else 0.022 + 0.001 * seed, "duration": 1.0, "missed": 0,
-            "missed_ours": 0, "late_periods": 0, "breaches": [],
-        }  # fmt: skip
+            "way": "wire",
+            "seed": seed,
+            "error": None if seed == 3 else 0.022 + 0.001 * seed,
+            "duration": 1.0,
+            "missed": 0,
+            "missed_ours": 0,
+            "late_periods": 0,
+            "breaches": [],
+        }
 
     monkeypatch.setattr(hil_throws, "_direct", direct)
     monkeypatch.setattr(hil_throws, "_over_the_wire", wire)
-    args = argparse.Namespace(throws=4, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0, jobs=1)
+    args = argparse.Namespace(
+        throws=4, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0, jobs=1
+    )
     with pytest.raises(KeyboardInterrupt):
         hil_throws.series(args)
     with (tmp_path / "throws-state.jsonl").open("a") as file:
@@ -84,7 +97,9 @@ def test_an_interrupted_series_goes_on_where_it_was(tmp_path, monkeypatch):
     assert flown == [0, 1, 2, 2, 3], "what was flown is not flown again"
     assert len(hil.json_lines(tmp_path / "throws-state.jsonl")) == 8
     assert report.tables[0].rows[0][1] == "3 of 4"
-    assert report.figures["ratio"] == pytest.approx(np.mean([0.022, 0.023, 0.024]) / np.mean([0.02, 0.021, 0.022]))
+    assert report.figures["ratio"] == pytest.approx(
+        np.mean([0.022, 0.023, 0.024]) / np.mean([0.02, 0.021, 0.022])
+    )
     assert "NOT met" in report.notes[0], "one did not land"
 
 
@@ -109,18 +124,27 @@ def test_throws_side_by_side_share_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(hil_throws, "_direct", direct)
     monkeypatch.setattr(hil_throws, "_over_the_wire", wire)
-    monkeypatch.setattr(hil_processes.os, "sched_getaffinity", lambda _: set(range(20)), raising=False)
-    args = argparse.Namespace(throws=10, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0, jobs=4)
+    monkeypatch.setattr(
+        hil_processes.os, "sched_getaffinity", lambda _: set(range(20)), raising=False
+    )
+    args = argparse.Namespace(
+        throws=10, seed=0, policy="state", out=str(tmp_path), keep_runs=False, speed=1.0, jobs=4
+    )
     assert hil_throws.series(args).figures["seeds"] == list(range(10))
     assert (sorted(flown), len(ports)) == (list(range(10)), 10)
-    assert hil_processes.own_cores(10) == [(None, None)] * 10, "one core is to spare for whoever asks"
+    assert hil_processes.own_cores(10) == [(None, None)] * 10, (
+        "one core is to spare for whoever asks"
+    )
     args.throws = 40
     with pytest.raises(VisthrowError, match="no"):
         hil_throws.series(args)
     assert len(flown) < 20
 
 
-@pytest.mark.parametrize("words", ["--throws 1", "--minutes 0", "--rate 0.1", "--throws 5 --speed 3", "--throws 5 --jobs 0"])
+@pytest.mark.parametrize(
+    "words",
+    ["--throws 1", "--minutes 0", "--rate 0.1", "--throws 5 --speed 3", "--throws 5 --jobs 0"],
+)
 def test_what_cannot_be_measured(words, tmp_path, capsys):
     assert runner.main([*words.split(), "--out", str(tmp_path)]) == 2
     assert "expected" in capsys.readouterr().err
@@ -132,13 +156,24 @@ def test_a_run_that_does_not_start_says_why(tmp_path):
 
 
 def test_a_short_soak_over_udp(tmp_path, capsys):
-    """Three seconds: all is counted, and the fake saw nothing that it should not. Times are for a quiet machine."""
+    """Three seconds: all is counted, and the fake saw nothing that it should not.
+
+    Times are for a quiet machine.
+    """
     out, run = tmp_path / "soak.json", tmp_path / "run"
-    assert runner.main(["--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]) == 0
+    assert (
+        runner.main(
+            ["--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]
+        )
+        == 0
+    )
     figures = json.loads(out.read_text())["figures"]
     assert figures["ticks"] > 50
     assert figures["breaches"] == []
-    assert all(figures["latency_ms"][name] for name in ("poll", "estimate", "observation", "policy", "send", "total"))
+    assert all(
+        figures["latency_ms"][name]
+        for name in ("poll", "estimate", "observation", "policy", "send", "total")
+    )
     assert not figures["interrupted"]
     assert hil.json_lines(tmp_path / "soak.jsonl")[0]["memory_bytes"] > 50e6
     assert "within the bars" in capsys.readouterr().out.replace("NOT ", "")
@@ -149,7 +184,9 @@ def test_a_short_soak_over_udp(tmp_path, capsys):
 def test_an_interrupted_soak_tells_what_there_is(tmp_path):
     out = tmp_path / "soak.json"
     words = ["--minutes", "0.3", "--json", str(out), "--out", str(tmp_path)]
-    bench = subprocess.Popen([sys.executable, "-m", "tests.bench.runner", *words], stdout=subprocess.PIPE, text=True)
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "tests.bench.runner", *words], stdout=subprocess.PIPE, text=True
+    )
     end = time.monotonic() + 120.0
     while not (tmp_path / "soak.jsonl").is_file() and time.monotonic() < end:
         time.sleep(0.2)
@@ -165,8 +202,12 @@ def test_an_interrupted_soak_tells_what_there_is(tmp_path):
 
 @pytest.mark.slow
 def test_a_minute_at_200_hz(tmp_path):
-    """No tick of ours is missed and memory stays flat; how long a tick takes is for a quiet machine to say."""
-    args = argparse.Namespace(minutes=SOAK_MINUTES, rate=200.0, policy="vision", core=None, keep=None, out=str(tmp_path))
+    """No tick of ours is missed and memory stays flat; how long a tick takes is for a quiet machine
+    to say.
+    """
+    args = argparse.Namespace(
+        minutes=SOAK_MINUTES, rate=200.0, policy="vision", core=None, keep=None, out=str(tmp_path)
+    )
     figures = hil_soak.soak(args).figures
     assert figures["ticks"] + figures["missed"] >= 60 * 50 * SOAK_MINUTES
     assert figures["missed_ours"] == 0
@@ -176,38 +217,55 @@ def test_a_minute_at_200_hz(tmp_path):
 
 
 TOLD = (
-    *(f"{name}{where}" for name in ("ctrl-c", "sigterm", "sighup") for where in ("", "-in-hover")), "time-over",
-)  # fmt: skip
+    *(f"{name}{where}" for name in ("ctrl-c", "sigterm", "sighup") for where in ("", "-in-hover")),
+    "time-over",
+)
 """Ways for a run to end that it hears of."""
 
-ITSELF = {"ardupilot": "levelled: no set-points", "px4": "left OFFBOARD: no set-points",
-          "betaflight": "override: the pilot's sticks count again"}  # fmt: skip
+ITSELF = {
+    "ardupilot": "levelled: no set-points",
+    "px4": "left OFFBOARD: no set-points",
+    "betaflight": "override: the pilot's sticks count again",
+}
 """What each kind does by itself when nobody speaks any more."""
 
 LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
 
 FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double", "late", "disk-full"}
 ENDS = {
-    **dict.fromkeys(("stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quaternion"), ("recover", "abort")),
+    **dict.fromkeys(
+        ("stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quaternion"),
+        ("recover", "abort"),
+    ),
     **dict.fromkeys(("reset", "stuck", "in-progress", "no-answer"), ("recover", "abort")),
     **dict.fromkeys(("payload-lost", "rare"), ("recover",)),
-    **dict.fromkeys(("silent", "taken", "not-armed", "no-numbers", "denied", *TOLD, "ctrl-c-twice"), ("abort",)), "limits": ("throw",),
-    "killed": (), "killed-in-hover": (),
-    "no-arming": ("ready", "abort"), "very-late": (), "slow-mechanism": ("refused",),
-}  # fmt: skip
+    **dict.fromkeys(
+        ("silent", "taken", "not-armed", "no-numbers", "denied", *TOLD, "ctrl-c-twice"), ("abort",)
+    ),
+    "limits": ("throw",),
+    "killed": (),
+    "killed-in-hover": (),
+    "no-arming": ("ready", "abort"),
+    "very-late": (),
+    "slow-mechanism": ("refused",),
+}
 """By fault what the runner does from then on, in this order, maybe with more between and after."""
 
 
 @pytest.mark.slow
 def test_every_fault_over_udp(tmp_path):
-    """The same outcomes between two processes as in lock step (tests/loopback); times are the machine's."""
+    """The same outcomes between two processes as in lock step (tests/loopback); times are the
+    machine's.
+    """
     out = tmp_path / "faults.json"
     assert runner.main(["--faults", "--speed", "0.5", "--json", str(out)]) == 0
     figures = json.loads(out.read_text())["figures"]
     assert set(figures) == set(hil_faults.known_cases()) == FLOWN_THROUGH | set(ENDS)
     for name, found in figures.items():
         assert found["breaches"] == [], name
-        assert found["releases"] <= (name in ("stuck", "in-progress", "denied")) or name == "no-answer", name
+        assert (
+            found["releases"] <= (name in ("stuck", "in-progress", "denied")) or name == "no-answer"
+        ), name
         steps = iter(step["what"].split()[0].rstrip(":") for step in found["states"])
         assert all(wanted in steps for wanted in ENDS.get(name, ())), (name, found["states"])
         case = hil_faults.known_cases()[name]
@@ -221,11 +279,19 @@ def test_every_fault_over_udp(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_every_way_to_end_a_run_over_udp(kind, tmp_path):
-    """In hover and in throw: it lands, or does by itself what the table says; the summary is there."""
+    """In hover and in throw: it lands, or does by itself what the table says; the
+    summary is there.
+    """
     out, names = tmp_path / "faults.json", (*TOLD, "ctrl-c-twice", "killed", "killed-in-hover")
-    assert runner.main(["--faults", *names, "--kind", kind, "--speed", "0.5", "--json", str(out)]) == 0
+    assert (
+        runner.main(["--faults", *names, "--kind", kind, "--speed", "0.5", "--json", str(out)]) == 0
+    )
     figures = json.loads(out.read_text())["figures"]
-    assert set(figures) == set(names) == {name for name, case in hil_faults.known_cases().items() if case.ends}
+    assert (
+        set(figures)
+        == set(names)
+        == {name for name, case in hil_faults.known_cases().items() if case.ends}
+    )
     for name, found in figures.items():
         assert (found["breaches"], found["releases"]) == ([], 0), name
         assert found["summary"] == ("killed" not in name), name
@@ -238,7 +304,12 @@ def test_every_way_to_end_a_run_over_udp(kind, tmp_path):
             assert found["states"][0]["what"].startswith("abort"), name
 
 
-@pytest.mark.parametrize("words", [["swop"], ["none", "--jobs", "0"], ["none", "--speed", "2"], ["none", "--kind", "px4"]])
+@pytest.mark.parametrize(
+    "words",
+    [["swop"], ["none", "--jobs", "0"], ["none", "--speed", "2"], ["none", "--kind", "px4"]],
+)
 def test_faults_that_cannot_be_injected(words, capsys):
     assert runner.main(["--faults", *words]) == 2
-    assert re.search("did you mean 'swap'|expected 1 or more, and|expected ctrl-c, ", capsys.readouterr().err)
+    assert re.search(
+        "did you mean 'swap'|expected 1 or more, and|expected ctrl-c, ", capsys.readouterr().err
+    )

@@ -1,4 +1,6 @@
-"""What closes the loop, but for flights and trainings: recording, extending, counting what was won back."""
+"""What closes the loop, but for flights and trainings: recording, extending, counting what was won
+back.
+"""
 
 import json
 from pathlib import Path
@@ -19,7 +21,11 @@ from visthrow.throws.loading import load_policy
 def throws(error: float, failed: int = 0) -> dict:
     """A hundred throws of about this error, some of which did not land."""
     spread = 1.0 + 0.1 * np.cos(np.arange(100))
-    return {"error": list(error * spread), "success": [i >= failed for i in range(100)], "duration": [1.0] * 100}
+    return {
+        "error": list(error * spread),
+        "success": [i >= failed for i in range(100)],
+        "duration": [1.0] * 100,
+    }
 
 
 def test_share_won_back_by_hand():
@@ -34,19 +40,25 @@ def test_throws_that_did_not_land_do_not_count():
     part["error"][:40] = [np.inf] * 40
     assert len(loop.landed(part)) == 60
     none = throws(0.1, failed=100)
-    assert np.isnan(loop.recovered({"before": none, "after": throws(0.1), "oracle": throws(0.1)})["share"])
+    assert np.isnan(
+        loop.recovered({"before": none, "after": throws(0.1), "oracle": throws(0.1)})["share"]
+    )
 
 
 ABLATIONS = {
-    "no_aerodynamics": "aerodynamics", "no_motor_lag": "motor_lag", "rigid_cable": "rope_flexible",
+    "no_aerodynamics": "aerodynamics",
+    "no_motor_lag": "motor_lag",
+    "rigid_cable": "rope_flexible",
     "simple_controller": "controller_kind",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("base", "effect"), ABLATIONS.items())
 def test_a_model_that_lacks_a_block_becomes_the_whole_one_by_its_effect(base, effect):
     """What is hidden from an ablated model is the paper's plant, to the last number."""
-    whole, ablated = (config.load(Experiment, config.find("train", name)) for name in ("state", f"state_{base}"))
+    whole, ablated = (
+        config.load(Experiment, config.find("train", name)) for name in ("state", f"state_{base}")
+    )
     assert ablated != whole
     found = loop.extended(ablated, {effect: 1.0})
     assert (found.vehicle, found.rope, found.task) == (whole.vehicle, whole.rope, whole.task)
@@ -54,11 +66,19 @@ def test_a_model_that_lacks_a_block_becomes_the_whole_one_by_its_effect(base, ef
 
 @pytest.mark.parametrize("theta", [{"motor_tau": 0.019}, {}], ids=["named", "failed"])
 def test_the_round(theta, tmp_path, monkeypatch):
-    """Stages in their order; the oracle is trained and flown whatever the diagnosis says, the other only if it names a cause."""
+    """Stages in their order; the oracle is trained and flown whatever the diagnosis says, the other
+    only if it names a cause.
+    """
     trained, errors = [], {"before": 0.10, "after": 0.04, "oracle": 0.02}
     monkeypatch.setattr(loop.Loop, "_train", lambda self, name, say: trained.append(name))
-    monkeypatch.setattr(loop.Loop, "_flights", lambda self, truth, say: [truth.vehicle.motor.time_constant])
-    monkeypatch.setattr(loop.Loop, "_diagnose", lambda self, logs, say: {"overall": "KNOWN", "theta": theta, "logs": logs})
+    monkeypatch.setattr(
+        loop.Loop, "_flights", lambda self, truth, say: [truth.vehicle.motor.time_constant]
+    )
+    monkeypatch.setattr(
+        loop.Loop,
+        "_diagnose",
+        lambda self, logs, say: {"overall": "KNOWN", "theta": theta, "logs": logs},
+    )
     monkeypatch.setattr(loop.Loop, "_throws", lambda self, name, policy, say: throws(errors[name]))
     record = loop.Loop({"motor_tau": 0.02}, tmp_path).run(lambda line: None)
     nominal = config.load(Experiment, config.find("train", "state")).vehicle.motor.time_constant
@@ -103,19 +123,27 @@ def test_poses_are_recorded_with_the_noise_of_motion_capture_and_nothing_true():
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
     place = np.zeros((len(time), 3))
     channels = {
-        "pos_w": Channel(time, place, "m", "world"), "payload_pos_w": Channel(time, place, "m", "world"),
-        "quat_wb": Channel(time, level, "1", "world"), "vel_w": Channel(time, place, "m/s", "world"),
+        "pos_w": Channel(time, place, "m", "world"),
+        "payload_pos_w": Channel(time, place, "m", "world"),
+        "quat_wb": Channel(time, level, "1", "world"),
+        "vel_w": Channel(time, place, "m/s", "world"),
         "command": Channel(time, np.tile([2.7, 0.0, 0.0, 0.0], (len(time), 1)), "N, rad/s", "body"),
         "release_command": Channel(time, np.zeros(len(time)), "1"),
-    }  # fmt: skip
-    meta = {"times": {"policy_start": 2.0, "landing": 38.0, "end": 40.0}, "policy": "state", "plant": "reference"}
+    }
+    meta = {
+        "times": {"policy_start": 2.0, "landing": 38.0, "end": 40.0},
+        "policy": "state",
+        "plant": "reference",
+    }
     seen = loop.recorded(FlightLog(channels, meta), np.random.default_rng(0))
     assert set(seen.channels) == {"pos_w", "payload_pos_w", "quat_wb", "command", "release_command"}
     assert seen["pos_w"].time[0] >= 2.0 - loop.BEFORE
     assert seen["payload_pos_w"].time[-1] <= 38.0 < seen["pos_w"].time[-1]
     for name in ("pos_w", "payload_pos_w"):
         assert seen[name].values.std() == pytest.approx(loop.NOISE[name], rel=0.05)
-    assert 2.0 * seen["quat_wb"].values[:, :3].std() == pytest.approx(loop.NOISE["quat_wb"], rel=0.05)
+    assert 2.0 * seen["quat_wb"].values[:, :3].std() == pytest.approx(
+        loop.NOISE["quat_wb"], rel=0.05
+    )
 
 
 def record_of(errors: dict, **more) -> dict:
@@ -128,13 +156,20 @@ def record_of(errors: dict, **more) -> dict:
 def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
     mine = tmp_path / "mine"
     mine.mkdir()
-    (mine / loop.RECORD).write_text(json.dumps(record_of({"before": 0.10, "after": 0.04, "oracle": 0.02}, base="state_no_delay")))
+    (mine / loop.RECORD).write_text(
+        json.dumps(
+            record_of({"before": 0.10, "after": 0.04, "oracle": 0.02}, base="state_no_delay")
+        )
+    )
     text = loop.table(loop.read([mine]))
     assert "| motor_tau +0.02 (state_no_delay) | motor_tau +0.019 | 100 [" in text
     assert "| 75 % [" in text
     harmless = record_of({"before": 0.0201, "after": 0.02, "oracle": 0.02})
     assert "nothing was lost" in loop.table([harmless])
-    lost = record_of({"before": 0.02, "after": 0.02, "oracle": 0.02}, recovered=dict.fromkeys(("share", "low", "high")))
+    lost = record_of(
+        {"before": 0.02, "after": 0.02, "oracle": 0.02},
+        recovered=dict.fromkeys(("share", "low", "high")),
+    )
     assert loop.table([lost]).endswith("| - |")
     assert loop.picture([harmless])[:4] == b"\x89PNG"
     with pytest.raises(DiagnoseError, match="no such record"):
@@ -148,7 +183,9 @@ def test_finished_loops_are_shown_and_others_refused(tmp_path, monkeypatch):
 
 
 def test_throws_side_by_side_come_down_at_their_goals():
-    """Each of a batch flies to its own goal, asks for its own release, and is logged as one flight."""
+    """Each of a batch flies to its own goal, asks for its own release, and is logged as
+    one flight.
+    """
     goals = np.array([[1.4, 0.0, 0.0], [0.0, -1.2, 0.0]])
     logs = ablations.throws(load_policy("state"), "hybrid", goals, 0)
     for goal, log in zip(goals, logs):
@@ -160,7 +197,9 @@ def test_throws_side_by_side_come_down_at_their_goals():
         assert np.ptp(apart[log["pos_w"].time < begin]) < 0.01  # hangs still
         seen = loop.recorded(log, np.random.default_rng(0))
         assert "landing" not in seen
-        assert recorded.record_of(seen, 0).latch == pytest.approx(log["release_command"].time[asked][0])
+        assert recorded.record_of(seen, 0).latch == pytest.approx(
+            log["release_command"].time[asked][0]
+        )
     assert np.linalg.norm(logs[0]["landing"].values - logs[1]["landing"].values) > 1.0
 
 
@@ -172,20 +211,34 @@ def test_a_batch_that_does_not_come_down_is_an_error(monkeypatch):
 
 @pytest.fixture
 def ablated(monkeypatch):
-    """A round without flights: every block is named but the rope's; what was asked for is counted."""
+    """A round without flights: every block is named but the rope's; what was asked for
+    is counted.
+    """
     asked = []
 
     def explained(logs, base, answer, device, say):
         asked.append((base, len(logs)))
         name = ablations.LACKS[base.removeprefix("state_")]
-        theta = {} if name == "rope_flexible" else {name: 1.0, **({"com_x": 1e-3} if name == "motor_lag" else {})}
+        theta = (
+            {}
+            if name == "rope_flexible"
+            else {name: 1.0, **({"com_x": 1e-3} if name == "motor_lag" else {})}
+        )
         findings = [{"name": n, "nats": 100.0} for n in theta]
-        return {"overall": "KNOWN", "theta": theta, "findings": findings, "seconds": 9.0, "reasons": [], "threshold": 10.0}
+        return {
+            "overall": "KNOWN",
+            "theta": theta,
+            "findings": findings,
+            "seconds": 9.0,
+            "reasons": [],
+            "threshold": 10.0,
+        }
 
     def held(base, theta, lacks, logs, device):
         asked.append((lacks, len(logs)))
         return {"before": 50.0, "after": 1.0 if theta else 50.0, "samples": 9} | {
-            f"landing_{who}": off for who, off in (("before", 0.08), ("after", 0.002), ("whole", None))
+            f"landing_{who}": off
+            for who, off in (("before", 0.08), ("after", 0.002), ("whole", None))
         }
 
     paths = lambda self, say: [Path(f"{i}.npz") for i in range(self.flights + self.held)]  # noqa: E731
@@ -201,7 +254,10 @@ def test_models_that_lack_a_block_are_held_against_the_same_flights(tmp_path, ab
         assert (f"state_{base}", 4) in ablated
         assert (lacks, 2) in ablated
     text = ablations.table(ablations.read(tmp_path))
-    assert "| controller_kind (state_simple_controller) | controller_kind +1 (100 nats) | KNOWN, named |" in text
+    assert (
+        "| controller_kind (state_simple_controller) | controller_kind +1 (100 nats) | KNOWN,"
+        " named |" in text
+    )
     assert "| 50 -> 1 | 80 -> 2 | 9 |" in text
     assert "KNOWN, named, with others" in text
     assert "nothing | KNOWN, not named" in text

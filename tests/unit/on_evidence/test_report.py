@@ -1,4 +1,6 @@
-"""The report: questions to the book, statistics in its tables, what it says where something is missing, and the page."""
+"""The report: questions to the book, statistics in its tables, what it says where something is
+missing, and the page.
+"""
 
 import re
 import subprocess
@@ -39,7 +41,9 @@ def grids(section) -> list[Grid]:
 
 
 def texts(section, kind: str) -> str:
-    return "\n".join(part.text for part in section.parts if isinstance(part, Text) and part.kind == kind)
+    return "\n".join(
+        part.text for part in section.parts if isinstance(part, Text) and part.kind == kind
+    )
 
 
 def only(*found) -> result_set.ResultSet:
@@ -62,7 +66,11 @@ def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
     for batch in (0, 1):
         one = made_up.policy(rng, "state", "state", "reference", 2.0, count=4)
         parts.append(Result({**one.unit, "batch": batch}, one.columns, made_up.MADE))
-    old = Result({**parts[0].unit, "batch": 2, "protocol": results.PROTOCOL - 1}, parts[0].columns, made_up.MADE)
+    old = Result(
+        {**parts[0].unit, "batch": 2, "protocol": results.PROTOCOL - 1},
+        parts[0].columns,
+        made_up.MADE,
+    )
     results.pack([*parts, old], tmp_path / "throws" / "x.json")
     (tmp_path / "findings").mkdir()
     (tmp_path / "findings" / "front.md").write_text("Why.\n")
@@ -74,9 +82,18 @@ def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
 def test_every_section_is_complete_when_everything_was_thrown(written):
     _, sections = written
     assert [s.name for s in sections] == [
-        "throws", "vision", "ablations", "baseline", "front", "gap", "beyond", "training", "origin",
-    ]  # fmt: skip
-    # The made-up baseline does not fly there, nobody trained with drag, and step times come from the records of bench.
+        "throws",
+        "vision",
+        "ablations",
+        "baseline",
+        "front",
+        "gap",
+        "beyond",
+        "training",
+        "origin",
+    ]
+    # The made-up baseline does not fly there, nobody trained with drag, and step times come from
+    # the records of bench.
     allowed = ("realistic reference plant", "drag", "step times")
     for section in sections:
         for part in texts(section, "missing").split("; "):
@@ -93,7 +110,11 @@ def test_an_empty_book_says_everything_that_is_missing(tmp_path):
 
 
 def test_policies_stand_beside_the_papers_vehicle(full):
-    rows = [row for row in grids(throws.throws_section(full))[0].rows if row[:3] == ("state", "2.0", "training simulator")]
+    rows = [
+        row
+        for row in grids(throws.throws_section(full))[0].rows
+        if row[:3] == ("state", "2.0", "training simulator")
+    ]
     ours = full.shipped("state", "hybrid", 2.0).of("error").mean()
     assert rows[0][5].startswith(f"{ours:.3f} [")
     assert rows[0][-1] == "0.105 ± 0.099, 1.154 ± 0.015"
@@ -110,15 +131,35 @@ def test_difference_of_vision_has_the_right_sign():
 
 
 def test_ablation_ratio_bias_and_the_verdict():
-    """Twice the spread is twice the error; a shift along the throw is told as overshoot; equal spread as no effect."""
+    """Twice the spread is twice the error; a shift along the throw is told as overshoot; equal
+    spread as no effect.
+    """
     rng = np.random.default_rng(2)
 
     def trained(variant: str, spread: float, offset=(0.0, 0.0)) -> list[Result]:
-        return [made_up.policy(rng, f"{variant}-{seed}", "state", "reference-realistic", 2.0, spread, offset, variant=variant,
-                               train_seed=seed, count=200) for seed in (1, 2, 3)]  # fmt: skip
+        return [
+            made_up.policy(
+                rng,
+                f"{variant}-{seed}",
+                "state",
+                "reference-realistic",
+                2.0,
+                spread,
+                offset,
+                variant=variant,
+                train_seed=seed,
+                count=200,
+            )
+            for seed in (1, 2, 3)
+        ]
 
     cable = trained("rigid_cable", 0.02, (0.1, 0.0))
-    found = only(*trained("full", 0.02), *trained("no_motor_lag", 0.04), *cable, *trained("no_aerodynamics", 0.02))
+    found = only(
+        *trained("full", 0.02),
+        *trained("no_motor_lag", 0.04),
+        *cable,
+        *trained("no_aerodynamics", 0.02),
+    )
     section = ablations.section(found)
     rows = {row[0]: row for row in grids(section)[0].rows}
     assert float(rows["no motor lag"][5].split(" [")[0]) == pytest.approx(2.0, abs=0.15)
@@ -138,7 +179,10 @@ def test_front_tells_honestly_who_beats_whom(full):
         found = made_up.baseline(rng, "hybrid", "both", 2.0, speed=2.2, **setting)
         return texts(trade.front_section(only(policy, found)), "finding")
 
-    assert "no setting is both as accurate and as fast; the policy is faster than every setting" in told(error=0.03, duration=1.5)
+    assert (
+        "no setting is both as accurate and as fast; the policy is faster than every setting"
+        in told(error=0.03, duration=1.5)
+    )
     assert "1 of 1 setting as accurate and as fast at once" in told(error=0.004, duration=1.0)
     assert "none of 1 setting landed all its throws" in told(error=0.004, duration=1.0, lost=1)
 
@@ -159,9 +203,23 @@ def test_curves_hold_the_policys_own_value(full):
 
 
 def test_bars_are_judged_by_the_mean(full):
-    said = "\n".join(part.text for part in beyond.section(full).parts if isinstance(part, Text) and part.kind == "finding")
+    said = "\n".join(
+        part.text
+        for part in beyond.section(full).parts
+        if isinstance(part, Text) and part.kind == "finding"
+    )
     assert re.search(r"state_moving-1 at targets.*under 0\.12 m, reached", said)
-    high = only(made_up.policy(np.random.default_rng(5), "state_payload-1", "state", "hybrid", 2.0, 0.2, variant="payload"))
+    high = only(
+        made_up.policy(
+            np.random.default_rng(5),
+            "state_payload-1",
+            "state",
+            "hybrid",
+            2.0,
+            0.2,
+            variant="payload",
+        )
+    )
     assert "missed by" in texts(beyond.section(high), "finding")
 
 
@@ -190,7 +248,10 @@ def test_the_command_reports_from_records(tmp_path, full, capsys):
     assert "0 trainings" in printed
     assert (out / "report.html").stat().st_size > 50_000
     for option in ("--results", "--records"):
-        assert cli.main(["report", option, str(tmp_path / "none"), "--out", str(tmp_path / "other")]) == 2
+        assert (
+            cli.main(["report", option, str(tmp_path / "none"), "--out", str(tmp_path / "other")])
+            == 2
+        )
         assert "no such folder" in capsys.readouterr().err
         assert cli.main(["report", option, str(tmp_path), "--out", str(tmp_path / "other")]) == 2
         assert "in it; expected" in capsys.readouterr().err
@@ -200,7 +261,11 @@ def test_the_command_reports_from_records(tmp_path, full, capsys):
 def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch):
     pytest.importorskip("piqp")
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr(baseline_record, "full", lambda: [thrower.unit(thrower.OWN, "none", target, 1) for target in (1.5, 2.0)])
+    monkeypatch.setattr(
+        baseline_record,
+        "full",
+        lambda: [thrower.unit(thrower.OWN, "none", target, 1) for target in (1.5, 2.0)],
+    )
     words = ["--records", str(tmp_path / "records"), "--out", str(tmp_path / "out")]
     record = tmp_path / "records" / "throws" / "baseline.json"
     results.pack([], record)
@@ -252,14 +317,17 @@ from visthrow.baseline import spline, thrower
 from visthrow.cli import report
 spline.LONGEST = (1.4,)
 report.QUICK_LIST = sys.argv[1]
-report.quick_units = lambda: [thrower.unit("pendulum", "none", target, 1) for target in (1.5, 2.0, 2.5)]
+targets = (1.5, 2.0, 2.5)
+report.quick_units = lambda: [thrower.unit("pendulum", "none", r, 1) for r in targets]
 sys.exit(cli.main(["report", "--quick", "--jobs", "1", "--out", sys.argv[2]]))
 """
 
 
 @pytest.mark.slow
 def test_quick_report_killed_and_started_again_repeats_nothing(tmp_path):
-    """SIGKILL in the policies' throws, then in the baseline's: what was there stays as it is, the rest is added."""
+    """SIGKILL in the policies' throws, then in the baseline's: what was there stays as it is, the
+    rest is added.
+    """
     pytest.importorskip("piqp")
     (tmp_path / "tiny.toml").write_text(QUICK)
     command = [sys.executable, "-c", DRIVER, str(tmp_path / "tiny.toml"), str(tmp_path / "out")]
@@ -268,7 +336,11 @@ def test_quick_report_killed_and_started_again_repeats_nothing(tmp_path):
     for least in (1, 4):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         deadline = time.monotonic() + 300.0
-        while time.monotonic() < deadline and process.poll() is None and len(list(units.glob("*.json"))) < least:
+        while (
+            time.monotonic() < deadline
+            and process.poll() is None
+            and len(list(units.glob("*.json"))) < least
+        ):
             time.sleep(0.01)
         process.kill()
         process.wait()

@@ -1,4 +1,6 @@
-"""Sweeps: what counts as the same run, what is done, who works on what, and what is written down of it."""
+"""Sweeps: what counts as the same run, what is done, who works on what, and what is written down of
+it.
+"""
 
 import json
 import signal
@@ -55,9 +57,19 @@ def finish(source, out):
     """Leave what a finished training leaves, around a shipped policy."""
     folder = source.folder(out)
     folder.mkdir(parents=True)
-    (folder / units.POLICY).write_bytes(units.find_policy("state").read_bytes() + source.name.encode())
-    rows = [{"target": t, "error_mean": 0.02, "duration_mean": 1.0, "success": 1.0} for t in (1.5, 2.0)]
-    made = {"commit": "c", "command": "visthrow train", "versions": {}, "processors": {"cpu": "x"}, "figures": {"throws": rows}}
+    (folder / units.POLICY).write_bytes(
+        units.find_policy("state").read_bytes() + source.name.encode()
+    )
+    rows = [
+        {"target": t, "error_mean": 0.02, "duration_mean": 1.0, "success": 1.0} for t in (1.5, 2.0)
+    ]
+    made = {
+        "commit": "c",
+        "command": "visthrow train",
+        "versions": {},
+        "processors": {"cpu": "x"},
+        "figures": {"throws": rows},
+    }
     write_json(folder / units.SUMMARY, made)
     header = "iteration,released,landing_error,duration,rollout_s,learning_s,wall_s\n"
     (folder / units.PROGRESS).write_text(header + "1,1,0.5,1,0.25,0.5,1\n2,1,0.25,1,0.25,0.5,2\n")
@@ -67,17 +79,30 @@ def finish(source, out):
 def throw(unit, out):
     """Leave what throws leave."""
     count = unit.count
-    columns = {"success": np.ones(count, bool), "landing_w": np.full((count, 2), unit.target), "error": np.zeros(count)}
+    columns = {
+        "success": np.ones(count, bool),
+        "landing_w": np.full((count, 2), unit.target),
+        "error": np.zeros(count),
+    }
     results.save(units.throws_folder(out), results.Result(unit.unit(out), columns))
 
 
 def test_order_is_the_lists_and_batches_are_the_protocols(path):
     work = load_list(path)
-    assert [source.name for source in work.sources] == ["state", "state-1", "state_rigid_cable-1", "state-2", "state_rigid_cable-2"]
+    assert [source.name for source in work.sources] == [
+        "state",
+        "state-1",
+        "state_rigid_cable-1",
+        "state-2",
+        "state_rigid_cable-2",
+    ]
     first = work.throws[work.sources[1].id]
     assert [(u.set, u.target, u.batch, u.count) for u in first] == [
-        ("own", 1.5, None, 3), ("own", 2.0, None, 3), ("transfer", 2.0, 0, 100), ("transfer", 2.0, 1, 50),
-    ]  # fmt: skip
+        ("own", 1.5, None, 3),
+        ("own", 2.0, None, 3),
+        ("transfer", 2.0, 0, 100),
+        ("transfer", 2.0, 1, 50),
+    ]
 
 
 def test_a_run_is_its_resolved_config_and_seed(path):
@@ -96,17 +121,28 @@ def test_a_run_is_its_resolved_config_and_seed(path):
 def test_runs_that_differ_by_changes_alone_are_kept_apart(tmp_path):
     """A list of one change at a time: a name and a line of the record for each."""
     groups = {"plain": (), "discount": ("ppo.discount=0.98",), "spread": ("ppo.initial_std=0.3",)}
-    runs = {name: RunGroup(throws=(), configs=("state",), changes=changes) for name, changes in groups.items()}
+    runs = {
+        name: RunGroup(throws=(), configs=("state",), changes=changes)
+        for name, changes in groups.items()
+    }
     work = expand("changes", SweepList(runs=runs, throws={}))
-    assert [source.name for source in work.sources] == ["state-1", "state-discount-1", "state-spread-1"]
+    assert [source.name for source in work.sources] == [
+        "state-1",
+        "state-discount-1",
+        "state-spread-1",
+    ]
     for source in work.sources:
         finish(source, tmp_path)
     training, _ = collect(work, tmp_path, tmp_path / "records")
-    assert [run["name"] for run in json.loads(training.read_text())["runs"]] == [source.name for source in work.sources]
+    assert [run["name"] for run in json.loads(training.read_text())["runs"]] == [
+        source.name for source in work.sources
+    ]
 
 
 def test_a_field_added_later_changes_no_key(path):
-    """Keys are made of what differs from a default: a schema that grows does not train everything anew."""
+    """Keys are made of what differs from a default: a schema that grows does not train everything
+    anew.
+    """
     source = load_list(path).sources[1]
     stated = config.to_dict(source.experiment(), defaults=False)
     del stated["vehicle"]["battery"]
@@ -121,10 +157,17 @@ def test_departures_are_what_differs_from_the_training(path, tmp_path):
     work = load_list(path)
     source = work.sources[2]
     finish(source, tmp_path)
-    own, transfer = work.throws[source.id][0].unit(tmp_path), work.throws[source.id][2].unit(tmp_path)
+    own, transfer = (
+        work.throws[source.id][0].unit(tmp_path),
+        work.throws[source.id][2].unit(tmp_path),
+    )
     assert own["departures"] == {}
     assert transfer["departures"] == {"rope.segments": 15}
-    assert (transfer["variant"], transfer["run"], transfer["train_seed"]) == ("rigid_cable", "state_rigid_cable", 1)
+    assert (transfer["variant"], transfer["run"], transfer["train_seed"]) == (
+        "rigid_cable",
+        "state_rigid_cable",
+        1,
+    )
     shipped = work.throws["state"][0].unit(tmp_path)
     assert (shipped["variant"], shipped["train_seed"], shipped["departures"]) == ("full", None, {})
 
@@ -142,7 +185,9 @@ def test_another_policy_under_the_same_name_is_thrown_again(path, tmp_path):
 
 
 class FakeStarter:
-    """Starts nothing: a task is done by leaving its files, fails, or is busy for a while, as told."""
+    """Starts nothing: a task is done by leaving its files, fails, or is busy for a
+    while, as told.
+    """
 
     def __init__(self, work, out, devices, jobs, fails=(), busy=()):
         self.work, self.out, self.devices, self.jobs = work, out, devices, jobs
@@ -160,7 +205,13 @@ class FakeStarter:
 
 class FakeRun:
     def __init__(self, starter, task):
-        self.starter, self.task, self.polls, self.status, self.stopped = starter, task, 0, None, False
+        self.starter, self.task, self.polls, self.status, self.stopped = (
+            starter,
+            task,
+            0,
+            None,
+            False,
+        )
 
     def poll(self):
         self.polls += 1
@@ -206,7 +257,9 @@ def test_everything_is_done_once_and_no_more_at_once_than_there_is_room(path, tm
     starter, outcome = run(path, tmp_path)
     assert outcome == pool.Outcome()
     names = [name for name, _ in starter.started]
-    assert len(names) == len(set(names)) == 5 + 4 * 2, "five policies, four of them with two batches on the reference plant"
+    assert len(names) == len(set(names)) == 5 + 4 * 2, (
+        "five policies, four of them with two batches on the reference plant"
+    )
     assert starter.most[True] == 2
     assert starter.most[False] <= 3
     assert names[:2] == ["state", load_list(path).sources[1].id]
@@ -244,7 +297,9 @@ def test_the_time_limit_stops_what_runs(path, tmp_path, monkeypatch):
 
 def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
     path = tmp_path / "locks" / "a.lock"
-    code = "import time; from pathlib import Path; from visthrow.evidence.sweep.work import locked\n"
+    code = (
+        "import time; from pathlib import Path; from visthrow.evidence.sweep.work import locked\n"
+    )
     code += f"with locked(Path({str(path)!r})): print(1, flush=True); time.sleep(60)"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
@@ -265,7 +320,10 @@ def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
 
 
 def test_a_folder_in_which_nothing_is_done_makes_no_record(path, tmp_path):
-    with pytest.raises(StorageError, match=r"nothing of the list .* is done there; expected what 'visthrow sweep run"):
+    with pytest.raises(
+        StorageError,
+        match=r"nothing of the list .* is done there; expected what 'visthrow sweep run",
+    ):
         collect(load_list(path), tmp_path / "nothing", tmp_path / "records")
     assert not (tmp_path / "records").exists()
 
@@ -280,16 +338,27 @@ def test_records_join_what_two_machines_did(path, tmp_path):
                 throw(unit, out)
         training, throws = collect(work, out, records)
     runs = json.loads(training.read_text())["runs"]
-    assert [r["name"] for r in runs] == ["state-1", "state_rigid_cable-1", "state-2", "state_rigid_cable-2"]
+    assert [r["name"] for r in runs] == [
+        "state-1",
+        "state_rigid_cable-1",
+        "state-2",
+        "state_rigid_cable-2",
+    ]
     assert runs[0]["curve"] == [[192, 0.75, 0.5], [384, 1.5, 0.25]]
-    assert (runs[0]["seconds"], runs[0]["wall_s"], runs[0]["final"]["error_mean"]) == (1.5, 3.0, 0.02)
+    assert (runs[0]["seconds"], runs[0]["wall_s"], runs[0]["final"]["error_mean"]) == (
+        1.5,
+        3.0,
+        0.02,
+    )
     found = results.load(throws)
     assert len(found) == 4 * 4
     before = throws.read_text()
     collect(work, there, records)
     assert throws.read_text() == before
     policy = work.sources[3].policy(there)
-    policy.write_bytes(policy.read_bytes() + b"x")  # trained anew: the old throws are of another policy
+    policy.write_bytes(
+        policy.read_bytes() + b"x"
+    )  # trained anew: the old throws are of another policy
     units._hash.cache_clear()
     for unit in work.throws[work.sources[3].id]:
         throw(unit, there)
@@ -309,7 +378,22 @@ def test_status_and_mistakes_on_the_command_line(path, tmp_path, capsys):
     assert "did you mean 'paper'" in capsys.readouterr().err
     assert cli.main(["sweep", "run", path, "--minutes", "0"]) == 2
     assert "expected more than 0" in capsys.readouterr().err
-    assert cli.main(["sweep", "run", path, "--slurm", "partition=gpu", "--devices", "cuda:0", "--minutes", "9"]) == 2
+    assert (
+        cli.main(
+            [
+                "sweep",
+                "run",
+                path,
+                "--slurm",
+                "partition=gpu",
+                "--devices",
+                "cuda:0",
+                "--minutes",
+                "9",
+            ]
+        )
+        == 2
+    )
     assert "the number of GPUs" in capsys.readouterr().err
 
 
@@ -336,7 +420,10 @@ def test_shipped_lists_name_what_exists():
     ablations = ("no_aerodynamics", "no_motor_lag", "simple_controller", "rigid_cable")
     for name in ("state", "vision_ideal", *(f"state_{ablation}" for ablation in ablations)):
         assert sorted(s.seed for s in paper if s.config == name) == [1, 2, 3], name
-    assert sum(s.iterations * (0.142 if s.config.startswith("state") else 0.153) for s in paper) < 3 * 3600, "hours of one H200"
+    assert (
+        sum(s.iterations * (0.142 if s.config.startswith("state") else 0.153) for s in paper)
+        < 3 * 3600
+    ), "hours of one H200"
 
 
 def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
@@ -361,23 +448,45 @@ def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
     assert cluster.Job(Ended(None), "a", lost).poll() is None
     assert cluster.Job(Ended(0), "a", lost).poll() == 0
     assert cluster.Job(Ended(utils.FailedJobError("raised")), "a", lost).poll() == 1
-    gone = [cluster.Job(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll() for _ in range(4)]
+    gone = [
+        cluster.Job(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll()
+        for _ in range(4)
+    ]
     assert gone == [pool.EXIT_STOPPED] * cluster.LOST_AT_MOST + [1]
 
 
 def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, capsys):
-    """A stand-in for sbatch keeps the script that it is given; where there is no Slurm, that is said."""
+    """A stand-in for sbatch keeps the script that it is given; where there is no Slurm, that is
+    said.
+    """
     pytest.importorskip("submitit")
     from visthrow.evidence.sweep.cluster import Cluster
 
-    words = ["sweep", "run", path, "--out", str(tmp_path / "out"), "--slurm", "partition=gpu", "--devices", "2", "--minutes", "9"]
+    words = [
+        "sweep",
+        "run",
+        path,
+        "--out",
+        str(tmp_path / "out"),
+        "--slurm",
+        "partition=gpu",
+        "--devices",
+        "2",
+        "--minutes",
+        "9",
+    ]
     monkeypatch.setenv("PATH", str(tmp_path))
     assert cli.main(words) == 2
     assert "no jobs can be submitted from here" in capsys.readouterr().err
-    for name, text in (("srun", ""), ("sbatch", f"/bin/cat $1 >> {tmp_path}/script; echo Submitted batch job 7")):
+    for name, text in (
+        ("srun", ""),
+        ("sbatch", f"/bin/cat $1 >> {tmp_path}/script; echo Submitted batch job 7"),
+    ):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
-    cluster = Cluster(path, tmp_path / "out", "slurm", 2, 1, 9.0, options={"slurm_partition": "gpu"})
+    cluster = Cluster(
+        path, tmp_path / "out", "slurm", 2, 1, 9.0, options={"slurm_partition": "gpu"}
+    )
     assert cluster.devices == ["job 0", "job 1"]
     cluster.start(pool.Task("state-1", ("state-1",), gpu=True), "job 0", None)
     script = (tmp_path / "script").read_text()

@@ -1,4 +1,6 @@
-"""Where a payload is said to land: closed forms, and what is done about releases that lead astray."""
+"""Where a payload is said to land: closed forms, and what is done about releases that
+lead astray.
+"""
 
 import math
 
@@ -35,7 +37,9 @@ def fallen(pos, vel, drag):
 
     down.terminal, down.direction = True, -1.0
     start = [*(np.array(pos) + AHEAD * np.array(vel)), *vel]
-    return solve_ivp(motion, (0.0, 5.0), start, events=down, rtol=1e-10, atol=1e-12).y_events[0][0, :2]
+    return solve_ivp(motion, (0.0, 5.0), start, events=down, rtol=1e-10, atol=1e-12).y_events[0][
+        0, :2
+    ]
 
 
 @pytest.mark.parametrize("drag", [0.0, 1.04e-3])
@@ -63,30 +67,47 @@ def test_what_is_held_back_and_when_it_is_given_up():
     assert (aim.given_up(1.49), aim.given_up(1.51), aim.held) == (False, True, 2)
     aim.begin()
     assert not aim.given_up(9.0)
-    assert Aim(None, AHEAD, HEIGHT, ROPE).astray(1.0, bad, goal) is None, "without a table all is let go"
+    assert Aim(None, AHEAD, HEIGHT, ROPE).astray(1.0, bad, goal) is None, (
+        "without a table all is let go"
+    )
 
 
-@pytest.mark.parametrize("wrong", [{"bound": 0.0, "patience": 0.4}, {"bound": 0.5, "patience": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"bound": 0.0, "patience": 0.4}, {"bound": 0.5, "patience": -1.0}]
+)
 def test_numbers_that_hold_nothing_back(wrong):
     with pytest.raises(ConfigError, match="expected above 0"):
         AimParams(**wrong)
 
 
-@pytest.mark.parametrize("path", sorted(config.find("hil", "fake").parent.glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(config.find("hil", "fake").parent.glob("*.toml")), ids=lambda path: path.stem
+)
 def test_every_shipped_run_holds_back_what_leads_astray(path):
     assert config.load(HilParams, path).aim == AimParams(bound=0.5, patience=1.0)
 
 
 def test_a_policy_that_asks_in_hover_never_releases():
-    """It asks at every tick; the throw ends after the patience, and the vehicle hovers on with its payload."""
-    runner = Runner(params("aim.bound=0.8", "aim.patience=0.3"), simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0)), Spy())
+    """It asks at every tick; the throw ends after the patience, and the vehicle hovers on with its
+    payload.
+    """
+    runner = Runner(
+        params("aim.bound=0.8", "aim.patience=0.3"),
+        simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0)),
+        Spy(),
+    )
     decisions = fly(runner, 5.0)
     asked = [d for d in decisions if d.note.startswith("release refused: it would land at")]
     assert runner.backend.release_times == []
     assert asked[-1].time - asked[0].time == pytest.approx(0.28, abs=0.021)
-    assert all(d.observation[19] < 0.5 for d in asked), "the policy is told of no release: there was none"
+    assert all(d.observation[19] < 0.5 for d in asked), (
+        "the policy is told of no release: there was none"
+    )
     states = [d.state for d in decisions]
     assert states[decisions.index(asked[-1]) + 1] == "recover"
-    assert decisions[decisions.index(asked[-1]) + 1].reason == "the policy released where it would miss"
+    assert (
+        decisions[decisions.index(asked[-1]) + 1].reason
+        == "the policy released where it would miss"
+    )
     assert runner.summary()["held_back"] == len(asked)
     assert "abort" not in states

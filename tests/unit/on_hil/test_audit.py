@@ -1,8 +1,19 @@
-"""The parameter audit: asked for until told, judged, written only where the operator said so, and the release's book-keeping."""
+"""The parameter audit: asked for until told, judged, written only where the operator said so, and
+the release's book-keeping.
+"""
 
 import pytest
 
-from hil.links.backends.audit import GIVE_UP, GIVE_UP_OPTIONAL, NO_SUCH_PARAMETER, Audit, Rule, bits, equal, within
+from hil.links.backends.audit import (
+    GIVE_UP,
+    GIVE_UP_OPTIONAL,
+    NO_SUCH_PARAMETER,
+    Audit,
+    Rule,
+    bits,
+    equal,
+    within,
+)
 from hil.links.backends.base import ACCEPTED, FAILED, IDLE, PENDING, Release
 
 RULES = (
@@ -15,7 +26,9 @@ GOOD = {"GUID_OPTIONS": 13.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 1.0, "FIXE
 
 
 def audit(values, write=False):
-    """An audit of a vehicle with these parameters: the audit, what was asked and written, the tables shown."""
+    """An audit of a vehicle with these parameters: the audit, what was asked and written, the
+    tables shown.
+    """
     values, asked, written, tables = dict(values), [], [], []
     box = []
 
@@ -71,7 +84,9 @@ def test_a_parameter_that_is_not_told_is_a_mismatch():
 
 
 def test_writing_keeps_other_bits_and_is_read_back():
-    found, _, written, tables, _ = audit({**GOOD, "GUID_OPTIONS": 5.0, "GUID_TIMEOUT": 3.0}, write=True)
+    found, _, written, tables, _ = audit(
+        {**GOOD, "GUID_OPTIONS": 5.0, "GUID_TIMEOUT": 3.0}, write=True
+    )
     assert (found.problems, sorted(written)) == ([], [("GUID_OPTIONS", 13), ("GUID_TIMEOUT", 0.5)])
     assert tables[0].count("(written)") == 2
 
@@ -83,7 +98,9 @@ def test_what_cannot_be_written_stays_wrong():
 
 def test_a_vehicle_that_does_not_take_the_value_is_not_written_for_ever():
     sent = []
-    stubborn = Audit(RULES[1:2], lambda name: stubborn.feed(name, 1.0), lambda name, value: sent.append(value))
+    stubborn = Audit(
+        RULES[1:2], lambda name: stubborn.feed(name, 1.0), lambda name, value: sent.append(value)
+    )
     for i in range(400):
         stubborn.service(0.02 * i)
     assert (sent, stubborn.problems) == ([0.0], ["ATC_ANGLE_BOOST is 1; expected 0"])
@@ -116,7 +133,11 @@ def test_in_progress_is_pending_and_ends_by_the_time_out():
     release.due(0.0)
     release.answer(None)
     assert (sends(release, 0.49, 0.01), release.state) == ([], PENDING)
-    assert (sends(release, 0.6, 0.49), release.state, release.note) == ([], FAILED, "no final answer within 0.5 s")
+    assert (sends(release, 0.6, 0.49), release.state, release.note) == (
+        [],
+        FAILED,
+        "no final answer within 0.5 s",
+    )
     release.answer(True)
     assert release.state == FAILED, "too late is too late"
 
@@ -149,7 +170,10 @@ def test_an_output_that_stood_open_all_along_has_not_moved():
     release.answer(True)
     release.output(True)
     sends(release, 0.6)
-    assert (release.state, release.note) == (FAILED, "accepted, but the output was not seen closed before within 0.5 s")
+    assert (release.state, release.note) == (
+        FAILED,
+        "accepted, but the output was not seen closed before within 0.5 s",
+    )
 
 
 def test_an_unknown_parameter_is_called_that_and_not_asked_for_again():

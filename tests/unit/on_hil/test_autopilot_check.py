@@ -51,7 +51,9 @@ def test_the_hover_of_a_run_is_its_weight(run):
 
 
 @pytest.mark.parametrize(("factor", "good"), [(1.05, True), (1.12, False), (0.85, False)])
-def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(run, tmp_path, factor, good):
+def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
+    run, tmp_path, factor, good
+):
     lines = [json.loads(line) for line in (run / TICKS).read_text().splitlines()]
     for line in lines:
         if line["command"]:
@@ -73,7 +75,9 @@ def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
     with pytest.raises(RunError, match="no folder of a run; expected"):
         hover_of_run(tmp_path)
     (tmp_path / TICKS).write_text("")
-    with pytest.raises(RunError, match="0 ticks of steady hover before throws; expected 50 or more"):
+    with pytest.raises(
+        RunError, match="0 ticks of steady hover before throws; expected 50 or more"
+    ):
         hover_of_run(tmp_path)
 
 
@@ -92,5 +96,7 @@ def test_an_autopilot_without_settings_to_audit_is_listened_to(capsys):
     check = AutopilotCheck(params, Crazyflie(pipe()[0], params.crazyflie))
     runner = Runner(params, Policy.load(find_policy("state")), DryRun())
     check.tick(0.0, runner)
-    assert check.results(0.0, runner.mass) == [(True, f"hover share not measured: 0 of {LEAST_SHARES} values in steady hover")]
+    assert check.results(0.0, runner.mass) == [
+        (True, f"hover share not measured: 0 of {LEAST_SHARES} values in steady hover")
+    ]
     assert capsys.readouterr().out == "", "there is no table to show"

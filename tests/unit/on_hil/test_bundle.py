@@ -1,4 +1,6 @@
-"""A run that ended other than well: one file that replays it, and where it went wrong in a sentence."""
+"""A run that ended other than well: one file that replays it, and where it went wrong in a
+sentence.
+"""
 
 import errno
 import shutil
@@ -76,7 +78,10 @@ def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
     folder = shutil.copytree(aborted[0], tmp_path / "none")
     (folder / "ticks.jsonl").write_text("")
     assert main(["hil", "replay", str(folder)]) == 1
-    assert capsys.readouterr().out.splitlines()[-1] == "Whether it went wrong is not known: no tick is recorded."
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == "Whether it went wrong is not known: no tick is recorded."
+    )
 
 
 def test_what_is_no_bundle(tmp_path, capsys):
@@ -86,7 +91,10 @@ def test_what_is_no_bundle(tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as bundle:
         bundle.writestr("holiday.txt", "x")
     assert main(["hil", "replay", str(tmp_path / "other.zip")]) == 2
-    assert "other.zip: no bundle of a run, it holds holiday.txt; expected config.toml" in capsys.readouterr().err
+    assert (
+        "other.zip: no bundle of a run, it holds holiday.txt; expected config.toml"
+        in capsys.readouterr().err
+    )
     with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
         bundle.writestr("../outside.txt", "x")
     assert main(["hil", "replay", str(tmp_path / "out.zip")]) == 2

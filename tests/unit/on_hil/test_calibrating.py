@@ -1,4 +1,6 @@
-"""The runner calibrates a camera that is mounted off and late, in the simulator's hover, uses that, and refuses what is too far."""
+"""The runner calibrates a camera that is mounted off and late, in the simulator's hover, uses that,
+and refuses what is too far.
+"""
 
 import math
 import re
@@ -31,7 +33,11 @@ DELAY = 0.03
 """Of a frame, stated [s]; it is older than that by LATENCY."""
 SCALE = 0.02
 """Relative error of the focal length."""
-OURS = [f"frames.{b}.{k}" for b in ("vehicle", "payload") for k in ('axes="x,y,z"', 'body_axes="x,y,z"', 'quaternion="xyzw"')]
+OURS = [
+    f"frames.{b}.{k}"
+    for b in ("vehicle", "payload")
+    for k in ('axes="x,y,z"', 'body_axes="x,y,z"', 'quaternion="xyzw"')
+]
 
 
 def run_params(*overrides: str) -> HilParams:
@@ -40,11 +46,17 @@ def run_params(*overrides: str) -> HilParams:
 
 
 class Hall:
-    """The simulator's vehicle, motion capture with half a millimetre of noise, and a camera that is mounted off and late."""
+    """The simulator's vehicle, motion capture with half a millimetre of noise, and a camera that is
+    mounted off and late.
+    """
 
     def __init__(self, runner: Runner, tilt_deg=TILT_DEG, latency: float = LATENCY) -> None:
         experiment = load_policy(runner.params.policy).experiment
-        self.runner, self.plant, self.rng = runner, WirePlant(experiment, 1), np.random.default_rng(3)
+        self.runner, self.plant, self.rng = (
+            runner,
+            WirePlant(experiment, 1),
+            np.random.default_rng(3),
+        )
         self.camera = KeypointCamera(runner.params.camera, dtype=torch.float64)
         turn = rotation_from_vector(torch.deg2rad(torch.tensor(tilt_deg, dtype=torch.float64)))
         self.rot_cb, self.late = (self.camera.rot_cb @ turn.T).numpy(), DELAY + latency
@@ -67,8 +79,14 @@ class Hall:
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
         lens, radius = self.camera.fisheye, self.runner.params.camera.payload_radius
         seen = (1.0 + SCALE) * lens.project_normalized(torch.from_numpy(unit))[0]
-        unit = lens.unproject(lens.denormalize(seen))[0].numpy()  # a detector knows the nominal lens
-        return Detection(now - DELAY, tuple(map(tuple, unit[:4].tolist())), (*unit[4].tolist(), math.asin(radius / far[4])))
+        unit = lens.unproject(lens.denormalize(seen))[
+            0
+        ].numpy()  # a detector knows the nominal lens
+        return Detection(
+            now - DELAY,
+            tuple(map(tuple, unit[:4].tolist())),
+            (*unit[4].tolist(), math.asin(radius / far[4])),
+        )
 
     def release(self, when: float) -> None:
         """The back-end's: the mechanism opens."""
@@ -79,30 +97,56 @@ class Hall:
             poses = []
             for k in range(4):
                 self.plant.step(self.command, self.released)
-                now, state = self.plant.time, {name: np.array(value) for name, value in self.plant.state.items()}
+                now, state = (
+                    self.plant.time,
+                    {name: np.array(value) for name, value in self.plant.state.items()},
+                )
                 self.path.append((now, state))
                 if k % 2 == 1:
                     _, old = min(self.path, key=lambda row: abs(row[0] - (now - 0.01)))
                     noise = 5e-4 * self.rng.standard_normal((2, 3))
                     poses += [
-                        Pose(now - 0.01, now, "vehicle", tuple((old["pos_w"] + noise[0]).tolist()), tuple(old["quat_wb"].tolist())),
-                        Pose(now - 0.01, now, "payload", tuple((old["payload_pos_w"] + noise[1]).tolist()), (0.0, 0.0, 0.0, 1.0)),
+                        Pose(
+                            now - 0.01,
+                            now,
+                            "vehicle",
+                            tuple((old["pos_w"] + noise[0]).tolist()),
+                            tuple(old["quat_wb"].tolist()),
+                        ),
+                        Pose(
+                            now - 0.01,
+                            now,
+                            "payload",
+                            tuple((old["payload_pos_w"] + noise[1]).tolist()),
+                            (0.0, 0.0, 0.0, 1.0),
+                        ),
                     ]
             if now > self.late + 0.02:
                 self.runner.look([self.detection(now)])
             if (due := self.runner.calibrating.due()) is not None:
                 p = self.runner.params
-                self.runner.calibrated(solved(due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads))
-            decision = self.runner.tick(now, poses, self.runner.backend.status(now), OperatorInput(arm=arm))
+                self.runner.calibrated(
+                    solved(due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads)
+                )
+            decision = self.runner.tick(
+                now, poses, self.runner.backend.status(now), OperatorInput(arm=arm)
+            )
             self.decisions.append(decision)
             if decision.command is not None:
                 self.command = np.array(decision.command)
 
     def off(self) -> float:
-        """RMS of what the policy would be shown now from what the camera of training would see [-]."""
+        """RMS of what the policy would be shown now from what the camera of training
+        would see [-].
+        """
         _, state = min(self.path, key=lambda row: abs(row[0] - (self.plant.time - 0.01)))
-        tensors = [torch.tensor(state[name][None]).double() for name in ("pos_w", "quat_wb", "payload_pos_w")]
-        true, _ = keypoints(self.camera, tensors[0], rotation_from_quat(tensors[1]), self.goal, tensors[2])
+        tensors = [
+            torch.tensor(state[name][None]).double()
+            for name in ("pos_w", "quat_wb", "payload_pos_w")
+        ]
+        true, _ = keypoints(
+            self.camera, tensors[0], rotation_from_quat(tensors[1]), self.goal, tensors[2]
+        )
         shown, valid = self.runner.detections.keypoints(self.plant.time)
         assert valid.all()
         return float(np.sqrt(np.square(shown - true.numpy()).mean()))
@@ -135,7 +179,10 @@ def test_tilt_latency_and_thrust_are_found_in_the_runners_own_hover(hall):
 
 
 def test_what_is_shown_to_the_policy_is_corrected(hall):
-    """Before: 3 deg of tilt are 0.03 of the image, a part of it on each axis. After: the noise is left, and the swing of 54 ms."""
+    """Before: 3 deg of tilt are 0.03 of the image, a part of it on each axis.
+
+    After: the noise is left, and the swing of 54 ms.
+    """
     assert hall.before > 0.015
     assert hall.off() < hall.before / 2.5
     assert not hall.runner.calibrating.problems()
@@ -147,7 +194,10 @@ def test_the_throw_waits_and_is_refused_where_the_camera_is_too_far_off(hall):
     calibrating = hall.runner.calibrating
     trained, calibrating.params = calibrating.params, replace(calibrating.params, most_tilt_deg=2.0)
     hall.fly(0.2, arm=True)
-    assert re.search(r"camera tilted by 2\.[1-4] deg, 2 at most: outside of what was trained", hall.decisions[-1].waits)
+    assert re.search(
+        r"camera tilted by 2\.[1-4] deg, 2 at most: outside of what was trained",
+        hall.decisions[-1].waits,
+    )
     assert {d.state for d in hall.decisions} <= {"idle", "check", "ready"}
     calibrating.params = trained
     hall.fly(0.2, arm=True)
@@ -169,10 +219,12 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     calibrating.take("the ball was not seen")
     assert calibrating.problems() == ["calibrating in the hover again: the ball was not seen"]
     for broken, said in (
-        ({"turn_sigma": (0.02, 1e-3, 1e-3)}, "known to 1.15 deg"), ({"latency": 0.08}, "80 ms late"),
-        ({"latency_sigma": 0.01}, "known to 10.0 ms"), ({"thrust": 0.85}, "thrust 0.85 of the commanded"),
+        ({"turn_sigma": (0.02, 1e-3, 1e-3)}, "known to 1.15 deg"),
+        ({"latency": 0.08}, "80 ms late"),
+        ({"latency_sigma": 0.01}, "known to 10.0 ms"),
+        ({"thrust": 0.85}, "thrust 0.85 of the commanded"),
         ({"scale": -0.08}, "focal length off by 8.0 %"),
-    ):  # fmt: skip
+    ):
         calibrating.take(replace(fine, **broken))
         assert said in "; ".join(calibrating.problems())
     calibrating.take(fine)
@@ -191,9 +243,18 @@ def test_a_hover_that_shows_too_little_is_told():
     rows = 100
     still = np.tile([0.0, 0.0, 1.3], (rows, 1))
     hovered = Hovered(
-        np.arange(rows) * 0.02, still, np.tile([0.0, 0.0, 0.0, 1.0], (rows, 1)), 0 * still, 0 * still, np.full(rows, 2.6),
-        np.zeros((rows, 8, 2)), np.zeros((rows, 8), bool), np.array([2.0, 0.0, 0.0]),
-    )  # fmt: skip
-    assert "the ball seen in 0 % of them; expected 75 or more, and 50 %" in solved(hovered, params.camera, contract, Spreads())
+        np.arange(rows) * 0.02,
+        still,
+        np.tile([0.0, 0.0, 0.0, 1.0], (rows, 1)),
+        0 * still,
+        0 * still,
+        np.full(rows, 2.6),
+        np.zeros((rows, 8, 2)),
+        np.zeros((rows, 8), bool),
+        np.array([2.0, 0.0, 0.0]),
+    )
+    assert "the ball seen in 0 % of them; expected 75 or more, and 50 %" in solved(
+        hovered, params.camera, contract, Spreads()
+    )
     broken = replace(hovered, valid=np.ones((rows, 8), bool), thrust=np.full(rows, 1e150))
     assert "no finite answer" in str(solved(broken, params.camera, contract, Spreads()))

@@ -7,7 +7,9 @@ from visthrow.cli import main
 
 
 def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):
-    """Millimetres that a bridge sends as metres; the source is none of the recorded kinds, whose files are refused."""
+    """Millimetres that a bridge sends as metres; the source is none of the recorded kinds, whose
+    files are refused.
+    """
     poses = []
     for i in range(200):
         t = 0.01 * i
@@ -15,7 +17,13 @@ def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):
             poses.append(Pose(t, t, body, (300.0 * t, 0.0, z), (0.0, 0.0, 0.0, 1.0)))
     opened = (Recorded(poses), None, True)
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened)
-    command = ["hil", "check", "--seconds", "1.9", *(word for setting in OURS for word in ("--set", setting))]
+    command = [
+        "hil",
+        "check",
+        "--seconds",
+        "1.9",
+        *(word for setting in OURS for word in ("--set", setting)),
+    ]
     assert main(command) == 1
     out = capsys.readouterr().out
     assert "FAIL  pos_w: 300 m/s" in out

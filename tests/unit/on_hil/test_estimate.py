@@ -21,7 +21,9 @@ def run(params, times, position, attitude=None):
     out = []
     for t in times:
         quat = None if attitude is None else tuple(map(float, attitude(t).as_quat()))
-        vel = slopes.update(Pose(float(t), float(t), "vehicle", tuple(map(float, position(t))), quat))
+        vel = slopes.update(
+            Pose(float(t), float(t), "vehicle", tuple(map(float, position(t))), quat)
+        )
         out.append((vel, slopes.rate))
     return slopes, out
 
@@ -34,7 +36,11 @@ def window(samples: int) -> float:
 @pytest.mark.parametrize("samples", [2, 3, 5, 8])
 def test_a_lines_lag_is_half_its_window(samples):
     acceleration = np.array([3.0, -1.0, 5.0])
-    slopes, out = run(EstimateParams(window(samples), 1), PERIOD * np.arange(30), lambda t: 0.5 * acceleration * t * t)
+    slopes, out = run(
+        EstimateParams(window(samples), 1),
+        PERIOD * np.arange(30),
+        lambda t: 0.5 * acceleration * t * t,
+    )
     lag = (samples - 1) * PERIOD / 2
     assert slopes.lag == pytest.approx(lag, abs=ROUNDING)
     np.testing.assert_allclose(out[-1][0], acceleration * (29 * PERIOD - lag), atol=ROUNDING)
@@ -53,7 +59,9 @@ def test_noise_is_what_the_weights_say():
     """A line over n even samples: sigma sqrt(12 / (n (n^2 - 1))) / T."""
     n = 5
     weights = fit_weights([i * PERIOD for i in range(n)], 1)[0]
-    assert np.sqrt(np.sum(np.square(weights))) == pytest.approx(np.sqrt(12 / (n * (n * n - 1))) / PERIOD)
+    assert np.sqrt(np.sum(np.square(weights))) == pytest.approx(
+        np.sqrt(12 / (n * (n * n - 1))) / PERIOD
+    )
 
 
 def test_body_rate_of_a_steady_turn():
@@ -71,7 +79,9 @@ def test_body_rate_of_a_steady_turn():
 
 def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
     slopes = SlopeFilter(EstimateParams(window(3), 1))
-    given = Pose(0.0, 0.0, "vehicle", (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    given = Pose(
+        0.0, 0.0, "vehicle", (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)
+    )
     assert slopes.update(given) == (1.0, 2.0, 3.0)
     assert slopes.rate == (4.0, 5.0, 6.0)
     assert slopes.lag == 0.0
@@ -81,7 +91,9 @@ def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
 
 
 def test_the_window_is_one_of_time():
-    """Twice the poses a second give twice the samples and so less noise; a source too slow for it keeps what the order needs."""
+    """Twice the poses a second give twice the samples and so less noise; a source too slow for it
+    keeps what the order needs.
+    """
     for period, count in ((0.005, 12), (0.01, 6), (0.04, 3)):
         slopes = SlopeFilter(EstimateParams(0.055, 2))
         for i in range(40):
@@ -96,22 +108,35 @@ def test_wrong_parameters():
 
 
 def test_spin_of_a_turn_that_quickens():
-    """About a fixed axis at 3 + 20 t rad/s a parabola finds both exactly; a line knows no change."""
+    """About a fixed axis at 3 + 20 t rad/s a parabola finds both exactly; a line knows
+    no change.
+    """
     slopes, out = run(
-        EstimateParams(window(6), 2), PERIOD * np.arange(8), lambda t: np.zeros(3),
+        EstimateParams(window(6), 2),
+        PERIOD * np.arange(8),
+        lambda t: np.zeros(3),
         lambda t: Rotation.from_rotvec([0.0, 3.0 * t + 10.0 * t * t, 0.0]),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(out[-1][1], (0.0, 3.0 + 20.0 * 7 * PERIOD, 0.0), atol=1e-6)
     np.testing.assert_allclose(slopes.spin, (0.0, 20.0, 0.0), atol=1e-4)
-    slopes, _ = run(EstimateParams(window(6), 1), PERIOD * np.arange(8), lambda t: np.zeros(3), lambda t: Rotation.identity())
+    slopes, _ = run(
+        EstimateParams(window(6), 1),
+        PERIOD * np.arange(8),
+        lambda t: np.zeros(3),
+        lambda t: Rotation.identity(),
+    )
     assert slopes.spin == (0.0, 0.0, 0.0)
 
 
 def test_a_state_is_carried_forward_with_a_share_of_its_accelerations():
-    """A body that falls and turns ever faster: place and attitude with its velocities, these with half of what they change by."""
+    """A body that falls and turns ever faster: place and attitude with its velocities, these with
+    half of what they change by.
+    """
     frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
     gate = GateParams(0.02, 10.0, 50.0, 3.0, 50.0, 0.3, 0.04, 0.1, 0.25)
-    track, bare = (Track(frames, gate, EstimateParams(window(6), 2), turns) for turns in (True, False))
+    track, bare = (
+        Track(frames, gate, EstimateParams(window(6), 2), turns) for turns in (True, False)
+    )
     for i in range(8):
         t = i * PERIOD
         quat = tuple(Rotation.from_rotvec([0.0, 3.0 * t + 10.0 * t * t, 0.0]).as_quat())
@@ -120,7 +145,11 @@ def test_a_state_is_carried_forward_with_a_share_of_its_accelerations():
     now, ahead = 7 * PERIOD, 0.02
     state = track.state(now, ahead)
     np.testing.assert_allclose(state.vel, (0.0, 0.0, -10.0 * (now + TRUST * ahead)), atol=1e-6)
-    np.testing.assert_allclose(state.rate, (0.0, 3.0 + 20.0 * (now + TRUST * ahead), 0.0), atol=1e-4)
-    np.testing.assert_allclose(state.pos, (0.0, 0.0, 5.0 - 5.0 * now**2 - 10.0 * now * ahead), atol=1e-6)
+    np.testing.assert_allclose(
+        state.rate, (0.0, 3.0 + 20.0 * (now + TRUST * ahead), 0.0), atol=1e-4
+    )
+    np.testing.assert_allclose(
+        state.pos, (0.0, 0.0, 5.0 - 5.0 * now**2 - 10.0 * now * ahead), atol=1e-6
+    )
     assert bare.state(now, ahead).rate == (0.0, 0.0, 0.0)
     assert track.state(now, 0.0).vel == pytest.approx((0.0, 0.0, -10.0 * now))

@@ -1,4 +1,6 @@
-"""The parts of the fakes: the witness catches what it is there for, options are checked, the MSP port takes peer after peer."""
+"""The parts of the fakes: the witness catches what it is there for, options are checked, the MSP
+port takes peer after peer.
+"""
 
 import math
 import socket
@@ -70,10 +72,14 @@ def test_the_witness_catches_releases(armed, payload_w, answered, text):
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.017])
 def test_set_points_and_releases_act_when_they_come(delay):
-    """Within a period of the plant, after the kind's delay: the vehicle is not the coarser for its periods."""
+    """Within a period of the plant, after the kind's delay: the vehicle is not the coarser for its
+    periods.
+    """
     here, there = pipe()
     plant, link = LevelPlant(), Link(here)
-    fake = make_fake("ardupilot", plant, Link(there, 1, 1), options=read_options([f"command_delay={delay}"]))
+    fake = make_fake(
+        "ardupilot", plant, Link(there, 1, 1), options=read_options([f"command_delay={delay}"])
+    )
     period, came, rates = plant.period, [0.0013, 0.0213, 0.0229], [0.0, 2.0, -1.0]
     at = 0.0
     fake.wall = lambda: at
@@ -84,7 +90,11 @@ def test_set_points_and_releases_act_when_they_come(delay):
                 fake.hear()
         at = 0.0537
         if n == 10:
-            link.send(mav.MAVLink_command_long_message(1, 1, mav.MAV_CMD_DO_GRIPPER, 0, 1, 0, 0, 0, 0, 0, 0))
+            link.send(
+                mav.MAVLink_command_long_message(
+                    1, 1, mav.MAV_CMD_DO_GRIPPER, 0, 1, 0, 0, 0, 0, 0, 0
+                )
+            )
             fake.hear()
         fake.step()
     flown = np.array(plant.commands)[:, 1]
@@ -117,7 +127,11 @@ def test_a_fake_reports_what_its_witness_saw():
 
 def test_options_of_a_fake():
     options = read_options(["silent_after=12", "parameters.GUID_OPTIONS=0", "answer=silent"])
-    assert (options.silent_after, options.parameters, options.answer) == (12.0, {"GUID_OPTIONS": 0.0}, "silent")
+    assert (options.silent_after, options.parameters, options.answer) == (
+        12.0,
+        {"GUID_OPTIONS": 0.0},
+        "silent",
+    )
     with pytest.raises(ConfigError, match="did you mean 'silent_after'"):
         read_options(["silent_aftr=12"])
     with pytest.raises(ConfigError, match="expected one of 'accepted', 'in-progress'"):
@@ -133,7 +147,10 @@ def test_the_msp_port_serves_one_peer_after_another():
         probe.bind(("127.0.0.1", 0))
         number = probe.getsockname()[1]
     port = ListeningPort(number)
-    with pytest.raises(LinkError, match=rf"tcp:127\.0\.0\.1:{number}: another program has it.*ss -tlnp.*: --msp-port PORT"):
+    with pytest.raises(
+        LinkError,
+        match=rf"tcp:127\.0\.0\.1:{number}: another program has it.*ss -tlnp.*: --msp-port PORT",
+    ):
         ListeningPort(number, "--msp-port PORT")
     with pytest.raises(LinkError, match="tcp port 99999; expected 1 to 65535"):
         ListeningPort(99_999)

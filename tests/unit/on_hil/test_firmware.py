@@ -1,4 +1,6 @@
-"""The bridge to a firmware, without one: packets, its command line, what is read of its channels."""
+"""The bridge to a firmware, without one: packets, its command line, what is read of its
+channels.
+"""
 
 import dataclasses
 import os
@@ -40,7 +42,9 @@ def free_port(kind=socket.SOCK_STREAM):
 
 def test_samples_are_forward_right_down_and_the_force_turned_round():
     """The firmware's own wrapper: rates FRD, acceleration the negative of FLU, attitude w first."""
-    values = packets.FDM.unpack(packets.sample(1.0, (0.1, 0.2, 0.3), (1.0, 2.0, 9.8), (0.0, 0.1, 0.2, 0.9)))
+    values = packets.FDM.unpack(
+        packets.sample(1.0, (0.1, 0.2, 0.3), (1.0, 2.0, 9.8), (0.0, 0.1, 0.2, 0.9))
+    )
     assert values[1:4] == (0.1, -0.2, -0.3)
     assert values[4:7] == (-1.0, -2.0, -9.8)
     assert values[7:11] == (0.9, 0.0, 0.1, 0.2)
@@ -62,7 +66,8 @@ static void *samples(void *unused) {
         double data[18]; fd_set set; struct timeval most = {0, 100000};
         FD_ZERO(&set); FD_SET(state, &set);
         int ready = select(state + 1, &set, NULL, NULL, &most);
-        if (ready == 1 && recvfrom(state, data, sizeof data, 0, NULL, NULL) == sizeof data) rate = data[1];
+        if (ready != 1) continue;
+        if (recvfrom(state, data, sizeof data, 0, NULL, NULL) == sizeof data) rate = data[1];
     }
 }
 static void *ports(void *unused) {
@@ -70,14 +75,22 @@ static void *ports(void *unused) {
     for (;;) { struct timeval most = {0, 9999}; select(0, NULL, NULL, NULL, &most); }
 }
 int main(int argc, char **argv) {
-    struct sockaddr_in at = {.sin_family = AF_INET}; pthread_t a, b; long turns = 0; double before = 0.0;
-    int port; sscanf(argv[1], "%d", &port); at.sin_port = htons(port); at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    struct sockaddr_in at = {.sin_family = AF_INET};
+    pthread_t a, b;
+    long turns = 0;
+    double before = 0.0;
+    int port;
+    sscanf(argv[1], "%d", &port);
+    at.sin_port = htons(port);
+    at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     pthread_create(&b, NULL, ports, NULL);
     state = socket(AF_INET, SOCK_DGRAM, 0); bind(state, (struct sockaddr *)&at, sizeof at);
     if (!serves) return 1;
     pthread_create(&a, NULL, samples, NULL);
     for (;;) {
-        struct timespec now, nap = {0, 50000}; clock_gettime(CLOCK_MONOTONIC, &now); nanosleep(&nap, NULL);
+        struct timespec now, nap = {0, 50000};
+        clock_gettime(CLOCK_MONOTONIC, &now);
+        nanosleep(&nap, NULL);
         printf("%ld %ld.%09ld %g\n", ++turns, now.tv_sec, now.tv_nsec, rate); fflush(stdout);
         if (rate != before) {
             float motors[4] = {2.0, 3.0, 4.0, rate}; before = rate; at.sin_port = htons(9002);
@@ -86,13 +99,16 @@ int main(int argc, char **argv) {
     }
 }
 """
-"""A program with the firmware's threads: one for samples, one for ports, and a loop that sleeps for 50 us and tells its clock. It opens
-a port only once the thread of ports serves."""
+"""A program with the firmware's threads: one for samples, one for ports, and a loop that sleeps for
+50 us and tells its clock. It opens a port only once the thread of ports serves.
+"""
 
 
 @pytest.fixture
 def stub(tmp_path, monkeypatch):
-    """Run `STUB` in lock step with samples of ours; returns what came of them, and what it printed."""
+    """Run `STUB` in lock step with samples of ours; returns what came of them, and what
+    it printed.
+    """
     if shutil.which("gcc") is None:
         pytest.skip("no C compiler")
     source, program, port = tmp_path / "stub.c", tmp_path / "stub", free_port(socket.SOCK_DGRAM)
@@ -102,9 +118,15 @@ def stub(tmp_path, monkeypatch):
 
     def run(feed):
         stands, said = os.pipe()
-        environment = os.environ | {"LD_PRELOAD": str(firmware.compiled(tmp_path)), "VISTHROW_STANDS": str(said)}
+        environment = os.environ | {
+            "LD_PRELOAD": str(firmware.compiled(tmp_path)),
+            "VISTHROW_STANDS": str(said),
+        }
         command = [program, str(port)]
-        with open(tmp_path / "told.txt", "w") as out, subprocess.Popen(command, env=environment, pass_fds=[said], stdout=out) as process:
+        with (
+            open(tmp_path / "told.txt", "w") as out,
+            subprocess.Popen(command, env=environment, pass_fds=[said], stdout=out) as process,
+        ):
             assert packets.stood(stands, 10.0)
             sensors = packets.Sensors(stands)
             came = feed(sensors)
@@ -119,8 +141,13 @@ def stub(tmp_path, monkeypatch):
 
 
 def test_a_clock_in_lock_step_goes_as_far_as_the_samples_let_it(stub):
-    """Loops of 50.1 us: 2 s after the start it stands still; each packet lets it go on by its period, twice the same in two runs."""
-    told = [stub(lambda sensors: [sensors.rest(period) for period in (0.002, 0.002, 0.010)])[1][-1] for _ in range(2)]
+    """Loops of 50.1 us: 2 s after the start it stands still; each packet lets it go on by its
+    period, twice the same in two runs.
+    """
+    told = [
+        stub(lambda sensors: [sensors.rest(period) for period in (0.002, 0.002, 0.010)])[1][-1]
+        for _ in range(2)
+    ]
     turns, now, _ = told[0]
     assert float(now) == pytest.approx(1.0 + 2.0 + 0.014, abs=1e-4)
     assert int(turns) == pytest.approx(2.014 / 50.1e-6, rel=1e-3)
@@ -128,8 +155,9 @@ def test_a_clock_in_lock_step_goes_as_far_as_the_samples_let_it(stub):
 
 
 def test_samples_of_a_datagram_are_taken_one_after_the_other(stub):
-    """Four samples at once are four of 0.5 ms each, as if they had come alone; each is answered, in our order: front left, front
-    right, rear left, rear right come as 2, 3, 4, 1."""
+    """Four samples at once are four of 0.5 ms each, as if they had come alone; each is answered, in
+    our order: front left, front right, rear left, rear right come as 2, 3, 4, 1.
+    """
     rates = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
     still = np.array([0.0, 0.0, 9.8]), np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -139,9 +167,13 @@ def test_samples_of_a_datagram_are_taken_one_after_the_other(stub):
     came, told = stub(lambda sensors: sensors.send(rates, *still, 0.0005))
     alone, as_told = stub(one_by_one)
     assert told == as_told
-    assert came.tolist() == alone.tolist() == [[4.0, 2.0, 3.0, rate] for rate in (1.0, 2.0, 3.0, 4.0)]
+    assert (
+        came.tolist() == alone.tolist() == [[4.0, 2.0, 3.0, rate] for rate in (1.0, 2.0, 3.0, 4.0)]
+    )
     for rate in (1.0, 2.0, 3.0, 4.0):
-        assert sum(float(words[2]) == rate for words in told) == pytest.approx(0.0005 / 50.1e-6, abs=1.0)
+        assert sum(float(words[2]) == rate for words in told) == pytest.approx(
+            0.0005 / 50.1e-6, abs=1.0
+        )
 
 
 class Answers:
@@ -208,29 +240,41 @@ def test_settings_follow_the_runs_configuration(params):
     assert found["yaw_srate"] == "30"
     assert found["aux 0"] == "0 0 1700 2100 0 0"
     assert "aux 1" not in found
-    override = config.load(HilParams, config.find("hil", "betaflight_sitl"), ["betaflight.arm_channel=0"]).betaflight
+    override = config.load(
+        HilParams, config.find("hil", "betaflight_sitl"), ["betaflight.arm_channel=0"]
+    ).betaflight
     assert needed(override)["msp_override_channels_mask"] == "143"  # sticks and AUX 4
     assert needed(override)["aux 1"].startswith("50 ")
 
 
 def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
-    """What the firmware says by MSP becomes events, and the release's channel opens the mechanism once."""
+    """What the firmware says by MSP becomes events, and the release's channel opens the mechanism
+    once.
+    """
     mine = free_port()
     monkeypatch.setattr(betaflight, "PORTS", (0, mine))
-    monkeypatch.setattr(packets.Sensors, "_run", lambda sensors, data: np.array([[0.4, 0.2, 0.3, 0.1]]))
+    monkeypatch.setattr(
+        packets.Sensors, "_run", lambda sensors, data: np.array([[0.4, 0.2, 0.3, 0.1]])
+    )
     serial = ListeningPort(mine)
     fake = BetaflightSitl(
-        make_motors("vision", 0), Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID), MocapParams(), 0,
-        Options(), params, -1,
-    )  # fmt: skip
+        make_motors("vision", 0),
+        Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID),
+        MocapParams(),
+        0,
+        Options(),
+        params,
+        -1,
+    )
     parser, channels = msp.Parser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]
     flags = [0]
 
     def answer(frame):
         payloads = {
-            msp.BOXIDS: bytes([1, BOX_ARM]), msp.RC: np.array(channels, dtype="<u2").tobytes(),
+            msp.BOXIDS: bytes([1, BOX_ARM]),
+            msp.RC: np.array(channels, dtype="<u2").tobytes(),
             msp.STATUS: bytes([125, 0, 0, 0, 0, 0]) + flags[0].to_bytes(4, "little") + bytes(12),
-        }  # fmt: skip
+        }
         serial.write(msp.pack(msp.Frame(frame.command, payloads[frame.command], msp.ANSWER)))
 
     def turn(count):
@@ -275,7 +319,9 @@ class Listening:
 
 
 def test_commands_and_questions_after_a_release_fit_into_the_firmwares_turns(params):
-    """It takes one in each of 100 turns a second by its default: 50 frames of sticks leave 50 for everything else."""
+    """It takes one in each of 100 turns a second by its default: 50 frames of sticks leave 50 for
+    everything else.
+    """
     port = Listening()
     backend = Betaflight(port, dataclasses.replace(params, release_timeout=5.0, audit=False))
     backend._order, backend._boxes = [0, 1, 2, 3], (BOX_ARM,)

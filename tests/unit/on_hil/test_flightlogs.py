@@ -1,4 +1,6 @@
-"""Flight logs made of run folders: channels, times, release and landing; the view of them, live and recorded."""
+"""Flight logs made of run folders: channels, times, release and landing; the view of them, live and
+recorded.
+"""
 
 import argparse
 import json
@@ -54,9 +56,13 @@ def test_a_log_a_throw_with_what_was_decided(run, logs):
         throw = [d for d in decisions if d.action is not None and d.state == "throw"]
         shown = log["action"].values[np.searchsorted(log["action"].time, latch.time)]
         np.testing.assert_array_equal(shown, next(d for d in throw if d.time == latch.time).action)
-        assert result["error"] == pytest.approx(2.0, abs=0.02), "it falls at its feet, the goal is 2 m away"
+        assert result["error"] == pytest.approx(2.0, abs=0.02), (
+            "it falls at its feet, the goal is 2 m away"
+        )
         fall = math.sqrt(2 * (1.333 - 0.383 - 0.04) / 9.81)
-        assert result["duration"] == pytest.approx(latch.time - times["policy_start"] + LAG + fall, abs=0.03)
+        assert result["duration"] == pytest.approx(
+            latch.time - times["policy_start"] + LAG + fall, abs=0.03
+        )
         assert log["landing"].values[0][2] == pytest.approx(0.04)
         attached = log["attached"]
         assert attached.values[attached.time < times["separation"]].all()
@@ -67,12 +73,17 @@ def test_a_log_a_throw_with_what_was_decided(run, logs):
 
 
 def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
-    """As Betaflight has it while it is not armed: frames go out, motors stand still, and have to spin up."""
+    """As Betaflight has it while it is not armed: frames go out, motors stand still, and have to
+    spin up.
+    """
     folder = shutil.copytree(run[0], tmp_path / "late")
     lines = [json.loads(text) for text in (folder / "ticks.jsonl").read_text().splitlines()]
     first = next(n for n, line in enumerate(lines) if line["command"] is not None)
     lag = read(run[0]).playback.runner.pilot.policy.contract["vehicle"]["motor"]["time_constant"]
-    late = [line["time"] for line in lines[first : first + 3 + math.ceil(flightlogs.SPUN_UP * lag / TICK)]]
+    late = [
+        line["time"]
+        for line in lines[first : first + 3 + math.ceil(flightlogs.SPUN_UP * lag / TICK)]
+    ]
     for line in lines[: first + 3]:
         line["status"][3] = "wait"
     (folder / "ticks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -83,12 +94,24 @@ def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
 
 def test_what_the_other_tools_read_of_it(run, logs, tmp_path):
     log = logs[0]
-    for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "command", "observation", "keypoints", "goal_w"):
+    for name in (
+        "pos_w",
+        "quat_wb",
+        "vel_w",
+        "rate_b",
+        "payload_pos_w",
+        "command",
+        "observation",
+        "keypoints",
+        "goal_w",
+    ):
         assert len(log[name].time) > (5 if name in ("observation", "keypoints") else 50), name
     assert np.median(np.diff(log["pos_w"].time)) == pytest.approx(TICK / 2, abs=1e-6)
     assert np.median(np.diff(log["command"].time)) == pytest.approx(TICK, abs=1e-6)
     worked_out = {"vel_w", "rate_b", "payload_vel_w"}
-    assert set(log.channels) - set(log.measured().channels) == worked_out, "no gyro gave rates: they are the runner's, of the poses"
+    assert set(log.channels) - set(log.measured().channels) == worked_out, (
+        "no gyro gave rates: they are the runner's, of the poses"
+    )
     log.save(tmp_path / "log.npz")
     again = FlightLog.load(tmp_path / "log.npz")
     assert again.meta["events"] == log.meta["events"]
@@ -144,10 +167,16 @@ def test_a_killed_run_and_no_run(tmp_path):
 
 
 def test_where_the_rope_let_go_is_found_in_noisy_poses():
-    """A payload pulled with three times its weight until 0.113 s, then free; 1 mm of noise, 100 Hz, 2 % lost."""
+    """A payload pulled with three times its weight until 0.113 s, then free; 1 mm of noise, 100 Hz,
+    2 % lost.
+    """
     rng, found = np.random.default_rng(0), []
     for _ in range(40):
-        let_go, start, vel = 0.113 + 0.01 * rng.random(), np.array([0.5, 0.0, 1.1]), np.array([4.0, 0.0, 2.0])
+        let_go, start, vel = (
+            0.113 + 0.01 * rng.random(),
+            np.array([0.5, 0.0, 1.1]),
+            np.array([4.0, 0.0, 2.0]),
+        )
         pull = np.array([15.0, 0.0, 20.0])
         times = np.arange(-0.05, 0.5, 0.01) + 0.01 * rng.random()
         times = times[rng.random(len(times)) > 0.02]
@@ -163,7 +192,9 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
 
 
 def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
-    """Let go at 0.11 s from 1.1 m at 4 m/s; it is seen until 60 ms, or 250 ms, before it comes down."""
+    """Let go at 0.11 s from 1.1 m at 4 m/s; it is seen until 60 ms, or 250 ms, before it comes
+    down.
+    """
     fall = math.sqrt(2 * (1.1 - 0.04) / 9.81)
     for before, found in ((0.06, True), (0.25, False)):
         flight = Flight((2.0, 0.0, 0.0), 0.0, 0.0, 0.04, 0.11)
@@ -191,15 +222,27 @@ def test_the_recording_of_a_run_holds_all(run, tmp_path):
     data = (tmp_path / "run.rrd").read_bytes()
     assert data[:4] == b"RRF2"
     entities = stored_entities(tmp_path / "run.rrd")
-    for entity in ("/world/vehicle", "/world/ball", "/world/trail/ball", "/camera/goal", "/camera/payload", "/events",
-                   "/camera/body_axes", "/signals/age/vehicle", "/signals/tick/observation", "/signals/phase/state"):  # fmt: skip
+    for entity in (
+        "/world/vehicle",
+        "/world/ball",
+        "/world/trail/ball",
+        "/camera/goal",
+        "/camera/payload",
+        "/events",
+        "/camera/body_axes",
+        "/signals/age/vehicle",
+        "/signals/tick/observation",
+        "/signals/phase/state",
+    ):
         assert entity in entities, entity
 
 
 def test_the_same_run_as_mcap(run, tmp_path, capsys):
     """`hil view --out run.mcap`, read back by the library's own reader."""
     reader = pytest.importorskip("mcap.reader")
-    assert view.run(argparse.Namespace(folder=run[0], live=False, out=str(tmp_path / "run.mcap"))) == 0
+    assert (
+        view.run(argparse.Namespace(folder=run[0], live=False, out=str(tmp_path / "run.mcap"))) == 0
+    )
     assert "open it with Foxglove" in capsys.readouterr().out
     found = {}
     with (tmp_path / "run.mcap").open("rb") as file:
@@ -235,7 +278,9 @@ class Stream:
 
 
 def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkeypatch):
-    """Lines come bit by bit, cut anywhere; all ticks are played back and the run's end ends the view."""
+    """Lines come bit by bit, cut anywhere; all ticks are played back and the run's end ends the
+    view.
+    """
     monkeypatch.setattr(view, "EVERY", 0.01)
     source, folder = run[0], tmp_path / "live"
     folder.mkdir()
@@ -259,7 +304,9 @@ def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkey
 
     stream, played = Stream(), []
     take = view.Show.take
-    monkeypatch.setattr(view.Show, "take", lambda show, ticks: (played.extend(ticks), take(show, ticks)))
+    monkeypatch.setattr(
+        view.Show, "take", lambda show, ticks: (played.extend(ticks), take(show, ticks))
+    )
     writer = threading.Thread(target=write)
     writer.start()
     dropped = view.follow(folder, stream)
@@ -270,7 +317,8 @@ def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkey
     assert stream.sent["world/trail/ball"] > 2
     assert stream.sent["events"] >= 5
     np.testing.assert_array_equal(
-        [t.decision.command or () for t in played[-5:]], [line["command"] or () for line in ticks[-5:]]
+        [t.decision.command or () for t in played[-5:]],
+        [line["command"] or () for line in ticks[-5:]],
     )
 
 

@@ -19,7 +19,9 @@ EXACT = 1e-14
 """Rounding of a few float64 products of numbers near 1."""
 
 
-def frames(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw=0.0, offset=(0.0, 0.0, 0.0)) -> Frames:
+def frames(
+    axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw=0.0, offset=(0.0, 0.0, 0.0)
+) -> Frames:
     return Frames(FrameParams(axes, body_axes, quaternion, yaw, offset))
 
 
@@ -44,10 +46,14 @@ def test_there_are_24_turns_and_24_mirrors_are_refused():
     for axes in every - set(AXES):
         with pytest.raises(FrameError, match="mirror the world") as caught:
             frames(axes)
-        assert set(str(caught.value).split(": ")[-1].split()) < set(AXES), "what it proposes are turns"
+        assert set(str(caught.value).split(": ")[-1].split()) < set(AXES), (
+            "what it proposes are turns"
+        )
 
 
-@pytest.mark.parametrize("axes", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,x", "xy,z,x", "--x,y,z", "x,,z"])
+@pytest.mark.parametrize(
+    "axes", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,x", "xy,z,x", "--x,y,z", "x,,z"]
+)
 def test_what_is_no_set_of_axes_is_refused(axes):
     with pytest.raises(FrameError, match="expected x, y and z once each"):
         frames(axes)
@@ -83,7 +89,9 @@ def test_every_case_against_matrices(axes):
         pose = random_pose(rng)
         rot = Rotation.from_quat([*pose.quat[1:], pose.quat[0]]).as_matrix()
         ours = convert.pose_from_source(pose)
-        np.testing.assert_allclose(Rotation.from_quat(ours.quat).as_matrix(), world @ rot @ body.T, atol=10 * EXACT)
+        np.testing.assert_allclose(
+            Rotation.from_quat(ours.quat).as_matrix(), world @ rot @ body.T, atol=10 * EXACT
+        )
         np.testing.assert_allclose(ours.pos, world @ pose.pos, atol=10 * EXACT)
         np.testing.assert_allclose(ours.vel, world @ pose.vel, atol=10 * EXACT)
         np.testing.assert_allclose(ours.rate, body @ pose.rate, atol=10 * EXACT)
@@ -97,7 +105,15 @@ def test_our_own_frame_changes_no_bit():
 
 
 def test_level_and_north_in_mavlink_is_level_and_ahead_here():
-    level = Pose(0.0, 0.0, "vehicle", (1.0, 2.0, -3.0), (1.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.1, 0.2, 0.3))
+    level = Pose(
+        0.0,
+        0.0,
+        "vehicle",
+        (1.0, 2.0, -3.0),
+        (1.0, 0.0, 0.0, 0.0),
+        (0.5, 0.0, 0.0),
+        (0.1, 0.2, 0.3),
+    )
     ahead = frames("x,-y,-z", "x,-y,-z", "wxyz").pose_from_source(level)
     assert ahead.pos == (1.0, -2.0, 3.0)
     assert same_turn(ahead.quat, (0.0, 0.0, 0.0, 1.0))
@@ -109,18 +125,25 @@ def test_level_and_north_in_mavlink_is_level_and_ahead_here():
 
 
 def test_marker_offset_follows_the_attitude():
-    """Marker 0.1 m above the centre of mass; rolled by 90 deg to the right it lies 0.1 m to the right of it."""
+    """Marker 0.1 m above the centre of mass; rolled by 90 deg to the right it lies 0.1 m to the
+    right of it.
+    """
     right = tuple(map(float, Rotation.from_euler("x", 90, degrees=True).as_quat()))
     convert = frames(offset=(0.0, 0.0, 0.1))
     pose = convert.pose_from_source(
         Pose(0.0, 0.0, "vehicle", (0.0, -0.1, 1.0), right, (0.0, 0.0, 0.2), (2.0, 0.0, 0.0))
     )
     np.testing.assert_allclose(pose.pos, (0.0, 0.0, 1.0), atol=EXACT)
-    # Turning with 2 rad/s on an arm of 0.1 m to the right the marker sinks at 0.2 m/s against the centre of mass.
+    # Turning with 2 rad/s on an arm of 0.1 m to the right the marker sinks at 0.2 m/s against the
+    # centre of mass.
     np.testing.assert_allclose(pose.vel, (0.0, 0.0, 0.4), atol=EXACT)
 
 
 def test_wrong_order_and_numbers_are_refused():
-    for wrong, message in (('quaternion="zyxw"', "one of 'xyzw', 'wxyz'"), ("yaw_offset_deg=nan", "nan"), ('axes="x,y"', "signed")):
+    for wrong, message in (
+        ('quaternion="zyxw"', "one of 'xyzw', 'wxyz'"),
+        ("yaw_offset_deg=nan", "nan"),
+        ('axes="x,y"', "signed"),
+    ):
         with pytest.raises(ConfigError, match=message):
             config.load(HilParams, config.find("hil", "dry_run"), [f"frames.vehicle.{wrong}"])

@@ -1,4 +1,6 @@
-"""The gate, the track and the clock: what is refused, what goes stale and when, and what a step of a clock does."""
+"""The gate, the track and the clock: what is refused, what goes stale and when, and what a step of
+a clock does.
+"""
 
 import math
 
@@ -79,12 +81,16 @@ def test_bodies_swapped_after_a_gap_are_known_by_the_cable(gap):
 
 
 def test_a_body_farther_off_than_the_cable_is_long():
-    """After a gap another body's pose may lie within the room of a jump; a body that goes its way is followed, whatever has come off."""
+    """After a gap another body's pose may lie within the room of a jump; a body that goes its way
+    is followed, whatever has come off.
+    """
     still, gap = (0.0, 0.0, 0.0), 0.1
     gate = Gate(PARAMS)
     gate.check(pose())
     assert gate.check(pose(gap, 0.2), still, Tether((-0.5, 0.0, 1.0), 0.69)) == "cable"
-    assert gate.check(pose(gap + 0.01, 0.05), still, Tether((-0.5, 0.0, 1.0), 0.54)) is None, "where it was to be"
+    assert gate.check(pose(gap + 0.01, 0.05), still, Tether((-0.5, 0.0, 1.0), 0.54)) is None, (
+        "where it was to be"
+    )
 
 
 def test_rare_poses_are_as_good_as_none():
@@ -128,7 +134,11 @@ def test_wrong_limits():
 
 
 def track() -> Track:
-    return Track(FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0)), PARAMS, EstimateParams(0.025, 1))
+    return Track(
+        FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0)),
+        PARAMS,
+        EstimateParams(0.025, 1),
+    )
 
 
 @pytest.mark.parametrize("step", [1.0, -1.0])
@@ -164,6 +174,7 @@ def test_a_state_is_carried_forward():
 
 def test_late_ticks_are_counted_and_keep_their_grid():
     clock = ManualClock(5.0)
+
     def waited(ticker):
         clock.sleep_until(ticker.due())
         return ticker.take()

@@ -1,4 +1,6 @@
-"""The hand-carry check on synthetic recordings: every axis case, both quaternion orders, and carelessness of the carrier."""
+"""The hand-carry check on synthetic recordings: every axis case, both quaternion orders, and
+carelessness of the carrier.
+"""
 
 import math
 
@@ -31,7 +33,9 @@ def about(axis, angle):
 
 
 def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
-    """What a source with these frames says of a vehicle that is carried about, not quite straight."""
+    """What a source with these frames says of a vehicle that is carried about, not
+    quite straight.
+    """
     rng = np.random.default_rng(seed)
     pos, quat, track = np.array([0.3, -0.2, 1.0]), about(2, math.radians(rng.uniform(-5, 5))), []
     ways = {i: 0.5 * np.eye(3)[i] + rng.normal(0, 0.05, 3) for i in range(3)}
@@ -40,7 +44,9 @@ def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
         track += [(pos, quat)] * int(rest * RATE)
         for part in smooth(100):
             axis, angle = turned.get(i, (0, 0.0))
-            track.append((pos + part * ways.get(i, np.zeros(3)), multiply(quat, about(axis, part * angle))))
+            track.append(
+                (pos + part * ways.get(i, np.zeros(3)), multiply(quat, about(axis, part * angle)))
+            )
         pos, quat = track[-1]
     track += [(pos, quat)] * int(rest * RATE)
     poses = []
@@ -48,7 +54,9 @@ def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
         jittered = multiply(attitude, (*rng.normal(0, 5e-4, 3), 1.0))
         unit = tuple(x / math.hypot(*jittered) for x in jittered)
         noisy = tuple((place + rng.normal(0, 5e-4, 3)).tolist())
-        poses.append(Frames(frames).source_from_pose(Pose(n / RATE, n / RATE, "vehicle", noisy, unit)))
+        poses.append(
+            Frames(frames).source_from_pose(Pose(n / RATE, n / RATE, "vehicle", noisy, unit))
+        )
     return poses
 
 
@@ -75,7 +83,11 @@ def check(steps, true: FrameParams, config: FrameParams):
 
 @pytest.mark.parametrize("axes", AXES)
 def test_every_axis_case_is_named(steps, axes):
-    for true in (made(axes=axes), made(body_axes=axes), made(axes=axes, body_axes="x,-y,-z", quaternion="wxyz")):
+    for true in (
+        made(axes=axes),
+        made(body_axes=axes),
+        made(axes=axes, body_axes="x,-y,-z", quaternion="wxyz"),
+    ):
         right = check(steps, true, true)
         assert right.passed
         assert right.fitting == true
@@ -89,19 +101,37 @@ def test_any_mixture_is_named(steps):
     rng = np.random.default_rng(1)
     for _ in range(25):
         true, config = (
-            made(*rng.choice(AXES, 2), rng.choice(["xyzw", "wxyz"]), float(rng.choice([0.0, 30.0, -40.0])))
+            made(
+                *rng.choice(AXES, 2),
+                rng.choice(["xyzw", "wxyz"]),
+                float(rng.choice([0.0, 30.0, -40.0])),
+            )
             for _ in range(2)
         )
         found = check(steps, true, config)
         assert (found.fitting.axes, found.fitting.body_axes, found.fitting.quaternion) == (
-            true.axes, true.body_axes, true.quaternion,
-        )  # fmt: skip
+            true.axes,
+            true.body_axes,
+            true.quaternion,
+        )
         assert found.fitting.yaw_offset_deg == pytest.approx(true.yaw_offset_deg, abs=8.0)
 
 
 def test_each_line_says_which_axis_failed(steps):
-    found = check(steps, made(axes="y,x,-z", body_axes="x,-y,-z", quaternion="wxyz"), made("x,-y,-z", "x,-y,-z", "wxyz"))
-    assert [passed for _, passed in found.lines] == [False, False, True, True, True, True, False], "a yaw of 90 deg"
+    found = check(
+        steps,
+        made(axes="y,x,-z", body_axes="x,-y,-z", quaternion="wxyz"),
+        made("x,-y,-z", "x,-y,-z", "wxyz"),
+    )
+    assert [passed for _, passed in found.lines] == [
+        False,
+        False,
+        True,
+        True,
+        True,
+        True,
+        False,
+    ], "a yaw of 90 deg"
     told = summary_text(found, made("x,-y,-z", "x,-y,-z", "wxyz"))
     assert 'would fit: axes = "y,x,-z"  (config: "x,-y,-z")' in told
     assert "quaternion" not in told.split("would fit", 1)[1]
@@ -109,7 +139,9 @@ def test_each_line_says_which_axis_failed(steps):
 
 
 def test_a_left_handed_world_is_told(track):
-    mirrored = [Pose(p.stamp, p.arrival, p.body, (p.pos[0], -p.pos[1], p.pos[2]), p.quat) for p in track]
+    mirrored = [
+        Pose(p.stamp, p.arrival, p.body, (p.pos[0], -p.pos[1], p.pos[2]), p.quat) for p in track
+    ]
     found = judge(find_steps(mirrored), OURS)
     assert found.mirrored
     assert not found.passed
@@ -117,7 +149,9 @@ def test_a_left_handed_world_is_told(track):
 
 
 def test_moves_that_were_left_out_are_counted():
-    with pytest.raises(RunError, match=r"5 moves between rests; expected 8.*8\. turn it to the left"):
+    with pytest.raises(
+        RunError, match=r"5 moves between rests; expected 8.*8\. turn it to the left"
+    ):
         judge(find_steps(carried(OURS, moves=5)), OURS)
     with pytest.raises(RunError, match="expected 8"):
         judge(find_steps(carried(OURS, rest=0.2)), OURS)
@@ -155,10 +189,18 @@ def test_the_command_on_a_recording(tmp_path, capsys, axes, status):
         '{name="quat_wb", columns=["qw", "qx", "qy", "qz"], unit="1", kind="quaternion"}]'
     )
     settings = (
-        "source.kind=csv", f"source.file={path}", 'source.time={column="t"}', f"source.columns={columns}",
+        "source.kind=csv",
+        f"source.file={path}",
+        'source.time={column="t"}',
+        f"source.columns={columns}",
         f'frames.vehicle.axes="{axes}"',
-    )  # fmt: skip
-    command = ["hil", "check", "--hand-carry", *(word for setting in settings for word in ("--set", setting))]
+    )
+    command = [
+        "hil",
+        "check",
+        "--hand-carry",
+        *(word for setting in settings for word in ("--set", setting)),
+    ]
     assert main(command) == status
     out = capsys.readouterr().out
     assert ("FAIL" in out) == bool(status)

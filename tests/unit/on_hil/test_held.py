@@ -25,7 +25,9 @@ class Told(DryRun):
 
 
 def test_each_command_goes_out_so_much_later_and_none_is_lost():
-    """Ticks every 20 ms, a wait of 25.5 ms: two commands wait at a time; a release of the back-end's own is served when it is due."""
+    """Ticks every 20 ms, a wait of 25.5 ms: two commands wait at a time; a release of the
+    back-end's own is served when it is due.
+    """
     told = Told()
     held = Held(told, 0.0255)
     for tick in range(3):
@@ -53,5 +55,10 @@ def test_nothing_goes_out_after_the_end():
 
 def test_a_vehicle_acts_sooner_or_later_but_not_both():
     with pytest.raises(ConfigError, match="one of them 0"):
-        config.load(HilParams, config.find("hil", "fake"), ["delay.hold=0.02", "delay.command=0.01"])
-    assert isinstance(make_backend(config.load(HilParams, config.find("hil", "dry_run"), ["delay.hold=0.02"])), DryRun)
+        config.load(
+            HilParams, config.find("hil", "fake"), ["delay.hold=0.02", "delay.command=0.01"]
+        )
+    assert isinstance(
+        make_backend(config.load(HilParams, config.find("hil", "dry_run"), ["delay.hold=0.02"])),
+        DryRun,
+    )

@@ -1,4 +1,6 @@
-"""Pictures as a source of keypoints: a rendered flight looked at by the detector and flown by the runner, live and recorded."""
+"""Pictures as a source of keypoints: a rendered flight looked at by the detector and flown by the
+runner, live and recorded.
+"""
 
 import dataclasses
 import json
@@ -20,7 +22,15 @@ from hil.control.recording.record import lines
 from hil.errors import SourceError
 from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
-from hil.poses.sources.images import DETECTORS, STAMPS, Eyes, Hint, ImageParams, LiveImages, RecordedImages
+from hil.poses.sources.images import (
+    DETECTORS,
+    STAMPS,
+    Eyes,
+    Hint,
+    ImageParams,
+    LiveImages,
+    RecordedImages,
+)
 from tests.drawn import render_scene
 from visthrow import config
 from visthrow.cli import main
@@ -52,7 +62,9 @@ def picture(i) -> np.ndarray:
     camera = KeypointCamera(training(), dtype=torch.float64)
     rot = rotation_from_vector(vector)[0]
     eye = torch.tensor(pos) + rot @ camera.position_b
-    frame = render_scene(Fisheye(SMALL), eye, rot @ camera.rot_cb.T, torch.tensor(GOAL), torch.tensor(ball), 0.033)
+    frame = render_scene(
+        Fisheye(SMALL), eye, rot @ camera.rot_cb.T, torch.tensor(GOAL), torch.tensor(ball), 0.033
+    )
     return np.round(frame.numpy()[..., ::-1] * 255).astype(np.uint8)
 
 
@@ -88,17 +100,23 @@ def test_a_detector_of_ones_own_is_named_by_the_configuration(pictures, monkeypa
 class Known(Blind):
     """It reports a ball and a square in its own camera, whatever it is shown."""
 
-    corners = np.array([[0.1, 0.1, 1.0], [0.1, -0.1, 1.0], [-0.1, -0.1, 1.0], [-0.1, 0.1, 1.0]]) / np.sqrt(1.02)
+    corners = np.array(
+        [[0.1, 0.1, 1.0], [0.1, -0.1, 1.0], [-0.1, -0.1, 1.0], [-0.1, 0.1, 1.0]]
+    ) / np.sqrt(1.02)
 
     def detect(self, image, known=None):
         return dataclasses.replace(super().detect(image), goal=GoalSeen(self.corners, 1.0))
 
 
 def test_what_a_camera_mounted_otherwise_sees_is_told_in_that_of_training(pictures, monkeypatch):
-    """Pitched by 30 degrees its axis points forward and down: x of the body is up in the image of training."""
+    """Pitched by 30 degrees its axis points forward and down: x of the body is up in the image of
+    training.
+    """
     monkeypatch.setitem(DETECTORS, "known", Known)
     mount = dataclasses.replace(training().mount, rpy_deg=(0.0, -30.0, 0.0))
-    seen = Eyes(ImageParams("camera", fisheye=SMALL, mount=mount, by="known"), training()).look(pictures[0], 0.0)
+    seen = Eyes(ImageParams("camera", fisheye=SMALL, mount=mount, by="known"), training()).look(
+        pictures[0], 0.0
+    )
     sine, cosine = 0.5, math.sqrt(0.75)
     assert seen.ball == pytest.approx((0.0, -sine, cosine, 0.1))
     turn = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
@@ -114,11 +132,17 @@ def folder(tmp_path_factory, pictures):
     names = [f"{i:03d}.png" for i in range(FRAMES)]
     for name, frame in zip(names, pictures):
         assert cv2.imwrite(str(path / name), frame)
-    (path / STAMPS).write_text("file,time_s\n" + "\n".join(f"{n},{PERIOD * i:.3f}" for i, n in enumerate(names)) + "\n")
+    (path / STAMPS).write_text(
+        "file,time_s\n" + "\n".join(f"{n},{PERIOD * i:.3f}" for i, n in enumerate(names)) + "\n"
+    )
     rows = ["t,x,y,z,qx,qy,qz,qw,bx,by,bz"]
     for j in range(5 * FRAMES):
         pos, vector, ball = pose(j / 5)
-        rows.append(",".join(map(repr, (PERIOD * j / 5, *pos.tolist(), *quaternion(vector), *ball.tolist()))))
+        rows.append(
+            ",".join(
+                map(repr, (PERIOD * j / 5, *pos.tolist(), *quaternion(vector), *ball.tolist()))
+            )
+        )
     (path / "poses.csv").write_text("\n".join(rows) + "\n")
     return path
 
@@ -131,7 +155,9 @@ def true_keypoints(i):
     pos, vector, ball = pose(i)
     tensors = [torch.tensor(v)[None] for v in (pos, np.array([*GOAL, 0.0]), ball)]
     camera = KeypointCamera(training(), dtype=torch.float64)
-    return keypoints(camera, tensors[0], rotation_from_vector(vector), tensors[1], tensors[2])[0][0].numpy()
+    return keypoints(camera, tensors[0], rotation_from_vector(vector), tensors[1], tensors[2])[0][
+        0
+    ].numpy()
 
 
 PIXEL = 1.0 / (SMALL.fx * math.radians(110))
@@ -175,7 +201,9 @@ def told(looker, picture, stamp, hint, blind=False):
 
 
 def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
-    """Where the ball was is kept in the world: after a turn of 20 deg it is looked for elsewhere in the picture."""
+    """Where the ball was is kept in the world: after a turn of 20 deg it is looked for elsewhere in
+    the picture.
+    """
     pos, vector, ball = pose(0)
     looker = Eyes(params(folder), training())
     assert told(looker, pictures[0], 0.0, None)[1].ball_ray_c is None
@@ -186,7 +214,9 @@ def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     for k in range(1, 5):
         told(looker, pictures[0], 0.02 * k, hint)
     turned = torch.tensor([[0.0, 0.4, 0.0]], dtype=torch.float64)
-    missed, known = told(looker, pictures[0], 0.1, Hint(tuple(pos.tolist()), quaternion(turned), None), blind=True)
+    missed, known = told(
+        looker, pictures[0], 0.1, Hint(tuple(pos.tolist()), quaternion(turned), None), blind=True
+    )
     camera = KeypointCamera(training(), dtype=torch.float64)
     rot = rotation_from_vector(turned)[0]
     eye = torch.tensor(pos) + rot @ camera.position_b
@@ -195,10 +225,17 @@ def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     assert math.acos(cosine) < known.ball_within, "but for the lens's own way of 1 cm"
     np.testing.assert_allclose(known.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
     assert known.height == pytest.approx(float(eye[2]), abs=1e-6)
-    np.testing.assert_allclose(missed.ball[:3], known.ball_ray_c, atol=1e-9, err_msg="missed, it reads where it is expected")
+    np.testing.assert_allclose(
+        missed.ball[:3],
+        known.ball_ray_c,
+        atol=1e-9,
+        err_msg="missed, it reads where it is expected",
+    )
 
 
-def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_while_that_is_known(folder, pictures):
+def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_while_that_is_known(
+    folder, pictures
+):
     looker = Eyes(params(folder), training())
     pos, vector, _ = pose(0)
     hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
@@ -214,7 +251,9 @@ def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_w
         if detection.ball is not None:
             np.testing.assert_allclose(detection.ball[:3], known.ball_ray_c, atol=1e-9)
             np.testing.assert_allclose(detection.ball, first.ball, atol=0.03)
-    assert told(looker, pictures[0], 0.42, hint)[0].ball == pytest.approx(first.ball), "and it is found again"
+    assert told(looker, pictures[0], 0.42, hint)[0].ball == pytest.approx(first.ball), (
+        "and it is found again"
+    )
 
 
 def test_only_the_newest_of_several_pictures_is_looked_at(folder):
@@ -224,15 +263,19 @@ def test_only_the_newest_of_several_pictures_is_looked_at(folder):
     assert detection.stamp == pytest.approx(PERIOD * 2)
 
 
-SQUARE = tuple(tuple((np.array([x, y, 1.0]) / math.sqrt(x * x + y * y + 1.0)).tolist()) for x, y in
-               ((0.1, 0.1), (0.2, 0.1), (0.2, 0.2), (0.1, 0.2)))  # fmt: skip
+SQUARE = tuple(
+    tuple((np.array([x, y, 1.0]) / math.sqrt(x * x + y * y + 1.0)).tolist())
+    for x, y in ((0.1, 0.1), (0.2, 0.1), (0.2, 0.2), (0.1, 0.2))
+)
 """Rays to the corners of a goal below the vehicle."""
 
 
 @pytest.mark.parametrize("reads", ["edge", "zero"])
 def test_what_is_not_seen_any_more(reads):
     lens = training()
-    camera = KeypointCamera(dataclasses.replace(lens, noise=dataclasses.replace(lens.noise, invalid_reads=reads)))
+    camera = KeypointCamera(
+        dataclasses.replace(lens, noise=dataclasses.replace(lens.noise, invalid_reads=reads))
+    )
     detections, level = Detections(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
     points, valid = detections.keypoints(0.0)
     assert not valid.any()
@@ -247,13 +290,19 @@ def test_what_is_not_seen_any_more(reads):
     detections.take(ahead, level)
     points, valid = detections.keypoints(2.2)
     assert not valid.any()
-    np.testing.assert_allclose(np.linalg.norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6)
-    assert bool((points[0, 4:, 1] < -0.9).all()) == (reads == "edge"), "gone over the upper edge, it reads there by the rule of edges alone"
+    np.testing.assert_allclose(
+        np.linalg.norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6
+    )
+    assert bool((points[0, 4:, 1] < -0.9).all()) == (reads == "edge"), (
+        "gone over the upper edge, it reads there by the rule of edges alone"
+    )
     detections.take(Detection(3.0, SQUARE, below.ball), level)
     assert detections.keypoints(3.01)[1].all()
     detections.take(Detection(3.02, None, below.ball), level)
     points, valid = detections.keypoints(3.03)
-    assert valid.tolist() == [[False] * 4 + [True] * 4], "a goal that a frame lacks has dropped out with it"
+    assert valid.tolist() == [[False] * 4 + [True] * 4], (
+        "a goal that a frame lacks has dropped out with it"
+    )
     assert not points[0, :4].any()
     detections.take(Detection(1.5, None, ahead.ball), level)
     again, _ = detections.keypoints(3.03)
@@ -276,7 +325,9 @@ def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
             self.released = True
 
     capture = Capture()
-    eyes = LiveImages(ImageParams("camera", fisheye=SMALL, delay=0.02), training(), lambda: 7.0, capture)
+    eyes = LiveImages(
+        ImageParams("camera", fisheye=SMALL, delay=0.02), training(), lambda: 7.0, capture
+    )
     deadline = time.monotonic() + 60.0
     while eyes.failure is None and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -290,20 +341,31 @@ def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
 
 
 def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
-    """The vision policy's observations hold the detections, and a replay without the pictures gives the same actions."""
+    """The vision policy's observations hold the detections, and a replay without the pictures gives
+    the same actions.
+    """
     fisheye = ", ".join(f"{key}={value}" for key, value in dataclasses.asdict(SMALL).items())
     columns = (
         '[{name="pos_w", columns=["x","y","z"], unit="m"}, '
         '{name="quat_wb", columns=["qx","qy","qz","qw"], unit="1", kind="quaternion"}, '
         '{name="payload_pos_w", columns=["bx","by","bz"], unit="m"}]'
     )
-    frames = '{axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0, marker_offset_b=[0.0, 0.0, 0.0]}'
+    frames = (
+        '{axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0,'
+        " marker_offset_b=[0.0, 0.0, 0.0]}"
+    )
     settings = (
-        "source.kind=csv", f"source.file={folder / 'poses.csv'}", 'source.time={column="t"}',
-        f"source.columns={columns}", "keypoints=detector",
-        f'images={{kind="folder", path="{folder}", fisheye={{{fisheye}}}}}', f"frames.vehicle={frames}",
-        f"frames.payload={frames}", f"goal_w=[{GOAL[0]}, {GOAL[1]}, 0.0]", "delay.source=0.0",
-    )  # fmt: skip
+        "source.kind=csv",
+        f"source.file={folder / 'poses.csv'}",
+        'source.time={column="t"}',
+        f"source.columns={columns}",
+        "keypoints=detector",
+        f'images={{kind="folder", path="{folder}", fisheye={{{fisheye}}}}}',
+        f"frames.vehicle={frames}",
+        f"frames.payload={frames}",
+        f"goal_w=[{GOAL[0]}, {GOAL[1]}, 0.0]",
+        "delay.source=0.0",
+    )
     out = tmp_path / "run"
     command = ["hil", "record", "--out", str(out)]
     assert main([*command, *(word for setting in settings for word in ("--set", setting))]) == 0
@@ -315,13 +377,18 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
         assert all(line["valid"])
         off = np.abs(np.array(line["keypoints"]) - true_keypoints(index))
         assert off.max() < WORST
-        assert np.array(line["keypoints"]).ravel()[:8].tolist() == line["observation"][20:28], "the goal's part"
+        assert np.array(line["keypoints"]).ravel()[:8].tolist() == line["observation"][20:28], (
+            "the goal's part"
+        )
     capsys.readouterr()
     (folder / STAMPS).rename(folder / "away")
     try:
         assert main(["hil", "replay", str(out)]) == 0
         assert "all bit for bit the same" in capsys.readouterr().out
-        assert main([*command[:-1], str(tmp_path / "b"), *(w for s in settings for w in ("--set", s))]) == 2
+        assert (
+            main([*command[:-1], str(tmp_path / "b"), *(w for s in settings for w in ("--set", s))])
+            == 2
+        )
         assert "expected lines of file,time_s" in capsys.readouterr().err
     finally:
         (folder / "away").rename(folder / STAMPS)
@@ -365,7 +432,9 @@ def test_a_video_with_stamps_beside_it(folder, pictures, tmp_path):
     source = RecordedImages(params(path, kind="video"), training())
     (detection,) = source.poll(PERIOD * 2 + 1e-6)
     assert detection.stamp == pytest.approx(PERIOD * 2), "by the video's own rate"
-    path.with_suffix(f".{STAMPS}").write_text("frame,time_s\n" + "\n".join(f"{i},{1.0 + i}" for i in range(FRAMES)) + "\n")
+    path.with_suffix(f".{STAMPS}").write_text(
+        "frame,time_s\n" + "\n".join(f"{i},{1.0 + i}" for i in range(FRAMES)) + "\n"
+    )
     (detection,) = RecordedImages(params(path, kind="video"), training()).poll(3.5)
     assert detection.stamp == pytest.approx(3.0)
     assert detection.ball is not None

@@ -37,10 +37,14 @@ def test_nothing_zero_and_very_long_times():
 def test_transport_is_counted_from_the_fastest_pose_and_starts_anew_at_a_step():
     stages = Stages()
     pose = lambda stamp, arrival, body=VEHICLE: Pose(stamp, arrival, body, (0.0, 0.0, 0.0))  # noqa: E731
-    assert stages.poses([pose(0.0, 100.01), pose(0.01, 100.03)], 100.035) == {"arrival": pytest.approx(0.005)}
+    assert stages.poses([pose(0.0, 100.01), pose(0.01, 100.03)], 100.035) == {
+        "arrival": pytest.approx(0.005)
+    }
     assert stages.stages["transport"].most == pytest.approx(0.01)
     stages.poses([pose(5.0, 100.05)], 100.06)
-    assert stages.stages["transport"].most == pytest.approx(0.01), "a step of the clock is no transport"
+    assert stages.stages["transport"].most == pytest.approx(0.01), (
+        "a step of the clock is no transport"
+    )
     assert stages.poses([pose(5.0, 100.06, PAYLOAD), pose(float("nan"), 100.06)], 100.07) == {}
 
 
@@ -49,7 +53,12 @@ def test_report_and_picture(tmp_path, monkeypatch):
     monkeypatch.setattr(parts, "png_of", lambda figure: figures.append(figure) or png_of(figure))
     stages, rng = Stages(), np.random.default_rng(0)
     for _ in range(500):
-        stages.add({name: float(x) for name, x in zip(("poll", "observation", "total"), rng.gamma(4.0, 1e-4, 3))})
+        stages.add(
+            {
+                name: float(x)
+                for name, x in zip(("poll", "observation", "total"), rng.gamma(4.0, 1e-4, 3))
+            }
+        )
     lines = table(stages.summary())
     assert [line.split()[0] for line in lines[1:]] == ["poll", "observation", "total"]
     assert STAGES["observation"] in lines[2]
@@ -58,8 +67,17 @@ def test_report_and_picture(tmp_path, monkeypatch):
     assert picture.shape[1] > 1000
     assert np.ptp(picture) > 200
     assert all(word not in lines[0] for word in ("clock", "real"))
-    assert "transport, arrival, late, ack: by the run's clock, at 0.2 of real time" in table(stages.summary(), 0.2)[0]
+    assert (
+        "transport, arrival, late, ack: by the run's clock, at 0.2 of real time"
+        in table(stages.summary(), 0.2)[0]
+    )
     (axis,) = figures[0].axes
-    assert [label.get_text() for label in axis.get_yticklabels()] == ["poll", "observation", "total"]
-    assert [text.get_text() for text in axis.texts] == [STAGES[name] for name in ("poll", "observation", "total")]
+    assert [label.get_text() for label in axis.get_yticklabels()] == [
+        "poll",
+        "observation",
+        "total",
+    ]
+    assert [text.get_text() for text in axis.texts] == [
+        STAGES[name] for name in ("poll", "observation", "total")
+    ]
     draw(tmp_path / "empty.png", Stages(), "nothing flown")

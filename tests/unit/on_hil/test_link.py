@@ -1,4 +1,6 @@
-"""The link: no bytes make it raise, device strings are refused, units and orders are MAVLink's, the .tlog reads back."""
+"""The link: no bytes make it raise, device strings are refused, units and orders are MAVLink's, the
+.tlog reads back.
+"""
 
 import math
 import os
@@ -52,7 +54,9 @@ POSES = tuple(message.id for message in MESSAGES[:3])
 
 
 def fuzz(count: int, seed: int) -> None:
-    """Noise and spoiled messages, half of these with a right checksum over any content: they reach the fields of poses."""
+    """Noise and spoiled messages, half of these with a right checksum over any content: they reach
+    the fields of poses.
+    """
     rng = np.random.default_rng(seed)
     good, whole, stream = [packed(message) for message in MESSAGES], Parser(), Parser()
     parsed = 0
@@ -100,11 +104,24 @@ def test_messages_are_of_version_2():
 @pytest.mark.parametrize(
     "text",
     [
-        "/bin/ls", "firmware.elf", "udp:/bin/sh:1", "tcp:127.0.0.1:5760;x.elf", "serial:/bin/bash:115200", "./a.elf",
-        "serial:/dev/../bin/sh:9600", "udp:example.org:14550", "", "udp:127.0.0.1", "udp:127.0.0.1:70000", "udp:1.2.3:5",
-        "udp:127.0.0.1:14550\n", "mcast:", "serial:/dev/ttyS0", "udp:127.0.0.1:0",
+        "/bin/ls",
+        "firmware.elf",
+        "udp:/bin/sh:1",
+        "tcp:127.0.0.1:5760;x.elf",
+        "serial:/bin/bash:115200",
+        "./a.elf",
+        "serial:/dev/../bin/sh:9600",
+        "udp:example.org:14550",
+        "",
+        "udp:127.0.0.1",
+        "udp:127.0.0.1:70000",
+        "udp:1.2.3:5",
+        "udp:127.0.0.1:14550\n",
+        "mcast:",
+        "serial:/dev/ttyS0",
+        "udp:127.0.0.1:0",
     ],
-)  # fmt: skip
+)
 def test_other_device_strings_are_refused(text):
     with pytest.raises(LinkError, match=r"refused|numeric address|port"):
         check_device(text, remote=True)
@@ -123,12 +140,18 @@ def test_loopback_only_unless_told_otherwise():
 def test_a_port_that_is_taken_says_who_may_have_it_and_what_names_another():
     number = free_port()
     first = open_port(check_device(f"udp:127.0.0.1:{number}"))
-    params = config.load(HilParams, config.find("hil", "fake"), [f"link.device=udp:127.0.0.1:{number}"])
+    params = config.load(
+        HilParams, config.find("hil", "fake"), [f"link.device=udp:127.0.0.1:{number}"]
+    )
     with pytest.raises(LinkError) as caught:
         open_source(params, Path("unused"), time.monotonic)
     first.close()
-    for words in ("another program has it", f"`ss -ulnp 'sport = :{number}'` shows which", "--set link.device=udp:127.0.0.1:PORT",
-                  "hil fake --device udpout:127.0.0.1:PORT"):  # fmt: skip
+    for words in (
+        "another program has it",
+        f"`ss -ulnp 'sport = :{number}'` shows which",
+        "--set link.device=udp:127.0.0.1:PORT",
+        "hil fake --device udpout:127.0.0.1:PORT",
+    ):
         assert words in str(caught.value)
     with pytest.raises(LinkError, match="no such address on this machine"):
         open_port(check_device("udp:192.0.2.1:14550", remote=True))  # of the range for examples
@@ -142,7 +165,9 @@ def test_what_the_fields_mean():
     np.testing.assert_allclose(angles, (0.3, 0.2, 0.1), atol=1e-12)
     assert all(map(math.isnan, quaternion_from_euler(math.inf, 0.0, 0.0)))
     half = math.sqrt(0.5)
-    east = pose_from_message(odometry(q=(half, 0.0, 0.0, half)), "payload", 0.0)  # facing east: forward is east
+    east = pose_from_message(
+        odometry(q=(half, 0.0, 0.0, half)), "payload", 0.0
+    )  # facing east: forward is east
     np.testing.assert_allclose(east.vel, (-2.0, 1.0, 3.0), atol=1e-12)
     assert (east.rate, east.reset, east.stamp, east.body) == ((0.1, 0.2, 0.3), 7, 2.0, "payload")
     assert pose_from_message(odometry(child=20), "vehicle", 0.0).vel == (1.0, 2.0, 3.0)
@@ -154,14 +179,26 @@ def test_what_the_fields_mean():
 def test_the_command_on_the_wire():
     sent = attitude_target(12.3456, (1, 2), 0.5, (1.0, -2.0, 3.0))
     (got,) = Parser().parse(packed(sent))
-    assert (got.target_system, got.target_component, got.type_mask, got.q) == (1, 2, 128, [1.0, 0.0, 0.0, 0.0])
-    assert (got.body_roll_rate, got.body_pitch_rate, got.body_yaw_rate, got.thrust) == (1.0, -2.0, 3.0, 0.5)
+    assert (got.target_system, got.target_component, got.type_mask, got.q) == (
+        1,
+        2,
+        128,
+        [1.0, 0.0, 0.0, 0.0],
+    )
+    assert (got.body_roll_rate, got.body_pitch_rate, got.body_yaw_rate, got.thrust) == (
+        1.0,
+        -2.0,
+        3.0,
+        0.5,
+    )
     assert got.time_boot_ms == 12345
 
 
 def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
     number = free_port()
-    ours = Link(open_port(check_device(f"udp:127.0.0.1:{number}")), tlog=TlogWriter(tmp_path / "link.tlog"))
+    ours = Link(
+        open_port(check_device(f"udp:127.0.0.1:{number}")), tlog=TlogWriter(tmp_path / "link.tlog")
+    )
     peer = Link(open_port(check_device(f"udpout:127.0.0.1:{number}")), 1, 1)
     heard, answers = [], []
     ours.listen(lambda message, arrival: heard.append((message.get_type(), arrival)))
@@ -182,13 +219,18 @@ def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
     from pymavlink import mavutil
 
     reader = mavutil.mavlink_connection(str(tmp_path / "link.tlog"), dialect="ardupilotmega")
-    assert [reader.recv_msg().get_type() for _ in range(2)] == ["ATT_POS_MOCAP", "SET_ATTITUDE_TARGET"]
+    assert [reader.recv_msg().get_type() for _ in range(2)] == [
+        "ATT_POS_MOCAP",
+        "SET_ATTITUDE_TARGET",
+    ]
     reader.close()
 
 
 def test_a_device_that_names_its_peer_hears_nobody_else():
     number, said = free_port(), []
-    ours = Link(open_port(check_device(f"udpout:127.0.0.1:{number}")), roster=Roster(tell=said.append))
+    ours = Link(
+        open_port(check_device(f"udpout:127.0.0.1:{number}")), roster=Roster(tell=said.append)
+    )
     peer = Link(open_port(check_device(f"udp:127.0.0.1:{number}")), 1, 1)
     heard = []
     ours.listen(lambda message, arrival: heard.append(message.get_type()))
@@ -200,7 +242,10 @@ def test_a_device_that_names_its_peer_hears_nobody_else():
         peer.send(MESSAGES[0])
         ours.pump(lambda: 0.0)
         assert heard == ["ATT_POS_MOCAP"]
-        assert said == [f"refused: datagram from 127.0.0.1:{stranger.getsockname()[1]}: the link's device is 127.0.0.1:{number}"]
+        assert said == [
+            f"refused: datagram from 127.0.0.1:{stranger.getsockname()[1]}: the link's device is"
+            f" 127.0.0.1:{number}"
+        ]
     ours.close()
     peer.close()
 

@@ -1,4 +1,6 @@
-"""Autopilot logs as sources: files written byte by byte, each message that carries a pose, damage and wrong files."""
+"""Autopilot logs as sources: files written byte by byte, each message that carries a pose, damage
+and wrong files.
+"""
 
 import math
 import random
@@ -34,7 +36,25 @@ YAWED = (QUARTER, 0.0, 0.0, QUARTER)
 
 
 def vision(i, reset=0):
-    return ("VISP", (1_000_000 + 20_000 * i, 5_000_000, 990 + 20 * i, 0.1 * i, 2.0, -1.5, 0.0, 0.0, 90.0, 0, 0, reset, 0, 100))
+    return (
+        "VISP",
+        (
+            1_000_000 + 20_000 * i,
+            5_000_000,
+            990 + 20 * i,
+            0.1 * i,
+            2.0,
+            -1.5,
+            0.0,
+            0.0,
+            90.0,
+            0,
+            0,
+            reset,
+            0,
+            100,
+        ),
+    )
 
 
 def test_vision_poses_of_a_bin_with_stamps_of_their_own(tmp_path):
@@ -46,16 +66,41 @@ def test_vision_poses_of_a_bin_with_stamps_of_their_own(tmp_path):
     assert poses[2].pos == pytest.approx((0.2, 2.0, -1.5))
     assert poses[2].quat == pytest.approx(YAWED)
     assert [pose.reset for pose in poses] == [0, 0, 0, 1, 1]
-    files.write_bin(path, {"VISP": files.VISP_OLD}, [(name, values[:-1]) for name, values in (vision(i) for i in range(2))])
+    files.write_bin(
+        path,
+        {"VISP": files.VISP_OLD},
+        [(name, values[:-1]) for name, values in (vision(i) for i in range(2))],
+    )
     assert read_bin(path, VEHICLE)[1].quat == pytest.approx(YAWED), "names of before 4.3"
 
 
 def test_an_estimate_is_that_of_one_core(tmp_path):
     path = tmp_path / "a.BIN"
     rows = [
-        ("XKF1", (1000 * i, core, 0.0, 0.0, 90.0, 1.0, 2.0, 3.0, 0.0, 0.5 + core, 0.25, -1.0, 0, 0, 0, 0))
-        for i in range(4) for core in (0, 1)
-    ]  # fmt: skip
+        (
+            "XKF1",
+            (
+                1000 * i,
+                core,
+                0.0,
+                0.0,
+                90.0,
+                1.0,
+                2.0,
+                3.0,
+                0.0,
+                0.5 + core,
+                0.25,
+                -1.0,
+                0,
+                0,
+                0,
+                0,
+            ),
+        )
+        for i in range(4)
+        for core in (0, 1)
+    ]
     files.write_bin(path, {"XKF1": files.XKF1}, rows)
     poses = read_bin(path, (LogBody("vehicle", "XKF1", instance=1),))
     assert len(poses) == 4
@@ -63,9 +108,13 @@ def test_an_estimate_is_that_of_one_core(tmp_path):
     assert poses[0].quat == pytest.approx(YAWED)
     with pytest.raises(SourceError, match=r"XKF1 \(instance 2\) holds no pose"):
         read_bin(path, (LogBody("vehicle", "XKF1", instance=2),))
-    with pytest.raises(SourceError, match="no VISP in this log; of the messages with poses it has: XKF1"):
+    with pytest.raises(
+        SourceError, match="no VISP in this log; of the messages with poses it has: XKF1"
+    ):
         read_bin(path, VEHICLE)
-    with pytest.raises(SourceError, match="'ATT' of the vehicle carries no pose; known: NKF1, POS, VISP, XKF1"):
+    with pytest.raises(
+        SourceError, match="'ATT' of the vehicle carries no pose; known: NKF1, POS, VISP, XKF1"
+    ):
         read_bin(path, (LogBody("vehicle", "ATT"),))
 
 
@@ -77,7 +126,17 @@ def test_a_place_on_the_globe_becomes_metres_from_the_origin(tmp_path):
         ("ORGN", (950_000, 1, 46.0, 8.0, 400.0)),  # home is not the origin
         ("ORGN", (960_000, 0, 47.0, 8.0, 498.5)),
         ("ATT", (990_000, 0.0, 0.0, 0.0, 0.0, 0.0, 90.0)),
-        ("POS", (1_000_000, 47.0 + 3 * metre, 8.0 + 2 * metre / math.cos(math.radians(47.0)), 500.0, 1.0, 1.5)),
+        (
+            "POS",
+            (
+                1_000_000,
+                47.0 + 3 * metre,
+                8.0 + 2 * metre / math.cos(math.radians(47.0)),
+                500.0,
+                1.0,
+                1.5,
+            ),
+        ),
         ("POS", (1_200_000, 47.0, 8.0, 500.0, 1.0, 1.5)),  # the attitude is too old
     ]
     files.write_bin(path, {"POS": files.POS, "ATT": files.ATT, "ORGN": files.ORGN}, rows)
@@ -99,13 +158,27 @@ def test_loggers_of_two_bodies_are_joined_by_a_stated_offset(tmp_path):
     one, two = tmp_path / "a.BIN", tmp_path / "b.BIN"
     for path in (one, two):
         files.write_bin(path, {"VISP": files.VISP}, [vision(i) for i in range(3)])
-    bodies = (LogBody("vehicle", "VISP"), LogBody("payload", "VISP", file=str(two), time_offset=-0.5))
+    bodies = (
+        LogBody("vehicle", "VISP"),
+        LogBody("payload", "VISP", file=str(two), time_offset=-0.5),
+    )
     poses = read_bin(one, bodies)
-    assert {p.body: round(p.arrival, 6) for p in reversed(poses)} == {"payload": 0.0, "vehicle": 0.5}
+    assert {p.body: round(p.arrival, 6) for p in reversed(poses)} == {
+        "payload": 0.0,
+        "vehicle": 0.5,
+    }
 
 
-ODOMETRY = ["uint64_t timestamp", "uint64_t timestamp_sample", "float[3] position", "float[4] q", "float[3] velocity",
-            "float[3] angular_velocity", "uint8_t velocity_frame", "uint8_t reset_counter"]  # fmt: skip
+ODOMETRY = [
+    "uint64_t timestamp",
+    "uint64_t timestamp_sample",
+    "float[3] position",
+    "float[4] q",
+    "float[3] velocity",
+    "float[3] angular_velocity",
+    "uint8_t velocity_frame",
+    "uint8_t reset_counter",
+]
 NAN = math.nan
 
 
@@ -117,14 +190,21 @@ def odometry(i, velocity=(1.0, 0.0, 0.0), frame=3, quat=YAWED):
 def test_external_poses_of_a_ulg(tmp_path):
     pytest.importorskip("pyulog")
     path = tmp_path / "a.ulg"
-    rows = [odometry(0), odometry(1, frame=1), odometry(2, (NAN,) * 3), odometry(3, quat=(NAN,) * 4)]
+    rows = [
+        odometry(0),
+        odometry(1, frame=1),
+        odometry(2, (NAN,) * 3),
+        odometry(3, quat=(NAN,) * 4),
+    ]
     files.write_ulg(path, {("vehicle_visual_odometry", 0): (ODOMETRY, rows)})
     poses = read_ulg(path, (LogBody("vehicle", "vehicle_visual_odometry"),))
     assert [pose.stamp for pose in poses] == pytest.approx([1.0, 1.01, 1.02, 1.03])
     assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.01, 0.02, 0.03])
     assert poses[1].pos == pytest.approx((0.5, 2.0, -1.0))
     assert poses[0].quat == pytest.approx(YAWED, abs=1e-6)
-    assert poses[0].vel == pytest.approx((0.0, 1.0, 0.0), abs=1e-6), "of the body, turned into the world"
+    assert poses[0].vel == pytest.approx((0.0, 1.0, 0.0), abs=1e-6), (
+        "of the body, turned into the world"
+    )
     assert poses[1].vel == pytest.approx((1.0, 0.0, 0.0)), "of the world already"
     assert (poses[2].vel, poses[3].quat) == (None, None), "NaN is PX4's word for unknown"
     assert poses[0].rate == pytest.approx((0.1, 0.2, 0.3))
@@ -134,9 +214,20 @@ def test_external_poses_of_a_ulg(tmp_path):
 def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     pytest.importorskip("pyulog")
     path = tmp_path / "a.ulg"
-    local = ["uint64_t timestamp", "float x", "float y", "float z", "float vx", "float vy", "float vz",
-             "uint8_t xy_reset_counter", "uint8_t z_reset_counter"]  # fmt: skip
-    places = [(1_000_000 + 20_000 * i, 0.1 * i, 2.0, -1.0, 5.0, 0.0, 0.0, 1, i // 2) for i in range(4)]
+    local = [
+        "uint64_t timestamp",
+        "float x",
+        "float y",
+        "float z",
+        "float vx",
+        "float vy",
+        "float vz",
+        "uint8_t xy_reset_counter",
+        "uint8_t z_reset_counter",
+    ]
+    places = [
+        (1_000_000 + 20_000 * i, 0.1 * i, 2.0, -1.0, 5.0, 0.0, 0.0, 1, i // 2) for i in range(4)
+    ]
     turns = [(990_000, *YAWED), (1_018_000, 1.0, 0.0, 0.0, 0.0)]
     rates = [(1_015_000, 0.1, 0.2, 0.3)]
     topics = {
@@ -149,7 +240,9 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     assert [pose.quat[0] for pose in poses] == pytest.approx([QUARTER, 1.0, 1.0, 1.0])
     assert [pose.rate is None for pose in poses] == [True, False, False, False]
     assert [pose.reset for pose in poses] == [1, 1, 2, 2]
-    with pytest.raises(SourceError, match=r"no vehicle_odometry in this log.*vehicle_local_position"):
+    with pytest.raises(
+        SourceError, match=r"no vehicle_odometry in this log.*vehicle_local_position"
+    ):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
     del topics["vehicle_attitude", 0]
     files.write_ulg(path, topics)
@@ -180,11 +273,14 @@ def test_spoiled_logs_raise_nothing_else(tmp_path):
     rng = np.random.default_rng(0)
     bin_path, ulg_path, copy = tmp_path / "a.BIN", tmp_path / "a.ulg", tmp_path / "copy"
     files.write_bin(bin_path, {"VISP": files.VISP}, [vision(i) for i in range(20)])
-    files.write_ulg(ulg_path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])})
+    files.write_ulg(
+        ulg_path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])}
+    )
     told = 0
     for path, read, body in (
-        (bin_path, read_bin, VEHICLE), (ulg_path, read_ulg, (LogBody("vehicle", "vehicle_visual_odometry"),)),
-    ):  # fmt: skip
+        (bin_path, read_bin, VEHICLE),
+        (ulg_path, read_ulg, (LogBody("vehicle", "vehicle_visual_odometry"),)),
+    ):
         data = path.read_bytes()
         for _ in range(150):
             copy.write_bytes(spoiled(data, rng))
@@ -199,11 +295,18 @@ def test_a_length_that_leads_back_is_no_circle(tmp_path):
     """A length of 400 where 90 bytes are left: pyulog steps back over them, and over them again."""
     pytest.importorskip("pyulog")
     path = tmp_path / "a.ulg"
-    files.write_ulg(path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])})
+    files.write_ulg(
+        path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])}
+    )
     data = path.read_bytes()
     first = data.index(b"A\x00\x00\x00vehicle_visual_odometry") - 2  # the end of the definitions
     path.write_bytes(data[:first] + data[16:first] * 7 + struct.pack("<HB", 400, 0) + bytes(90))
-    with patience(), pytest.raises(SourceError, match=r"a\.ulg: cannot be read: .*leads nowhere.*expected a PX4 log"):
+    with (
+        patience(),
+        pytest.raises(
+            SourceError, match=r"a\.ulg: cannot be read: .*leads nowhere.*expected a PX4 log"
+        ),
+    ):
         read_ulg(path, (LogBody("vehicle", "vehicle_visual_odometry"),))
 
 
@@ -238,12 +341,22 @@ def test_many_damaged_logs_end(name, tmp_path):
 def test_a_topic_without_a_field_says_which(tmp_path):
     pytest.importorskip("pyulog")
     path = tmp_path / "a.ulg"
-    files.write_ulg(path, {("vehicle_odometry", 0): (["uint64_t timestamp", "float[3] position"], [(1, 0.0, 0.0, 0.0)])})
+    files.write_ulg(
+        path,
+        {
+            ("vehicle_odometry", 0): (
+                ["uint64_t timestamp", "float[3] position"],
+                [(1, 0.0, 0.0, 0.0)],
+            )
+        },
+    )
     with pytest.raises(SourceError, match=r"no field 'q\[0\]'; vehicle_odometry has position"):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
 
 
-@pytest.mark.parametrize("content", [b"", b"\x00" * 500, b"ULog\x01\x12\x35\x01" + b"\xff" * 40, b"t,x\n1,2\n"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00" * 500, b"ULog\x01\x12\x35\x01" + b"\xff" * 40, b"t,x\n1,2\n"]
+)
 def test_files_that_are_no_log(tmp_path, content, capfd):
     path = tmp_path / "x"
     path.write_bytes(content)
@@ -273,7 +386,10 @@ def test_configs_of_logs():
         ((*LOG, 'frames.vehicle.quaternion="xyzw"'), "kind bin writes 'wxyz'"),
         ((*LOG, 'backend="ardupilot"'), "a recording flies dry"),
         (LOG[:1], "expected the file of the bin source"),
-        ((*LOG[:2], 'source.logs=[{body="drone", message="VISP"}]'), "one of 'vehicle', 'payload', 'goal'"),
+        (
+            (*LOG[:2], 'source.logs=[{body="drone", message="VISP"}]'),
+            "one of 'vehicle', 'payload', 'goal'",
+        ),
     ):
         with pytest.raises(ConfigError, match=message):
             config.load(HilParams, config.find("hil", "dry_run"), overrides)
@@ -281,33 +397,65 @@ def test_configs_of_logs():
 
 @pytest.mark.parametrize("kind", ["bin", "ulg"])
 def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
-    """Vehicle and payload from two loggers through `hil record`, in MAVLink's frames, the policy looking on."""
+    """Vehicle and payload from two loggers through `hil record`, in MAVLink's frames, the policy
+    looking on.
+    """
     swing = [0.05 * math.sin(0.1 * i) for i in range(60)]
     for name, down in (("vehicle", -1.333), ("payload", -0.9)):
         if kind == "bin":
             rows = [
-                ("VISP", (20_000 * i, 0, 20 * i, x, 0.001 * i, down, 0.0, 0.0, 0.0, 0, 0, 0, 0, 100)) for i, x in enumerate(swing)
+                (
+                    "VISP",
+                    (20_000 * i, 0, 20 * i, x, 0.001 * i, down, 0.0, 0.0, 0.0, 0, 0, 0, 0, 100),
+                )
+                for i, x in enumerate(swing)
             ]
             files.write_bin(tmp_path / f"{name}.bin", {"VISP": files.VISP}, rows)
         else:
             pytest.importorskip("pyulog")
             rows = [
-                (20_000 * i + 1, 20_000 * i + 1, x, 0.001 * i, down, 1.0, 0.0, 0.0, 0.0, *(NAN,) * 6, 1, 0)
+                (
+                    20_000 * i + 1,
+                    20_000 * i + 1,
+                    x,
+                    0.001 * i,
+                    down,
+                    1.0,
+                    0.0,
+                    0.0,
+                    0.0,
+                    *(NAN,) * 6,
+                    1,
+                    0,
+                )
                 for i, x in enumerate(swing)
             ]
-            files.write_ulg(tmp_path / f"{name}.ulg", {("vehicle_mocap_odometry", 0): (ODOMETRY, rows)})
+            files.write_ulg(
+                tmp_path / f"{name}.ulg", {("vehicle_mocap_odometry", 0): (ODOMETRY, rows)}
+            )
     message = "VISP" if kind == "bin" else "vehicle_mocap_odometry"
     logs = ", ".join(
-        f'{{body="{name}", message="{message}", file="{tmp_path / name}.{kind}"}}' for name in ("vehicle", "payload")
+        f'{{body="{name}", message="{message}", file="{tmp_path / name}.{kind}"}}'
+        for name in ("vehicle", "payload")
     )
-    settings = (f"source.kind={kind}", f"source.file={tmp_path}/vehicle.{kind}", f"source.logs=[{logs}]")
+    settings = (
+        f"source.kind={kind}",
+        f"source.file={tmp_path}/vehicle.{kind}",
+        f"source.logs=[{logs}]",
+    )
     out = tmp_path / "run"
-    command = ["hil", "record", "--out", str(out), *(word for setting in settings for word in ("--set", setting))]
+    command = [
+        "hil",
+        "record",
+        "--out",
+        str(out),
+        *(word for setting in settings for word in ("--set", setting)),
+    ]
     assert main(command) == 0
     told = capsys.readouterr().out
     assert "vehicle: 60 poses taken; refused: none" in told
     assert "payload: 60 poses taken; refused: none" in told
     assert main(["hil", "replay", str(out)]) == 0
     assert "all bit for bit the same" in capsys.readouterr().out
-    (tick, *_) = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
+    tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
     assert tick["observation"][2] == pytest.approx(1.333, abs=0.01), "down became up"

@@ -1,4 +1,6 @@
-"""Motion-capture packages: stand-ins with the packages' own faces, and these faces against the packages where they are."""
+"""Motion-capture packages: stand-ins with the packages' own faces, and these faces against the
+packages where they are.
+"""
 
 import dataclasses
 import sys
@@ -21,7 +23,9 @@ PARAMS = MocapParams("vicon", "127.0.0.1", timeout=1.0)
 
 def body(x, y=0.0):
     """As motioncapture.RigidBody; its position is an array, its rotation has x, y, z, w."""
-    return SimpleNamespace(name="", position=[x, y, 1.0], rotation=SimpleNamespace(x=0.1, y=0.2, z=0.3, w=0.9))
+    return SimpleNamespace(
+        name="", position=[x, y, 1.0], rotation=SimpleNamespace(x=0.1, y=0.2, z=0.3, w=0.9)
+    )
 
 
 class System:
@@ -96,7 +100,9 @@ def test_a_package_that_holds_the_interpreter_holds_nothing_up(tmp_path, monkeyp
     with pytest.raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 1 s"):
         MotionCaptureSource(PARAMS, BODIES, time.monotonic)
     assert time.monotonic() - begin < 30.0
-    (tmp_path / "motioncapture.py").write_text("def connect(*args):\n    raise RuntimeError('no such host')\n")
+    (tmp_path / "motioncapture.py").write_text(
+        "def connect(*args):\n    raise RuntimeError('no such host')\n"
+    )
     with pytest.raises(SourceError, match="RuntimeError: no such host"):
         MotionCaptureSource(dataclasses.replace(PARAMS, timeout=60.0), BODIES, time.monotonic)
     sys.modules.pop("motioncapture", None)
@@ -106,7 +112,11 @@ class Client:
     """As natnet.NatNetClient."""
 
     def __init__(self, server_ip_address="", local_ip_address="", use_multicast=True, answers=True):
-        self.address, self.answers, self.running = (server_ip_address, local_ip_address, use_multicast), answers, False
+        self.address, self.answers, self.running = (
+            (server_ip_address, local_ip_address, use_multicast),
+            answers,
+            False,
+        )
         self.on_data_frame_received_event = SimpleNamespace(handlers=[])
 
     def connect(self, timeout=5.0):
@@ -122,7 +132,10 @@ class Client:
 
 def frame(*rows, stamp=3.5):
     """As natnet.DataFrame."""
-    bodies = [SimpleNamespace(id_num=i, pos=(x, 1.0, 0.0), rot=(0.0, 0.0, 0.0, 1.0), tracking_valid=ok) for i, x, ok in rows]
+    bodies = [
+        SimpleNamespace(id_num=i, pos=(x, 1.0, 0.0), rot=(0.0, 0.0, 0.0, 1.0), tracking_valid=ok)
+        for i, x, ok in rows
+    ]
     return SimpleNamespace(rigid_bodies=tuple(bodies), suffix=SimpleNamespace(timestamp=stamp))
 
 
@@ -131,8 +144,12 @@ IDS = (RigidBody("vehicle", "7"), RigidBody("payload", "8"))
 
 def test_natnet_by_streaming_id_drops_what_motive_does_not_track():
     clients = []
-    module = SimpleNamespace(NatNetClient=lambda **kwargs: clients.append(Client(**kwargs)) or clients[-1])
-    source = NatNetSource(MocapParams("natnet", "127.0.0.1", multicast=False), IDS, lambda: 9.0, module=module)
+    module = SimpleNamespace(
+        NatNetClient=lambda **kwargs: clients.append(Client(**kwargs)) or clients[-1]
+    )
+    source = NatNetSource(
+        MocapParams("natnet", "127.0.0.1", multicast=False), IDS, lambda: 9.0, module=module
+    )
     (client,) = clients
     assert client.running
     assert client.address == ("127.0.0.1", "127.0.0.1", False)
@@ -140,8 +157,9 @@ def test_natnet_by_streaming_id_drops_what_motive_does_not_track():
     hear(frame((7, 0.5, True), (8, 0.7, False), (9, 3.0, True)))
     hear(frame((8, 0.8, None)))
     assert [(p.body, p.pos, p.stamp, p.arrival) for p in source.poll(0.0)] == [
-        ("vehicle", (0.5, 1.0, 0.0), 3.5, 9.0), ("payload", (0.8, 1.0, 0.0), 3.5, 9.0),
-    ]  # fmt: skip
+        ("vehicle", (0.5, 1.0, 0.0), 3.5, 9.0),
+        ("payload", (0.8, 1.0, 0.0), 3.5, 9.0),
+    ]
     assert source.untracked == 1
     source.close()
     assert not client.running
@@ -149,8 +167,12 @@ def test_natnet_by_streaming_id_drops_what_motive_does_not_track():
 
 def test_natnet_that_does_not_answer():
     module = SimpleNamespace(NatNetClient=lambda **kwargs: Client(**kwargs, answers=False))
-    with pytest.raises(SourceError, match=r"natnet at 127.0.0.1 .*multicast\): no answer within 1 s"):
-        NatNetSource(MocapParams("natnet", "127.0.0.1", timeout=1.0), IDS, time.monotonic, module=module)
+    with pytest.raises(
+        SourceError, match=r"natnet at 127.0.0.1 .*multicast\): no answer within 1 s"
+    ):
+        NatNetSource(
+            MocapParams("natnet", "127.0.0.1", timeout=1.0), IDS, time.monotonic, module=module
+        )
     with pytest.raises(SourceError, match="natnet bodies quad, ball; expected streaming ids"):
         NatNetSource(MocapParams("natnet", "127.0.0.1"), BODIES, time.monotonic, module=module)
 
@@ -170,9 +192,14 @@ def test_wrong_names_hosts_and_missing_packages(monkeypatch):
 
 def test_configs_of_mocap():
     mocap = 'source.mocap={system="vicon", host="127.0.0.1"}'
-    overrides = ['source.kind="mocap"', *(f'frames.{name}.quaternion="xyzw"' for name in ("vehicle", "payload"))]
+    overrides = [
+        'source.kind="mocap"',
+        *(f'frames.{name}.quaternion="xyzw"' for name in ("vehicle", "payload")),
+    ]
     bodies = 'source.bodies=[{body="vehicle", name="quad"}]'
-    loaded = config.load(HilParams, config.find("hil", "dry_run"), [*overrides, mocap, bodies, 'backend="ardupilot"'])
+    loaded = config.load(
+        HilParams, config.find("hil", "dry_run"), [*overrides, mocap, bodies, 'backend="ardupilot"']
+    )
     assert loaded.source.mocap.host == "127.0.0.1"
     assert config.loads(HilParams, config.dumps(loaded)) == loaded
     for wrong, message in (
@@ -196,7 +223,9 @@ def test_the_stand_in_has_the_face_of_motioncapture():
 
 def test_the_stand_in_has_the_face_of_natnet():
     real = pytest.importorskip("natnet")
-    client = real.NatNetClient(server_ip_address="127.0.0.1", local_ip_address="127.0.0.1", use_multicast=False)
+    client = real.NatNetClient(
+        server_ip_address="127.0.0.1", local_ip_address="127.0.0.1", use_multicast=False
+    )
     assert client.on_data_frame_received_event.handlers == []
     assert {"connect", "run_async", "shutdown"} <= set(dir(client))
     fields = real.DataFrame.__dataclass_fields__

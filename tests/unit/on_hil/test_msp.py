@@ -12,7 +12,9 @@ from tests.fuzz import EACH, SEEDS
 from tests.loopback.wire import pipe
 from visthrow import config
 
-HELLO = msp.Frame(msp.STATUS, struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0), msp.ANSWER)
+HELLO = msp.Frame(
+    msp.STATUS, struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0), msp.ANSWER
+)
 PARAMS = config.load(HilParams, config.find("hil", "fake_betaflight")).betaflight
 
 
@@ -49,18 +51,29 @@ def test_what_does_not_fit_is_not_packed():
 
 def test_numbers_beyond_the_end_are_none():
     frame = msp.Frame(1, b"\x01\x02\x03")
-    assert [frame.number(code, at) for code, at in (("B", 2), ("B", 3), ("<H", 1), ("<H", 2), ("<I", 0))] == [3, None, 770, None, None]
+    assert [
+        frame.number(code, at) for code, at in (("B", 2), ("B", 3), ("<H", 1), ("<H", 2), ("<I", 0))
+    ] == [3, None, 770, None, None]
     assert frame.words() == (513,)
 
 
 def fuzz(count: int, seed: int) -> None:
-    """Random bytes, mutated frames and whole answers of every command with any content, into parser and back-end."""
+    """Random bytes, mutated frames and whole answers of every command with any content, into parser
+    and back-end.
+    """
     here, there = pipe()
     backend = Betaflight(here, PARAMS)
     rng, sent, parsed = np.random.default_rng(seed), [], msp.Parser()
-    seeds = [msp.pack(msp.Frame(int(c), rng.bytes(int(rng.integers(0, 60))), msp.ANSWER)) for c in range(256)]
+    seeds = [
+        msp.pack(msp.Frame(int(c), rng.bytes(int(rng.integers(0, 60))), msp.ANSWER))
+        for c in range(256)
+    ]
     for i in range(count):
-        data = bytearray(seeds[rng.integers(len(seeds))] if rng.random() < 0.8 else rng.bytes(int(rng.integers(0, 80))))
+        data = bytearray(
+            seeds[rng.integers(len(seeds))]
+            if rng.random() < 0.8
+            else rng.bytes(int(rng.integers(0, 80)))
+        )
         if data and rng.random() < 0.5:
             data[rng.integers(len(data))] = rng.integers(256)
         if data and rng.random() < 0.2:
@@ -72,7 +85,9 @@ def fuzz(count: int, seed: int) -> None:
             while there.inbox:
                 sent += [f.command for f in parsed.parse(there.inbox.popleft())]
     assert backend.parser.errors > count // 50, "some must be no frames"
-    assert {msp.SET_RAW_RC, msp.SET_RC_TUNING, msp.EEPROM_WRITE}.isdisjoint(sent), "nothing of it commands or writes"
+    assert {msp.SET_RAW_RC, msp.SET_RC_TUNING, msp.EEPROM_WRITE}.isdisjoint(sent), (
+        "nothing of it commands or writes"
+    )
     assert backend.release_record.state == "idle"
     assert len(backend.parser._buffer) < 4096, "and nothing piles up"
     answers = backend._heard

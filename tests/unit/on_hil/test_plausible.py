@@ -26,11 +26,19 @@ FLIGHTS = {
 
 
 def flight(name: str, **units: str) -> HilParams:
-    """The config of a recorded flight, some units of its mapping replaced, by channel; ``time`` is its clock's."""
-    params = config.load(HilParams, config.find("hil", name), [f'source.file="{DATA / FLIGHTS[name]}"'])
-    columns = tuple(dataclasses.replace(c, unit=units.get(c.name, c.unit)) for c in params.source.columns)
+    """The config of a recorded flight, some units of its mapping replaced, by channel; ``time`` is
+    its clock's.
+    """
+    params = config.load(
+        HilParams, config.find("hil", name), [f'source.file="{DATA / FLIGHTS[name]}"']
+    )
+    columns = tuple(
+        dataclasses.replace(c, unit=units.get(c.name, c.unit)) for c in params.source.columns
+    )
     time = dataclasses.replace(params.source.time, unit=units.get("time", "s"))
-    return dataclasses.replace(params, source=dataclasses.replace(params.source, columns=columns, time=time))
+    return dataclasses.replace(
+        params, source=dataclasses.replace(params.source, columns=columns, time=time)
+    )
 
 
 def problems(params: HilParams) -> str:
@@ -45,14 +53,42 @@ def test_flights_as_they_are(name):
 @pytest.mark.parametrize(
     ("name", "units", "message"),
     [
-        ("crazyflie_log", {"pos_w": "m", "payload_pos_w": "m"}, "pos_w: .* millimetres taken for metres"),
+        (
+            "crazyflie_log",
+            {"pos_w": "m", "payload_pos_w": "m"},
+            "pos_w: .* millimetres taken for metres",
+        ),
         ("crazyflie_log", {"time": "ms"}, "is the unit of time wrong"),
-        ("crazyflie_log", {"vel_w": "m/s"}, r"d\(pos_w\)/dt, vel_w: the second is 1\d\d\d times the first: one is in thousandths"),
-        ("crazyflie_log", {"rate_b": "deg/s"}, r"rate of quat_wb, rate_b: the second is 0.01\d+ times .* degrees"),
-        ("crazyflie_log", {"quat_wb": "deg"}, r"rate of quat_wb, rate_b: the second is [56]\d.* times .* degrees"),
-        ("crazyflie_pair_log", {"pos_w": "m", "payload_pos_w": "m"}, "pos_w: .* millimetres taken for metres"),
-        ("crazyflie_pair_log", {"rate_b": "rad/s"}, r"rate of quat_wb, rate_b: the second is [56]\d.* times .* degrees"),
-        ("slungload_log", {"pos_w": "mm", "payload_pos_w": "mm"}, "no cable; millimetres taken for metres, or metres for"),
+        (
+            "crazyflie_log",
+            {"vel_w": "m/s"},
+            r"d\(pos_w\)/dt, vel_w: the second is 1\d\d\d times the first: one is in thousandths",
+        ),
+        (
+            "crazyflie_log",
+            {"rate_b": "deg/s"},
+            r"rate of quat_wb, rate_b: the second is 0.01\d+ times .* degrees",
+        ),
+        (
+            "crazyflie_log",
+            {"quat_wb": "deg"},
+            r"rate of quat_wb, rate_b: the second is [56]\d.* times .* degrees",
+        ),
+        (
+            "crazyflie_pair_log",
+            {"pos_w": "m", "payload_pos_w": "m"},
+            "pos_w: .* millimetres taken for metres",
+        ),
+        (
+            "crazyflie_pair_log",
+            {"rate_b": "rad/s"},
+            r"rate of quat_wb, rate_b: the second is [56]\d.* times .* degrees",
+        ),
+        (
+            "slungload_log",
+            {"pos_w": "mm", "payload_pos_w": "mm"},
+            "no cable; millimetres taken for metres, or metres for",
+        ),
     ],
 )
 def test_each_wrong_unit_is_named(name, units, message):
@@ -66,7 +102,15 @@ def flown(angle: float) -> list[Pose]:
         t = 0.01 * i
         x, push = 0.5 * np.cos(3 * t), -0.5 * 9 * np.cos(3 * t)
         half = 0.5 * angle * np.arctan2(push, 9.81)
-        poses.append(Pose(t, t, "vehicle", (float(x), 0.0, 1.0), (0.0, float(np.sin(half)), 0.0, float(np.cos(half)))))
+        poses.append(
+            Pose(
+                t,
+                t,
+                "vehicle",
+                (float(x), 0.0, 1.0),
+                (0.0, float(np.sin(half)), 0.0, float(np.cos(half))),
+            )
+        )
     return poses
 
 
@@ -80,7 +124,16 @@ def test_a_multirotor_tilts_where_it_accelerates():
 def test_little_data_and_a_still_vehicle_say_nothing():
     frames = flight("slungload_log").frames
     rng = np.random.default_rng(0)
-    still = [Pose(0.01 * i, 0.01 * i, "vehicle", tuple(1e-3 * rng.standard_normal(3)), (0.0, 0.0, 0.0, 1.0)) for i in range(300)]
+    still = [
+        Pose(
+            0.01 * i,
+            0.01 * i,
+            "vehicle",
+            tuple(1e-3 * rng.standard_normal(3)),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+        for i in range(300)
+    ]
     assert unit_problems(still, frames) == []
     assert unit_problems(still[:5], frames) == []
     assert unit_problems([], frames) == []
@@ -88,7 +141,10 @@ def test_little_data_and_a_still_vehicle_say_nothing():
 
 def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     params = flight("crazyflie_log", vel_w="m/s")
-    with pytest.raises(SourceError, match=r"vel_w: the second is 1\d\d\d times .* \(source\.check_units=false lets it pass\)"):
+    with pytest.raises(
+        SourceError,
+        match=r"vel_w: the second is 1\d\d\d times .* \(source\.check_units=false lets it pass\)",
+    ):
         open_source(params, tmp_path, MonotonicClock())
     lax = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
     assert open_source(lax, tmp_path, MonotonicClock())[2]
@@ -100,10 +156,15 @@ def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_recorded_flights_replay(name, tmp_path, capsys):
-    """Each is recorded with the vision policy looking on, and the recording gives the same actions again."""
+    """Each is recorded with the vision policy looking on, and the recording gives the same actions
+    again.
+    """
     file = f"source.file={DATA / FLIGHTS[name]}"
     out = str(tmp_path / "run")
-    assert main(["hil", "record", "--config", name, "--set", file, "--seconds", "4", "--out", out]) == 0
+    assert (
+        main(["hil", "record", "--config", name, "--set", file, "--seconds", "4", "--out", out])
+        == 0
+    )
     capsys.readouterr()
     assert main(["hil", "replay", out]) == 0
     told = capsys.readouterr().out
@@ -112,13 +173,34 @@ def test_recorded_flights_replay(name, tmp_path, capsys):
 
 
 def test_a_run_recorded_with_another_form_of_mapping_replays(tmp_path, capsys):
-    """Runs of earlier versions name a body's columns, and a camera's log; replaying needs neither, the poses are recorded."""
+    """Runs of earlier versions name a body's columns, and a camera's log; replaying needs neither,
+    the poses are recorded.
+    """
     file, out = f"source.file={DATA / FLIGHTS['crazyflie_log']}", tmp_path / "run"
-    assert main(["hil", "record", "--config", "crazyflie_log", "--set", file, "--seconds", "1", "--bare", "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "hil",
+                "record",
+                "--config",
+                "crazyflie_log",
+                "--set",
+                file,
+                "--seconds",
+                "1",
+                "--bare",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     tree = tomllib.loads((out / "config.toml").read_text())
     assert "time" in tree["source"]
     tree["against"] = "none"
-    tree["source"]["columns"] = [{"body": "vehicle", "pos": {"names": ["x", "y", "z"], "unit": "mm"}, "row_period": 0.01}]
+    tree["source"]["columns"] = [
+        {"body": "vehicle", "pos": {"names": ["x", "y", "z"], "unit": "mm"}, "row_period": 0.01}
+    ]
     del tree["source"]["time"]
     (out / "config.toml").write_text(toml_text.dumps(tree))
     capsys.readouterr()

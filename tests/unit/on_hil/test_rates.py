@@ -1,4 +1,7 @@
-"""Sticks from body rates: Betaflight's curves at known points, their inverse, and which way is which."""
+"""Sticks from body rates:
+
+Betaflight's curves at known points, their inverse, and which way is which.
+"""
 
 import math
 
@@ -17,7 +20,9 @@ def degrees(params, axis, stick):
 
 
 def test_known_points_of_the_curves():
-    """RC rate 1 with super rate 0.7 ends at 200 / 0.3 deg/s; actual rates end at their largest, and begin with their slope."""
+    """RC rate 1 with super rate 0.7 ends at 200 / 0.3 deg/s; actual rates end at their largest, and
+    begin with their slope.
+    """
     assert degrees(CLASSIC, 0, 1.0) == pytest.approx(200.0 / 0.3)
     assert degrees(CLASSIC, 0, 0.5) == pytest.approx(100.0 / 0.65)
     assert degrees(CLASSIC, 1, 1.0) == pytest.approx(360.0)
@@ -26,7 +31,9 @@ def test_known_points_of_the_curves():
     assert degrees(ACTUAL, 0, 1.0) == pytest.approx(670.0)
     assert degrees(ACTUAL, 0, 0.5) == pytest.approx(70 * 0.5 + 600 * 0.25)
     assert degrees(ACTUAL, 0, 1e-6) == pytest.approx(70e-6, rel=1e-4)
-    assert degrees(ACTUAL, 1, 0.5) == pytest.approx(200 * 0.5 + 700 * 0.5 * (0.5**5 * 0.54 + 0.5 * 0.46))
+    assert degrees(ACTUAL, 1, 0.5) == pytest.approx(
+        200 * 0.5 + 700 * 0.5 * (0.5**5 * 0.54 + 0.5 * 0.46)
+    )
     assert degrees(LINEAR, 2, -0.5) == pytest.approx(-150.0)
 
 
@@ -46,12 +53,16 @@ def test_the_inverse_is_as_near_as_microseconds_allow(params):
 
 def test_half_a_step_of_the_shipped_profile_is_small():
     sticks = Sticks(LINEAR)
-    worst = max(abs(sticks.rate(0, sticks.position(0, r / 100)) - r / 100) for r in range(-1000, 1001))
+    worst = max(
+        abs(sticks.rate(0, sticks.position(0, r / 100)) - r / 100) for r in range(-1000, 1001)
+    )
     assert math.degrees(worst) <= 0.6 + 1e-9, "600 deg/s over 500 us, half of one"
 
 
 def test_which_way_is_which():
-    """Right roll is stick right; nose down, +y in forward-left-up, is stick forward; left yaw, +z, is stick left."""
+    """Right roll is stick right; nose down, +y in forward-left-up, is stick forward; left yaw, +z,
+    is stick left.
+    """
     sticks = Sticks(LINEAR)
     assert sticks.position(0, 1.0) > 1500
     assert sticks.position(1, 1.0) > 1500
@@ -61,7 +72,12 @@ def test_which_way_is_which():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"), [((300, 1, 1), "rc_rates is .*; expected 1 to 255"), ((0, 60, 60), "1 to 255"), ((-1, 60, 60), "1 to 255")]
+    ("change", "message"),
+    [
+        ((300, 1, 1), "rc_rates is .*; expected 1 to 255"),
+        ((0, 60, 60), "1 to 255"),
+        ((-1, 60, 60), "1 to 255"),
+    ],
 )
 def test_profiles_that_are_none(change, message):
     with pytest.raises(ConfigError, match=message):

@@ -44,7 +44,10 @@ def run_folder(tmp_path_factory):
     def spoil(time, poses):
         """A few poses that no gate lets through: these must read back as well."""
         if int(time * 100) % 50 == 7:
-            return [type(p)(p.stamp, p.arrival, p.body, (math.nan, math.inf, 0.0), p.quat) for p in poses]
+            return [
+                type(p)(p.stamp, p.arrival, p.body, (math.nan, math.inf, 0.0), p.quat)
+                for p in poses
+            ]
         return poses
 
     recorded(folder, "vision", spoil=spoil)
@@ -76,7 +79,9 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
         data = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(data[: len(data) // 2])
     (tmp_path / "summary.json").unlink()
-    assert main(["hil", "replay", str(tmp_path)]) == 1, "what there is is the same, and not all is there"
+    assert main(["hil", "replay", str(tmp_path)]) == 1, (
+        "what there is is the same, and not all is there"
+    )
     out = capsys.readouterr().out
     assert "all bit for bit the same" in out
     assert "CUT: no summary" in out
@@ -99,10 +104,12 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("run --seconds 0", "expected a number above 0"), ("check --seconds nan", "expected a number above 0"),
-        ("fake --after -3", "expected a number above 0"), ("fake --seed -1", "expected a whole number of 0 or more"),
+        ("run --seconds 0", "expected a number above 0"),
+        ("check --seconds nan", "expected a number above 0"),
+        ("fake --after -3", "expected a number above 0"),
+        ("fake --seed -1", "expected a whole number of 0 or more"),
     ],
-)  # fmt: skip
+)
 def test_numbers_out_of_range_on_the_command_line(words, expected, capsys):
     with pytest.raises(SystemExit):
         main(["hil", *words.split()])
@@ -118,7 +125,9 @@ def test_a_folder_that_cannot_be_made(tmp_path, capsys):
 
 
 def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder, tmp_path, capsys):
-    """The links write before there is a recorder: a second run into a folder emptied the first one's link.tlog."""
+    """The links write before there is a recorder: a second run into a folder emptied the first
+    one's link.tlog.
+    """
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
     first = tmp_path / "first"
     shutil.copytree(run_folder, first)
@@ -126,7 +135,12 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder
     assert main(["hil", "run", "--out", str(first), "--set", device]) == 2
     assert "holds a run already" in capsys.readouterr().err
     assert (first / "link.tlog").read_bytes() == b"of the first run"
-    late = ["--config", "fake_betaflight", "--set", "betaflight.device=tcp:127.0.0.1:9"]  # nobody listens there
+    late = [
+        "--config",
+        "fake_betaflight",
+        "--set",
+        "betaflight.device=tcp:127.0.0.1:9",
+    ]  # nobody listens there
     assert main(["hil", "run", "--out", str(tmp_path / "new"), "--set", device, *late]) == 2
     assert "cannot connect" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
@@ -172,7 +186,10 @@ def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
         recorder.tick(n, [], status, words, True, runner.tick(0.02 * n, [], status, words), {})
     recorder.close({})
     assert "No space left" in recorder.failed
-    assert json.loads((tmp_path / "a" / "summary.json").read_text())["recording_failed"] == recorder.failed
+    assert (
+        json.loads((tmp_path / "a" / "summary.json").read_text())["recording_failed"]
+        == recorder.failed
+    )
 
 
 CSV = "t,x,y,z,qx,qy,qz,qw,px,py,pz\n" + "".join(
@@ -211,7 +228,9 @@ axes = "x,y,z"
 
 
 def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
-    """``hil run`` on recorded poses: as fast as it goes, the policy asked at every tick, nothing released."""
+    """``hil run`` on recorded poses: as fast as it goes, the policy asked at every tick, nothing
+    released.
+    """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "poses.csv").write_text(CSV)
     (tmp_path / "mine.toml").write_text(MAPPING.format(base="hil/dry_run.toml", file="poses.csv"))
@@ -242,6 +261,9 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
 
 def test_a_device_string_that_would_be_executed_is_refused(tmp_path, capsys):
     for device in ("/bin/true", "a.elf", "udp:0.0.0.0:14560"):
-        assert main(["hil", "run", "--set", f'link.device="{device}"', "--out", str(tmp_path / "x")]) == 2
+        assert (
+            main(["hil", "run", "--set", f'link.device="{device}"', "--out", str(tmp_path / "x")])
+            == 2
+        )
         assert "device" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

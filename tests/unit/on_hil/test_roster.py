@@ -1,4 +1,6 @@
-"""Who may speak on a link: ids, type of autopilot, addresses that are held in flight; what is refused is counted and said."""
+"""Who may speak on a link: ids, type of autopilot, addresses that are held in flight; what is
+refused is counted and said.
+"""
 
 import pytest
 
@@ -27,7 +29,10 @@ def pose(**ids):
 
 def odometry(**ids):
     return wired(
-        mav.MAVLink_odometry_message(7, 20, 12, 1.0, 2.0, 3.0, [1.0, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.0] * 21, [0.0] * 21), **ids
+        mav.MAVLink_odometry_message(
+            7, 20, 12, 1.0, 2.0, 3.0, [1.0, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.0] * 21, [0.0] * 21
+        ),
+        **ids,
     )
 
 
@@ -60,10 +65,15 @@ def test_an_autopilot_is_heard_from_its_first_right_heartbeat_on():
     assert not who.at
     assert who.admit(beat(), A, 0.2)
     assert who.admit(other, A, 0.3)
-    assert not who.admit(beat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA), A, 0.4), "at its own address as well"
+    assert not who.admit(beat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA), A, 0.4), (
+        "at its own address as well"
+    )
     assert who.refused == 2, "what came too early is of no stranger"
     assert said == [
-        "refused: HEARTBEAT of system 1, component 1 from 127.0.0.1:1001: it is a ARDUPILOTMEGA, expected is a PX4",
+        (
+            "refused: HEARTBEAT of system 1, component 1 from 127.0.0.1:1001: it is a"
+            " ARDUPILOTMEGA, expected is a PX4"
+        ),
     ]
 
 
@@ -72,7 +82,10 @@ def test_a_stranger_is_refused_counted_and_said_once():
     for i in range(50):
         assert not who.admit(pose(system=9, component=9), C, 0.01 * i)
     (line,) = said
-    assert line.startswith("refused: ATT_POS_MOCAP of system 9, component 9 from 10.0.0.9:14550: nobody of this run, which expects")
+    assert line.startswith(
+        "refused: ATT_POS_MOCAP of system 9, component 9 from 10.0.0.9:14550: nobody of this run,"
+        " which expects"
+    )
     assert "vehicle as 1/1 (ATT_POS_MOCAP)" in line
     assert who.summary()["refused_most"][0]["count"] == who.refused == 50
 
@@ -95,7 +108,11 @@ def test_on_the_ground_a_party_that_fell_silent_comes_back_from_another_address(
     assert who.admit(beat(), A, SILENT)
     assert not who.admit(beat(), B, 2.0 * SILENT - 0.1)
     assert who.admit(beat(), B, 2.0 * SILENT + 0.1)
-    assert (who.at["autopilot"], back, said[-1]) == (B, [AUTOPILOT], "the autopilot speaks from 127.0.0.1:1002 now")
+    assert (who.at["autopilot"], back, said[-1]) == (
+        B,
+        [AUTOPILOT],
+        "the autopilot speaks from 127.0.0.1:1002 now",
+    )
     assert not who.admit(beat(), A, 2.0 * SILENT + 0.2)
 
 
@@ -116,11 +133,18 @@ def test_in_flight_no_address_changes():
 
 def test_only_those_on_the_list_are_looked_at():
     who, said = roster(allow=("10.0.0.9", "127.0.0.1:1002"))
-    assert [who.shuts_out(address) for address in (A, B, C, ("10.0.0.9", 5))] == [True, False, False, False]
+    assert [who.shuts_out(address) for address in (A, B, C, ("10.0.0.9", 5))] == [
+        True,
+        False,
+        False,
+        False,
+    ]
     assert said == ["refused: datagram from 127.0.0.1:1001: not on link.allow"]
 
 
-@pytest.mark.parametrize("text", ["example.org", "10.0.0.300", "10.0.0.9:x", "", "10.0.0.9:14550:1"])
+@pytest.mark.parametrize(
+    "text", ["example.org", "10.0.0.300", "10.0.0.9:x", "", "10.0.0.9:14550:1"]
+)
 def test_a_list_of_allowed_senders_holds_addresses(text):
     with pytest.raises(LinkError, match=r"link\.allow .*; expected a numeric address"):
         check_allowed((text,))

@@ -1,4 +1,6 @@
-"""The runner on a vehicle of a few lines: a throw, and every fault with what was done and how soon."""
+"""The runner on a vehicle of a few lines: a throw, and every fault with what was done
+and how soon.
+"""
 
 import dataclasses
 import math
@@ -29,7 +31,9 @@ def runner(action=AT_ONCE, *overrides, mechanism=0.0, **kwargs) -> Runner:
 
 
 def safe(pilot: Runner, decisions) -> None:
-    """What must hold whatever happened: finite, clipped commands, and at most one release, and that in a throw."""
+    """What must hold whatever happened: finite, clipped commands, and at most one release, and that
+    in a throw.
+    """
     for _, command in pilot.backend.sent:
         assert all(map(math.isfinite, command))
         assert 0.0 <= command[0] <= 14.0
@@ -52,10 +56,19 @@ def when(decisions, state: str) -> float:
 def test_a_throw_from_idle_to_done():
     pilot, decisions = thrown(seconds=20.0)
     assert [state for state, _ in changes(decisions)] == [
-        "idle", "check", "ready", "armed", "throw", "recover", "land", "done",
-    ]  # fmt: skip
+        "idle",
+        "check",
+        "ready",
+        "armed",
+        "throw",
+        "recover",
+        "land",
+        "done",
+    ]
     latch = next(d.time for d in decisions if d.release)
-    assert pilot.backend.release_times == [pytest.approx(latch + LAG)], "no mechanism: the runner waits the trained lag"
+    assert pilot.backend.release_times == [pytest.approx(latch + LAG)], (
+        "no mechanism: the runner waits the trained lag"
+    )
     assert when(decisions, "recover") == pytest.approx(latch + LAG, abs=TICK)
     (landing,) = pilot.latch.landings
     np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
@@ -99,7 +112,9 @@ def test_nothing_is_released_without_the_operators_word():
     assert changes(decisions)[-1][0] == "ready"
     assert not pilot.backend.release_times
     pilot, decisions = thrown(
-        overrides=("throws=2",), seconds=20.0, words=lambda t, s: OperatorInput(arm=s == "ready" and t < 3)
+        overrides=("throws=2",),
+        seconds=20.0,
+        words=lambda t, s: OperatorInput(arm=s == "ready" and t < 3),
     )
     assert decisions[-1].state == "ready", "one word, one throw"
 
@@ -111,7 +126,9 @@ def test_a_policy_that_never_releases_is_stopped():
 
 def test_operators_abort_in_mid_throw():
     pilot, decisions = thrown(
-        action=NEVER, words=lambda t, s: OperatorInput(arm=s == "ready", abort=s == "throw" and t > 3.0), seconds=8.0
+        action=NEVER,
+        words=lambda t, s: OperatorInput(arm=s == "ready", abort=s == "throw" and t > 3.0),
+        seconds=8.0,
     )
     assert ("abort", "the operator said abort") in changes(decisions)
     assert pilot.backend.aborts > 0
@@ -131,7 +148,9 @@ def lost(bodies, repeat=False, until=99.0):
                 last[pose.body] = pose
                 out.append(pose)
             elif repeat:
-                out.append(dataclasses.replace(last[pose.body], stamp=pose.stamp, arrival=pose.arrival))
+                out.append(
+                    dataclasses.replace(last[pose.body], stamp=pose.stamp, arrival=pose.arrival)
+                )
         return out
 
     return spoil
@@ -140,7 +159,10 @@ def lost(bodies, repeat=False, until=99.0):
 @pytest.mark.parametrize("repeat", [False, True])
 def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
     _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, repeat), seconds=6.0)
-    assert changes(decisions)[-2:] == [("recover", "stale poses"), ("abort", "no new pose of the vehicle")]
+    assert changes(decisions)[-2:] == [
+        ("recover", "stale poses"),
+        ("abort", "no new pose of the vehicle"),
+    ]
     assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
     assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
     levelled = [d for d in decisions if d.note.startswith("level")]
@@ -156,7 +178,9 @@ def test_payload_lost_but_not_the_vehicle():
 
 
 def test_a_short_gap_is_flown_through():
-    _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, until=START + 0.08), seconds=6.0)
+    _, decisions = thrown(
+        action=NEVER, poses=lost({"vehicle", "payload"}, until=START + 0.08), seconds=6.0
+    )
     assert decisions[-1].state == "throw"
 
 
@@ -186,8 +210,12 @@ def test_bad_poses_are_no_poses(name):
 
 
 HARMLESS = {
-    "clock step": lambda time, poses: [dataclasses.replace(p, stamp=p.stamp + (time > START)) for p in poses],
-    "clock step back": lambda time, poses: [dataclasses.replace(p, stamp=p.stamp - (time > START)) for p in poses],
+    "clock step": lambda time, poses: [
+        dataclasses.replace(p, stamp=p.stamp + (time > START)) for p in poses
+    ],
+    "clock step back": lambda time, poses: [
+        dataclasses.replace(p, stamp=p.stamp - (time > START)) for p in poses
+    ],
     "doubled": lambda time, poses: [p for p in poses for _ in range(2)],
     "one bad": spoiled(BAD["jump"], START + 0.02),
 }
@@ -228,7 +256,9 @@ def test_poses_at_5_hz_from_mid_throw_on_end_the_run():
 
 @pytest.mark.parametrize("gap", [0.0, 0.15])
 def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
-    """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the two apart."""
+    """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the
+    two apart.
+    """
 
     def spoil(time, poses):
         if time <= START:
@@ -244,7 +274,10 @@ def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (('frames.vehicle.quaternion="wxyz"', 'frames.payload.quaternion="wxyz"'), "heading|tilted"),
+        (
+            ('frames.vehicle.quaternion="wxyz"', 'frames.payload.quaternion="wxyz"'),
+            "heading|tilted",
+        ),
         (('frames.vehicle.axes="y,-x,z"', 'frames.payload.axes="y,-x,z"'), "heading"),
         (("home_w=[1.0, 0.0, 1.333]",), "from its hover point"),
     ],
@@ -257,7 +290,10 @@ def test_the_checks_before_a_throw(overrides, message):
     assert not pilot.backend.sent, "nothing was ever sent"
 
 
-GOAL = 'frames.goal={axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0, marker_offset_b=[0.0, 0.0, 0.0]}'
+GOAL = (
+    'frames.goal={axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw_offset_deg=0.0,'
+    " marker_offset_b=[0.0, 0.0, 0.0]}"
+)
 
 
 @pytest.mark.parametrize("x", [2.0, 9.0])
@@ -266,21 +302,33 @@ def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_seen(x):
 
     def with_goal(time, poses):
         noise = 1e-4 * math.sin(1e3 * time)
-        return [*poses, dataclasses.replace(poses[0], body="goal", pos=(x + noise, 0.0, 0.0))] if poses else poses
+        return (
+            [*poses, dataclasses.replace(poses[0], body="goal", pos=(x + noise, 0.0, 0.0))]
+            if poses
+            else poses
+        )
 
     overrides = (GOAL, "goal_w=[9.0, 0.0, 0.0]", "states.check=1.5")
     _, decisions = thrown(overrides=overrides, seconds=4.0, poses=with_goal)
     state, reason = changes(decisions)[2]
-    assert (state, "goal x 9.00 m beyond" in reason) == (("ready", False) if x == 2.0 else ("abort", True))
+    assert (state, "goal x 9.00 m beyond" in reason) == (
+        ("ready", False) if x == 2.0 else ("abort", True)
+    )
 
 
 def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
-    """Nobody told the runner; the vehicle, rid of it, goes its own way, and is followed. The throw is over."""
+    """Nobody told the runner; the vehicle, rid of it, goes its own way, and is followed.
+
+    The throw is over.
+    """
     begun = START + 0.02
 
     def spoil(time, poses):
         fall = min(max(time - begun, 0.0) ** 2 * 0.5 * 9.81, 0.8)
-        return [dataclasses.replace(p, pos=(*p.pos[:2], p.pos[2] - fall * (p.body == "payload"))) for p in poses]
+        return [
+            dataclasses.replace(p, pos=(*p.pos[:2], p.pos[2] - fall * (p.body == "payload")))
+            for p in poses
+        ]
 
     pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=START + 0.6)
     assert pilot.tracks["vehicle"].gate.refused == {}
@@ -299,7 +347,10 @@ def test_no_throw_on_pictures_that_do_not_show(name):
     pilot.detections = Detections(pilot.pilot.camera, 0.1)
 
     def watch(time, decision):
-        seen = {thing: None if thing == name and hidden[0] <= time < hidden[1] else rays for thing, rays in shown.items()}
+        seen = {
+            thing: None if thing == name and hidden[0] <= time < hidden[1] else rays
+            for thing, rays in shown.items()
+        }
         pilot.look([Detection(time, seen["goal"], seen["ball"])])
 
     decisions = fly(pilot, hidden[1] + 2.0, watch=watch)
@@ -310,15 +361,25 @@ def test_no_throw_on_pictures_that_do_not_show(name):
 
 def test_bodies_exchanged_from_the_start_are_noticed():
     swap = BAD["swapped"]
-    _, decisions = thrown(poses=lambda t, poses: [swap(p) for p in poses], overrides=("states.check=1.5",), seconds=4.0)
+    _, decisions = thrown(
+        poses=lambda t, poses: [swap(p) for p in poses],
+        overrides=("states.check=1.5",),
+        seconds=4.0,
+    )
     assert "bodies exchanged" in changes(decisions)[2][1]
 
 
 @pytest.mark.parametrize(
     ("status", "reason"),
     [
-        (lambda t: Status(t < START, "silent"), "the autopilot is silent, disarmed or in another mode: silent"),
-        (lambda t: Status(True, "", "failed" if t > START else "idle"), "the release was refused or not answered"),
+        (
+            lambda t: Status(t < START, "silent"),
+            "the autopilot is silent, disarmed or in another mode: silent",
+        ),
+        (
+            lambda t: Status(True, "", "failed" if t > START else "idle"),
+            "the release was refused or not answered",
+        ),
     ],
 )
 def test_an_autopilot_that_goes(status, reason):
@@ -328,7 +389,9 @@ def test_an_autopilot_that_goes(status, reason):
 
 
 def test_an_autopilot_in_another_mode_never_leads_to_a_throw():
-    pilot, decisions = thrown(status=lambda t: Status(False, "mode"), overrides=("states.idle=2.0",), seconds=5.0)
+    pilot, decisions = thrown(
+        status=lambda t: Status(False, "mode"), overrides=("states.idle=2.0",), seconds=5.0
+    )
     assert ("abort", "autopilot not ready (mode), for 2 s") in changes(decisions)
     assert decisions[-1].state == "done", "what was never ours needs no descent"
     assert not pilot.backend.sent
@@ -341,9 +404,13 @@ def test_a_policy_that_puts_out_no_numbers(value):
 
     def broken(*args):
         out = act(*args)
-        return dataclasses.replace(out, command=np.full((1, 4), value, np.float32), release=np.array([True]))
+        return dataclasses.replace(
+            out, command=np.full((1, 4), value, np.float32), release=np.array([True])
+        )
 
-    decisions = fly(pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None)
+    decisions = fly(
+        pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None
+    )
     safe(pilot, decisions)
     assert "is not finite" in changes(decisions)[-1][1]
     assert not pilot.backend.release_times, "what it says of the release counts for nothing either"
@@ -390,7 +457,10 @@ def narrowed(pilot, high):
 
 
 def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
-    """The payload is off, the vehicle brakes: what was to be done is done. It comes down at once, and says why."""
+    """The payload is off, the vehicle brakes: what was to be done is done.
+
+    It comes down at once, and says why.
+    """
     pilot = runner(AT_ONCE, "throws=2")
     decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
     safe(pilot, decisions)
@@ -408,19 +478,32 @@ def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
 
 
-@pytest.mark.parametrize(("sends", "ended"), [(True, ["check", "ready", "abort"]), (False, ["check", "ready"])])
+@pytest.mark.parametrize(
+    ("sends", "ended"), [(True, ["check", "ready", "abort"]), (False, ["check", "ready"])]
+)
 def test_a_fence_that_others_leave_ends_no_run_that_looks_on(sends, ended):
-    """A recorded throw brakes below the floor: whoever only looks on flies nothing there. A vehicle of ours comes down."""
+    """A recorded throw brakes below the floor: whoever only looks on flies nothing there.
+
+    A vehicle of ours comes down.
+    """
     machine, states = Machine(runner().params.states, 1, patient=True, sends=sends), []
     for tick in range(500):
-        states.append(machine.step(tick * TICK, Inputs(0, 0, fence="vehicle's braking point z" if tick > 300 else None)))
+        states.append(
+            machine.step(
+                tick * TICK, Inputs(0, 0, fence="vehicle's braking point z" if tick > 300 else None)
+            )
+        )
     assert list(dict.fromkeys(states)) == ended
 
 
 def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
-    """The vehicle drifts while it is armed, beyond where a throw may begin; then the thrust is wrong. Neither is called a swing."""
+    """The vehicle drifts while it is armed, beyond where a throw may begin; then the thrust is
+    wrong. Neither is called a swing.
+    """
     pilot = runner(AT_ONCE, "states.armed=1.5", "states.armed_least=1.0")
-    pilot._thrust_off = lambda: ["hovering takes 1.10 times the weight"] if pilot.machine.state == "armed" else []
+    pilot._thrust_off = lambda: (
+        ["hovering takes 1.10 times the weight"] if pilot.machine.state == "armed" else []
+    )
     decisions = fly(pilot, 5.0)
     assert ("ready", "disarmed: hovering takes 1.10 times the weight") in changes(decisions)
     waits = [d.waits for d in decisions if d.state == "armed"]
@@ -434,7 +517,9 @@ def test_no_exception_leaves_the_runner():
     def broken(*args):
         raise ZeroDivisionError("in flight")
 
-    decisions = fly(pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None)
+    decisions = fly(
+        pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None
+    )
     safe(pilot, decisions)
     assert changes(decisions)[-1] == ("abort", "ZeroDivisionError: in flight")
     assert "in flight" in pilot.errors[0]
@@ -464,7 +549,9 @@ def test_a_failed_recording_prevents_the_next_throw_only():
 
 def test_a_tick_overrun_in_mid_throw():
     """A tick that comes 0.15 s late: poses have waited, content is as old as it is."""
-    _, decisions = thrown(action=NEVER, late=lambda t: 0.03 if START < t < START + 0.02 else 0.0, seconds=5.0)
+    _, decisions = thrown(
+        action=NEVER, late=lambda t: 0.03 if START < t < START + 0.02 else 0.0, seconds=5.0
+    )
     assert decisions[-1].state == "throw"
 
 
@@ -486,7 +573,13 @@ def test_another_camera_is_refused():
         ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
         ("states.armed=-1.0", "armed is -1.0; expected above 0"),
         ("home_w=[0.0, 0.0, 30.0]", "expected within the vehicle's fence"),
-        ("goal_w=[9.0, 0.0, 0.0]", r"goal_w \(9.0, .* expected within the payload's fence, \(-3.0, -3.0, -0.05\) to \(3.0, 3.0, 3.0\)"),
+        (
+            "goal_w=[9.0, 0.0, 0.0]",
+            (
+                r"goal_w \(9.0, .* expected within the payload's fence, \(-3.0, -3.0, -0.05\) to"
+                r" \(3.0, 3.0, 3.0\)"
+            ),
+        ),
         ("landing_height=-3.0", "expected within the payload's fence"),
         ("link.system=300", "expected 1 to 255"),
     ],

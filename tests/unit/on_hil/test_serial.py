@@ -16,7 +16,9 @@ from hil.params import HilParams
 from visthrow import config
 from visthrow.common.errors import StorageError
 
-PARAMS = config.load(HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]).betaflight
+PARAMS = config.load(
+    HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]
+).betaflight
 STATUS = struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0)
 
 
@@ -64,11 +66,17 @@ def test_a_back_end_on_a_serial_port(wire):
     answer = msp.pack(msp.Frame(msp.STATUS, STATUS, msp.ANSWER))
     os.write(controller, answer[:7])
     serve(backend, 0.2)
-    os.write(controller, answer[7:] + msp.pack(msp.Frame(msp.BOXIDS, bytes([0, 1, 27, 50]), msp.ANSWER)))
+    os.write(
+        controller, answer[7:] + msp.pack(msp.Frame(msp.BOXIDS, bytes([0, 1, 27, 50]), msp.ANSWER))
+    )
     serve(backend, 0.3)
-    assert not backend.send((2.668, 0.0, 0.0, 0.0), 0.3), "the order of the channels is not known yet"
+    assert not backend.send((2.668, 0.0, 0.0, 0.0), 0.3), (
+        "the order of the channels is not known yet"
+    )
     assert not backend.status(0.3).connected
-    os.write(controller, msp.pack(msp.Frame(msp.RX_MAP, bytes([0, 1, 3, 2, 4, 5, 6, 7]), msp.ANSWER)))
+    os.write(
+        controller, msp.pack(msp.Frame(msp.RX_MAP, bytes([0, 1, 3, 2, 4, 5, 6, 7]), msp.ANSWER))
+    )
     serve(backend, 0.35)
     assert backend.status(0.35).connected
     backend.ask("follow", 0.4)
@@ -106,7 +114,9 @@ def test_what_went_over_the_port_is_written_down(wire, tmp_path):
     path = tmp_path / "run" / "link.msp"
     chunks = [(way, data) for way, data in read_log(path)]
     assert chunks[0] == (b"<", b"abc")
-    assert b"".join(data for way, data in chunks if way == b">") == b"defg", "in pieces, as they came"
+    assert b"".join(data for way, data in chunks if way == b">") == b"defg", (
+        "in pieces, as they came"
+    )
     with pytest.raises(StorageError, match="cannot write"):
         LoggedPort(port, tmp_path)
 
@@ -124,5 +134,7 @@ def test_a_port_that_is_not_there_is_named_once():
     pytest.importorskip("serial")
     with pytest.raises(LinkError) as caught:
         SerialPort(Device("serial", "/dev/no_such_port", 115200))
-    assert str(caught.value).startswith("cannot open /dev/no_such_port: No such file or directory; plugged in here: ")
+    assert str(caught.value).startswith(
+        "cannot open /dev/no_such_port: No such file or directory; plugged in here: "
+    )
     assert str(caught.value).count("no_such_port") == 1

@@ -1,4 +1,6 @@
-"""MAVLink signing: keys, what is taken and what is not; pymavlink's own check is the oracle for what we send."""
+"""MAVLink signing: keys, what is taken and what is not; pymavlink's own check is the oracle for
+what we send.
+"""
 
 import hashlib
 import time
@@ -35,10 +37,16 @@ def keyed(tmp_path, data: bytes, mode=0o600):
 def test_a_key_is_raw_hexadecimal_or_a_phrase(tmp_path):
     assert read_key(keyed(tmp_path, KEY)) == KEY
     assert read_key(keyed(tmp_path, KEY.hex().encode() + b"\n")) == KEY
-    assert read_key(keyed(tmp_path, b"correct horse battery\n")) == hashlib.sha256(b"correct horse battery").digest()
+    assert (
+        read_key(keyed(tmp_path, b"correct horse battery\n"))
+        == hashlib.sha256(b"correct horse battery").digest()
+    )
 
 
-@pytest.mark.parametrize(("data", "mode", "text"), [(b"short", 0o600, "5 characters; expected 32 bytes"), (KEY, 0o644, "chmod 600")])
+@pytest.mark.parametrize(
+    ("data", "mode", "text"),
+    [(b"short", 0o600, "5 characters; expected 32 bytes"), (KEY, 0o644, "chmod 600")],
+)
 def test_files_that_are_no_key(tmp_path, data, mode, text):
     with pytest.raises(LinkError, match=text):
         read_key(keyed(tmp_path, data, mode))
@@ -76,7 +84,10 @@ def test_unsigned_and_wrongly_signed_messages_are_refused_and_counted(theirs):
     hear(link)
     assert got == []
     (row,) = link.roster.summary()["refused_most"]
-    assert (row["count"], row["what"]) == (4, "message of system 1, component 1 from 127.0.0.1:1: no valid signature")
+    assert (row["count"], row["what"]) == (
+        4,
+        "message of system 1, component 1 from 127.0.0.1:1: no valid signature",
+    )
 
 
 def test_no_message_counts_twice():

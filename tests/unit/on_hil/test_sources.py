@@ -1,4 +1,6 @@
-"""Sources: senders told apart, pairs, .tlog and CSV read as the live link does, wrong files told."""
+"""Sources: senders told apart, pairs, .tlog and CSV read as the live link does, wrong
+files told.
+"""
 
 import gzip
 import math
@@ -35,7 +37,21 @@ def mocap(time_us=1_000_000, x=1.0):
 
 def odometry():
     return mav.MAVLink_odometry_message(
-        7, 20, 12, 1.0, 2.0, 3.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, [0.0] * 21, [0.0] * 21
+        7,
+        20,
+        12,
+        1.0,
+        2.0,
+        3.0,
+        [1.0, 0.0, 0.0, 0.0],
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        [0.0] * 21,
+        [0.0] * 21,
     )
 
 
@@ -57,7 +73,15 @@ def test_a_local_position_takes_the_attitude_of_its_sender():
     assert decoder.feed(local, 0.0) is None, "another sender's"
     decoder.feed(wired(attitude), 0.0)
     pose = decoder.feed(local, 0.5)
-    assert pose == Pose(1.0, 0.5, "vehicle", (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (4.0, 5.0, 6.0), (0.25, 0.5, 0.75))
+    assert pose == Pose(
+        1.0,
+        0.5,
+        "vehicle",
+        (1.0, 2.0, 3.0),
+        (1.0, 0.0, 0.0, 0.0),
+        (4.0, 5.0, 6.0),
+        (0.25, 0.5, 0.75),
+    )
     late = wired(mav.MAVLink_local_position_ned_message(1100, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
     assert decoder.feed(late, 0.0) is None, "too old an attitude"
 
@@ -122,7 +146,9 @@ def test_files_that_are_no_tlog(tmp_path):
 
 CSV = "t,x,y,z,roll,pitch,yaw\n1000,1,2,3,0,0,90\n1010,1.5,2,3,0,0,90\n\n1020,,2,3,0,0,90\n"
 PLACE = ChannelMap("pos_w", ("x", "y", "z"), "mm")
-MAPPING = TableMap(TimeColumn("t", "ms"), (PLACE, ChannelMap("quat_wb", ("roll", "pitch", "yaw"), "deg", "euler")))
+MAPPING = TableMap(
+    TimeColumn("t", "ms"), (PLACE, ChannelMap("quat_wb", ("roll", "pitch", "yaw"), "deg", "euler"))
+)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -145,10 +171,13 @@ def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
     turned = np.tile([0.0, 0.0, 0.0, 1.0], (8, 1))
     turned[3:, 2:] = math.sqrt(0.5)
     valid = np.arange(20) != 5
-    log = FlightLog({
-        "pos_w": Channel(time, place, "m", "world", valid), "quat_wb": Channel(time[:16:2] + 0.004, turned, "1", "world"),
-        "payload_pos_w": Channel(time + 0.003, place - [0, 0, 0.4], "m", "world"),
-    })  # fmt: skip
+    log = FlightLog(
+        {
+            "pos_w": Channel(time, place, "m", "world", valid),
+            "quat_wb": Channel(time[:16:2] + 0.004, turned, "1", "world"),
+            "payload_pos_w": Channel(time + 0.003, place - [0, 0, 0.4], "m", "world"),
+        }
+    )
     log.save(tmp_path / "a.npz")
     poses = read_table(tmp_path / "a.npz", None)
     vehicle = [pose for pose in poses if pose.body == "vehicle"]
@@ -183,22 +212,45 @@ def test_wrong_csv(tmp_path, text, message):
 def test_csv_without_mapping(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(CSV)
-    with pytest.raises(SourceError, match=r"columns t, x, y, z, roll, pitch, yaw, .*it needs a mapping"):
+    with pytest.raises(
+        SourceError, match=r"columns t, x, y, z, roll, pitch, yaw, .*it needs a mapping"
+    ):
         read_table(path, None)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (('source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="m"}]',), "columns of a table need its time"),
-        (('source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="deg"}]', 'source.time={column="t"}'), "of the kind 'rad'"),
-        (('source.columns=[{name="quat_wb", columns=["r", "p", "y"], unit="deg", kind="euler"}]', 'source.time={column="t"}'),
-         "kind csv writes 'xyzw'"),
+        (
+            ('source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="m"}]',),
+            "columns of a table need its time",
+        ),
+        (
+            (
+                'source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="deg"}]',
+                'source.time={column="t"}',
+            ),
+            "of the kind 'rad'",
+        ),
+        (
+            (
+                (
+                    'source.columns=[{name="quat_wb", columns=["r", "p", "y"], unit="deg",'
+                    ' kind="euler"}]'
+                ),
+                'source.time={column="t"}',
+            ),
+            "kind csv writes 'xyzw'",
+        ),
     ],
-)  # fmt: skip
+)
 def test_wrong_mappings(settings, message):
     with pytest.raises(ConfigError, match=message):
-        config.load(HilParams, config.find("hil", "dry_run"), ("source.kind=csv", "source.file=a.csv", *settings))
+        config.load(
+            HilParams,
+            config.find("hil", "dry_run"),
+            ("source.kind=csv", "source.file=a.csv", *settings),
+        )
 
 
 def test_recorded_poses_come_when_their_time_has_come():

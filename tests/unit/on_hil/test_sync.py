@@ -1,4 +1,6 @@
-"""Clocks of peers by TIMESYNC: offset, drift, a clock that is set; poses dated by them, and stamps of another clock."""
+"""Clocks of peers by TIMESYNC: offset, drift, a clock that is set; poses dated by them, and stamps
+of another clock.
+"""
 
 import numpy as np
 import pytest
@@ -65,15 +67,25 @@ def test_one_wild_exchange_changes_nothing():
 
 
 def dated(offset, seconds=2.0, stamp_offset=None):
-    """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet another clock."""
+    """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet
+    another clock.
+    """
     here, there = pipe()
-    fake = FakeArduPilot(LevelPlant(), Link(there, *VEHICLE_ID), MocapParams(loss=0.0), 0, Options(clock_offset=offset))
+    fake = FakeArduPilot(
+        LevelPlant(),
+        Link(there, *VEHICLE_ID),
+        MocapParams(loss=0.0),
+        0,
+        Options(clock_offset=offset),
+    )
     if stamp_offset is not None:
         plain = fake.wall
         fake.wall = lambda: plain() + stamp_offset
     link = Link(here)
     sync = LinkSync(link)
-    source = MavlinkSource(link, (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 1),), lambda: fake.plant.time)
+    source = MavlinkSource(
+        link, (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 1),), lambda: fake.plant.time
+    )
     poses = []
     for _ in range(round(seconds / fake.plant.period)):
         fake.step()

@@ -1,4 +1,6 @@
-"""The operator's terminal: lines, half lines, what is no text, signals; and a console that holds nobody up."""
+"""The operator's terminal: lines, half lines, what is no text, signals; and a console that holds
+nobody up.
+"""
 
 import os
 import signal
@@ -36,7 +38,9 @@ def test_lines_are_words_and_half_a_line_holds_nobody_up(typed):
     assert terminal.words("ready") == OperatorInput(arm=True, land=True)
     assert terminal.words("ready") == OperatorInput()
     os.write(typed, b"\xff\xfe\xe9\nabort\n")
-    assert terminal.words("ready") == OperatorInput(abort=True), "bytes that are no text raise nothing"
+    assert terminal.words("ready") == OperatorInput(abort=True), (
+        "bytes that are no text raise nothing"
+    )
     os.write(typed, b"arm")
     os.close(typed)
     assert terminal.words("ready") == OperatorInput(arm=True), "the last line needs no end"
@@ -86,12 +90,19 @@ def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
 
 @pytest.mark.parametrize(
     ("base", "override"),
-    [("ardupilot", "throws=1"), ("fake", 'link.device="udp:192.168.1.2:14560"'), ("vicon", "throws=1"),
-     ("fake_betaflight", 'betaflight.device="serial:/dev/ttyACM0:115200"'), ("fake", 'source.device="udp:10.0.0.1:14561"')],
-)  # fmt: skip
+    [
+        ("ardupilot", "throws=1"),
+        ("fake", 'link.device="udp:192.168.1.2:14560"'),
+        ("vicon", "throws=1"),
+        ("fake_betaflight", 'betaflight.device="serial:/dev/ttyACM0:115200"'),
+        ("fake", 'source.device="udp:10.0.0.1:14561"'),
+    ],
+)
 def test_auto_arm_is_refused_for_what_is_not_on_this_machine(base, override):
     params = config.load(HilParams, config.find("hil", base), (override, "link.remote=true"))
-    with pytest.raises(RunError, match=r"--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"):
+    with pytest.raises(
+        RunError, match=r"--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"
+    ):
         require_fake(params)
     require_fake(config.load(HilParams, config.find("hil", "fake_betaflight")))
 
@@ -118,8 +129,19 @@ def test_a_terminal_that_takes_nothing_holds_nobody_up(monkeypatch):
 
 def test_a_reason_is_not_said_twice(capsys):
     console = Console()
-    for state, reason, waits in (("abort", "no", ""), ("done", "no", ""), ("idle", "start", "no pose"), ("idle", "start", "disarmed")):
+    for state, reason, waits in (
+        ("abort", "no", ""),
+        ("done", "no", ""),
+        ("idle", "start", "no pose"),
+        ("idle", "start", "disarmed"),
+    ):
         console.decision(Decision(1.0, state, reason, waits=waits))
     console.close()
     said = [line.split(maxsplit=2)[2] for line in capsys.readouterr().err.splitlines()]
-    assert [" ".join(line.split()) for line in said] == ["abort no", "done", "idle start", "idle waits: no pose", "idle waits: disarmed"]
+    assert [" ".join(line.split()) for line in said] == [
+        "abort no",
+        "done",
+        "idle start",
+        "idle waits: no pose",
+        "idle waits: disarmed",
+    ]

@@ -20,7 +20,9 @@ def test_there_and_back():
     for thrust in (0.6, 1.0, 2.668, 4.0, 6.0):
         assert BENT.thrust(BENT.share(thrust)) == pytest.approx(thrust)
     assert BENT.share(2.668) == pytest.approx(0.37)
-    assert BENT.share(3.668) - BENT.share(2.668) == pytest.approx(0.37 / 2.668 / 0.8), "a flatter vehicle needs more share"
+    assert BENT.share(3.668) - BENT.share(2.668) == pytest.approx(0.37 / 2.668 / 0.8), (
+        "a flatter vehicle needs more share"
+    )
     assert (BENT.share(-5.0), BENT.share(50.0)) == (0.0, 1.0)
     assert BENT.thrust(0.0) == pytest.approx(0.2 * 2.668)
 
@@ -30,20 +32,30 @@ def test_a_lower_battery_gets_more_share():
     assert params.share(2.668, 12.0) == pytest.approx(0.2)
     assert params.share(2.668, 10.8) == pytest.approx(0.2 / 0.81)
     assert params.share(2.668, None) == pytest.approx(0.2), "unknown: not corrected"
-    assert params.share(2.668, 0.0) == pytest.approx(0.2 * 1.25**2), "a wrong reading does not run away"
+    assert params.share(2.668, 0.0) == pytest.approx(0.2 * 1.25**2), (
+        "a wrong reading does not run away"
+    )
     assert BENT.share(2.668, 5.0) == pytest.approx(0.37), "not corrected where the config says so"
 
 
 @pytest.mark.parametrize(
-    "wrong", [(0.0, 0.3, 1.0, 0.1, 0.0), (1.0, 1.2, 1.0, 0.1, 0.0), (1.0, 0.3, 0.1, 0.1, 0.0), (1.0, 0.3, 1.0, 0.0, 0.0),
-              (1.0, 0.3, 1.0, 0.1, -1.0)],
-)  # fmt: skip
+    "wrong",
+    [
+        (0.0, 0.3, 1.0, 0.1, 0.0),
+        (1.0, 1.2, 1.0, 0.1, 0.0),
+        (1.0, 0.3, 0.1, 0.1, 0.0),
+        (1.0, 0.3, 1.0, 0.0, 0.0),
+        (1.0, 0.3, 1.0, 0.1, -1.0),
+    ],
+)
 def test_calibrations_that_are_none(wrong):
     with pytest.raises(ConfigError, match=r"weight|hover|slope|tolerance|voltage"):
         ThrustParams(*wrong)
 
 
-@pytest.mark.parametrize(("off", "good"), [(0.0, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)])
+@pytest.mark.parametrize(
+    ("off", "good"), [(0.0, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)]
+)
 def test_the_measured_hover_is_held_against_the_calibration(off, good):
     meter = HoverMeter(BENT)
     for _ in range(LEAST_SHARES):
@@ -60,13 +72,20 @@ def test_too_few_values_measure_nothing():
     meter = HoverMeter(BENT)
     meter.add(0.9)
     assert meter.share is None
-    assert meter.summary_text(0.272) == (True, "hover share not measured: 1 of 50 values in steady hover")
+    assert meter.summary_text(0.272) == (
+        True,
+        "hover share not measured: 1 of 50 values in steady hover",
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "override", "message"),
     [
-        ("fake", "ardupilot.thrust.hover=0.37", r"gives 7\.\d+ N at most, the policy was trained with 14 N"),
+        (
+            "fake",
+            "ardupilot.thrust.hover=0.37",
+            r"gives 7\.\d+ N at most, the policy was trained with 14 N",
+        ),
         ("fake_px4", "px4.thrust.slope=0.7", "gives 12.* N at most"),
         ("fake_betaflight", "betaflight.rates.rc_rates=[40, 60, 30]", None),
         ("fake_betaflight", "betaflight.rates.rates=[60, 60, 20]", None),
@@ -78,8 +97,11 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
     params = config.load(HilParams, config.find("hil", name), [override])
     if message is None:  # with actual rates the end counts, and is never below the middle's slope
         require_reach(params, contract)
-        slow = config.load(HilParams, config.find("hil", name), ["betaflight.rates.rc_rates=[30, 60, 30]",
-                                                                 "betaflight.rates.rates=[30, 60, 30]"])  # fmt: skip
+        slow = config.load(
+            HilParams,
+            config.find("hil", name),
+            ["betaflight.rates.rc_rates=[30, 60, 30]", "betaflight.rates.rates=[30, 60, 30]"],
+        )
         with pytest.raises(RunError, match=r"reach 5\.2, 10\.5, 5\.2 rad/s on roll, pitch, yaw"):
             require_reach(slow, contract)
     else:
@@ -89,22 +111,35 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
 
 @pytest.mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
 def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name):
-    """They differ from those of the fakes in devices, calibration, mechanism and the lateness of commands alone."""
+    """They differ from those of the fakes in devices, calibration, mechanism and the lateness of
+    commands alone.
+    """
     real = config.load(HilParams, config.find("hil", name))
-    fake = config.load(HilParams, config.find("hil", "fake" if name == "ardupilot" else f"fake_{name}"))
+    fake = config.load(
+        HilParams, config.find("hil", "fake" if name == "ardupilot" else f"fake_{name}")
+    )
     require_reach(real, simple_policy().contract)
     assert (real.backend, getattr(real, name).audit) == (name, True)
     swapped = dataclasses.replace(
-        real, link=fake.link, ardupilot=fake.ardupilot, px4=fake.px4, betaflight=fake.betaflight,
-        delay=dataclasses.replace(real.delay, command=fake.delay.command), source=dataclasses.replace(real.source, device=None),
-    )  # fmt: skip
+        real,
+        link=fake.link,
+        ardupilot=fake.ardupilot,
+        px4=fake.px4,
+        betaflight=fake.betaflight,
+        delay=dataclasses.replace(real.delay, command=fake.delay.command),
+        source=dataclasses.replace(real.source, device=None),
+    )
     assert swapped == fake
     with pytest.raises(ConfigError, match="a recording flies dry"):
-        config.load(HilParams, config.find("hil", name), ['source.kind="tlog"', 'source.file="a.tlog"'])
+        config.load(
+            HilParams, config.find("hil", name), ['source.kind="tlog"', 'source.file="a.tlog"']
+        )
 
 
 def test_a_curve_of_the_rotors_is_inverted_exactly():
-    """``T = W (z / z_h)^2`` with ``z = idle + (1 - idle) u``: 4 times the weight at twice the motors' command."""
+    """``T = W (z / z_h)^2`` with ``z = idle + (1 - idle) u``: 4 times the weight at twice the
+    motors' command.
+    """
     params = ThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, 2.0, 0.055)
     motors = 0.055 + 0.945 * 0.36
     double = (2 * motors - 0.055) / 0.945
@@ -118,5 +153,8 @@ def test_a_curve_of_the_rotors_is_inverted_exactly():
 
 @pytest.mark.parametrize("wrong", [(0.5, 0.0), (2.0, 0.6), (2.0, -0.1)])
 def test_curves_that_no_rotor_has_are_refused(wrong):
-    with pytest.raises(ConfigError, match=r"exponent is 0.5; expected 1 to 3|idle is .*; expected 0 or more and below 0.5"):
+    with pytest.raises(
+        ConfigError,
+        match=r"exponent is 0.5; expected 1 to 3|idle is .*; expected 0 or more and below 0.5",
+    ):
         ThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, *wrong)

@@ -1,4 +1,6 @@
-"""`visthrow diagnose check`: a flight made of closed forms, and everything that can be wrong with its log."""
+"""`visthrow diagnose check`: a flight made of closed forms, and everything that can be wrong with
+its log.
+"""
 
 import json
 
@@ -18,11 +20,19 @@ DELAY = 0.04
 """Of the rates behind the commands [s]."""
 
 
-def flight(seconds: float = 12.0, rate: float = 100.0, seed: int = 0, scale: float = 1.0) -> dict[str, np.ndarray]:
-    """Columns of a flight along a smooth path, attitude along the thrust that it takes; noise of a good motion capture."""
+def flight(
+    seconds: float = 12.0, rate: float = 100.0, seed: int = 0, scale: float = 1.0
+) -> dict[str, np.ndarray]:
+    """Columns of a flight along a smooth path, attitude along the thrust that it takes; noise of a
+    good motion capture.
+    """
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, seconds, 1.0 / rate)
-    tones = [(axis, a, w, rng.uniform(0, 6)) for axis in range(3) for a, w in ((0.6, 1.3 + 0.4 * axis), (0.08, 5.1 + axis))]
+    tones = [
+        (axis, a, w, rng.uniform(0, 6))
+        for axis in range(3)
+        for a, w in ((0.6, 1.3 + 0.4 * axis), (0.08, 5.1 + axis))
+    ]
     pos, vel, acc = (np.zeros((len(time), 3)) for _ in range(3))
     for axis, a, w, phase in tones:
         a, w = a * scale, w * rng.uniform(0.75, 1.25)
@@ -45,30 +55,47 @@ def flight(seconds: float = 12.0, rate: float = 100.0, seed: int = 0, scale: flo
     thrust = 0.2 * np.linalg.norm(force, axis=1)
     quat = (turn * Rotation.from_rotvec(rng.normal(0, step, (len(time), 3)))).as_quat()
     return {
-        "time": time, "pos_w": pos + [0, 0, 3.0] + rng.normal(0, 3e-4, pos.shape), "vel_w": vel + rng.normal(0, 5e-3, vel.shape),
-        "quat_wb": quat, "rate_b": rates + rng.normal(0, 0.02, rates.shape),
+        "time": time,
+        "pos_w": pos + [0, 0, 3.0] + rng.normal(0, 3e-4, pos.shape),
+        "vel_w": vel + rng.normal(0, 5e-3, vel.shape),
+        "quat_wb": quat,
+        "rate_b": rates + rng.normal(0, 0.02, rates.shape),
         "acc_b": turn.inv().apply(force) + rng.normal(0, 0.1, force.shape),
         "command": np.column_stack([thrust, ahead]) + rng.normal(0, 1e-3, (len(time), 4)),
-    }  # fmt: skip
+    }
 
 
 UNITS = {
-    "pos_w": ("m", "world"), "vel_w": ("m/s", "world"), "quat_wb": ("1", "world"), "rate_b": ("rad/s", "body"),
-    "acc_b": ("m/s^2", "body"), "command": ("N, rad/s", "body"), "payload_pos_w": ("m", "world"),
-    "motor_command": ("1", "none"), "est_pos_w": ("m", "world"),
-}  # fmt: skip
+    "pos_w": ("m", "world"),
+    "vel_w": ("m/s", "world"),
+    "quat_wb": ("1", "world"),
+    "rate_b": ("rad/s", "body"),
+    "acc_b": ("m/s^2", "body"),
+    "command": ("N, rad/s", "body"),
+    "payload_pos_w": ("m", "world"),
+    "motor_command": ("1", "none"),
+    "est_pos_w": ("m", "world"),
+}
 
 
 def log_of(columns: dict[str, np.ndarray], **channels: Channel) -> FlightLog:
     time = columns["time"]
-    made = {name: Channel(time, values, *UNITS[name]) for name, values in columns.items() if name != "time"}
+    made = {
+        name: Channel(time, values, *UNITS[name])
+        for name, values in columns.items()
+        if name != "time"
+    }
     return FlightLog({**made, **channels})
 
 
 def faults(log: FlightLog, verdict: str = "bad") -> str:
     """Topics, channels and words of all rows with a verdict."""
     (checked,) = check([log])
-    return " | ".join(f"{r.topic} {r.channel}: {r.text}" for r in checked.rows if r.verdict == verdict and r.topic != "answers")
+    return " | ".join(
+        f"{r.topic} {r.channel}: {r.text}"
+        for r in checked.rows
+        if r.verdict == verdict and r.topic != "answers"
+    )
 
 
 def test_a_good_flight_has_nothing_wrong():
@@ -82,14 +109,19 @@ def test_a_good_flight_has_nothing_wrong():
 
 
 def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
-    """Half of the time without a payload that was a third of the whole: beside a flight that keeps it its thrust carries the same mass."""
+    """Half of the time without a payload that was a third of the whole: beside a flight that keeps
+    it its thrust carries the same mass.
+    """
     columns = flight()
     gone = columns["time"] > 0.5 * columns["time"][-1]
     lighter = {**columns, "command": columns["command"] * np.where(gone, 2.0 / 3.0, 1.0)[:, None]}
     kept = log_of(flight(seed=1))
     attached = Channel(columns["time"], ~gone, "bool")
     told = [check([kept, log_of(lighter, **more)]) for more in ({"attached": attached}, {})]
-    assert [any("the thrust's scale differs" in row.text for one in found for row in one.rows) for found in told] == [False, True]
+    assert [
+        any("the thrust's scale differs" in row.text for one in found for row in one.rows)
+        for found in told
+    ] == [False, True]
 
 
 def test_noise_is_measured_beside_motion():
@@ -101,10 +133,14 @@ def test_noise_is_measured_beside_motion():
 @pytest.mark.parametrize(
     ("channel", "factor", "words"),
     [
-        ("rate_b", 180 / np.pi, "degrees"), ("rate_b", np.pi / 180, "degrees"), ("acc_b", 1 / 9.80665, "in g"),
-        ("vel_w", 1000.0, "thousandths"), ("pos_w", 1000.0, "thousandths"), ("pos_w", 1e-3, ""),
+        ("rate_b", 180 / np.pi, "degrees"),
+        ("rate_b", np.pi / 180, "degrees"),
+        ("acc_b", 1 / 9.80665, "in g"),
+        ("vel_w", 1000.0, "thousandths"),
+        ("pos_w", 1000.0, "thousandths"),
+        ("pos_w", 1e-3, ""),
     ],
-)  # fmt: skip
+)
 def test_wrong_units(channel, factor, words):
     columns = flight()
     columns[channel] = columns[channel] * factor
@@ -115,7 +151,9 @@ def test_wrong_units(channel, factor, words):
 
 
 @pytest.mark.parametrize("channel", ["rate_b", "vel_w", "acc_b"])
-@pytest.mark.parametrize(("order", "signs"), [((1, 0, 2), (1, 1, 1)), ((0, 1, 2), (1, -1, -1)), ((0, 2, 1), (1, 1, 1))])
+@pytest.mark.parametrize(
+    ("order", "signs"), [((1, 0, 2), (1, 1, 1)), ((0, 1, 2), (1, -1, -1)), ((0, 2, 1), (1, 1, 1))]
+)
 def test_wrong_axes(channel, order, signs):
     columns = flight()
     columns[channel] = columns[channel][:, order] * signs
@@ -152,10 +190,16 @@ def test_scrambled_commands_are_caught():
 
 def test_a_pose_stream_of_another_clock_is_told():
     columns = flight()
-    late = np.column_stack([np.interp(columns["time"] - 0.035, columns["time"], c) for c in columns["pos_w"].T])
+    late = np.column_stack(
+        [np.interp(columns["time"] - 0.035, columns["time"], c) for c in columns["pos_w"].T]
+    )
     columns["est_pos_w"] = late
     (checked,) = check([log_of(columns)])
-    (row,) = [r for r in checked.rows if r.channel == "pos_w, est_pos_w" and r.topic == "delay" and "delay_s" in r.figures]
+    (row,) = [
+        r
+        for r in checked.rows
+        if r.channel == "pos_w, est_pos_w" and r.topic == "delay" and "delay_s" in r.figures
+    ]
     assert row.verdict == "warn"
     assert row.figures["delay_s"] == pytest.approx(0.035, abs=0.002)
 
@@ -163,7 +207,9 @@ def test_a_pose_stream_of_another_clock_is_told():
 def test_a_drifting_clock_is_told():
     columns = flight(40.0)
     stretched = columns["time"] * 1.001
-    columns["est_pos_w"] = np.column_stack([np.interp(stretched, columns["time"], c) for c in columns["pos_w"].T])
+    columns["est_pos_w"] = np.column_stack(
+        [np.interp(stretched, columns["time"], c) for c in columns["pos_w"].T]
+    )
     found = faults(log_of(columns), "warn")
     assert "the delay runs from -3" in found, found
 
@@ -187,7 +233,9 @@ def test_gaps_and_clocks():
     found = faults(log_of({name: values[keep] for name, values in columns.items()}), "warn")
     assert "the longest 1.21" in found
     columns = flight()
-    columns["time"] = columns["time"] + np.random.default_rng(0).uniform(-0.004, 0.004, len(columns["time"]))
+    columns["time"] = columns["time"] + np.random.default_rng(0).uniform(
+        -0.004, 0.004, len(columns["time"])
+    )
     assert "clock" in faults(log_of(columns), "warn")
     pose = flight()
     other = Channel(pose["time"] + 500.0, pose["pos_w"], "m", "world")
@@ -226,7 +274,16 @@ def test_explain_names_nothing_where_channels_contradict_each_other(tmp_path, ca
     columns = flight()
     columns["rate_b"] = columns["rate_b"] * 57.3
     log_of(columns).save(tmp_path / "a.npz")
-    cli.main(["diagnose", "explain", str(tmp_path / "a.npz"), "--no-report", "--json", str(tmp_path / "a.json")])
+    cli.main(
+        [
+            "diagnose",
+            "explain",
+            str(tmp_path / "a.npz"),
+            "--no-report",
+            "--json",
+            str(tmp_path / "a.json"),
+        ]
+    )
     assert "DATA INCONSISTENT" in capsys.readouterr().out
     assert json.loads((tmp_path / "a.json").read_text())["overall"] == "DATA INCONSISTENT"
 
@@ -235,7 +292,9 @@ def test_two_vehicles_with_one_payload_tell_their_clocks():
     first, other = flight(), flight(seed=3)
     late = dict(other, time=other["time"] + 0.013)
     first["payload_pos_w"] = first["pos_w"] - [0, 0, 0.4]
-    late["payload_pos_w"] = first["payload_pos_w"] + np.random.default_rng(0).normal(0, 2e-4, first["pos_w"].shape)
+    late["payload_pos_w"] = first["payload_pos_w"] + np.random.default_rng(0).normal(
+        0, 2e-4, first["pos_w"].shape
+    )
     rows = [r for r in check([log_of(first), log_of(late)])[1].rows if "rms_m" in r.figures]
     assert rows[0].figures["delay_s"] == pytest.approx(0.013, abs=1e-3)
     second = dict(late, payload_pos_w=other["pos_w"])
@@ -270,21 +329,27 @@ def test_too_short(count):
 def test_long_and_constant_logs():
     time = np.arange(0.0, 7200.0, 0.1)
     zero = np.zeros((len(time), 3))
-    log = FlightLog({"pos_w": Channel(time, zero, "m", "world"), "rate_b": Channel(time, zero, "rad/s", "body")})
+    log = FlightLog(
+        {"pos_w": Channel(time, zero, "m", "world"), "rate_b": Channel(time, zero, "rad/s", "body")}
+    )
     assert "one value from beginning to end" in faults(log)
     assert "long" in faults(log, "warn")
 
 
 def test_invalid_channels_do_not_stop_it():
     columns = flight()
-    none = Channel(columns["time"], columns["pos_w"], "m", "world", np.zeros(len(columns["time"]), bool))
+    none = Channel(
+        columns["time"], columns["pos_w"], "m", "world", np.zeros(len(columns["time"]), bool)
+    )
     assert "valid" in faults(log_of(columns, est_pos_w=none))
     assert check([FlightLog({})])[0].verdict == "bad"
 
 
 def test_relate_finds_delay_and_scale():
     time = np.arange(0, 20, 0.01)
-    a = np.column_stack([np.sin(1.1 * time) + np.sin(3.7 * time), np.cos(2.3 * time), np.sin(0.9 * time + 1)])
+    a = np.column_stack(
+        [np.sin(1.1 * time) + np.sin(3.7 * time), np.cos(2.3 * time), np.sin(0.9 * time + 1)]
+    )
     b = 2.0 * np.column_stack([np.interp(time - 0.0234, time, c) for c in a.T])
     found = relate(time, a, time, b)
     assert found.delay == pytest.approx(0.0234, abs=5e-4)
@@ -297,7 +362,20 @@ def test_relate_finds_delay_and_scale():
 
 def test_command_line(tmp_path, capsys):
     log_of(flight(6.0)).save(tmp_path / "a.npz")
-    assert cli.main(["diagnose", "check", str(tmp_path / "a.npz"), "--out", str(tmp_path), "--json", str(tmp_path / "a.json")]) == 0
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "check",
+                str(tmp_path / "a.npz"),
+                "--out",
+                str(tmp_path),
+                "--json",
+                str(tmp_path / "a.json"),
+            ]
+        )
+        == 0
+    )
     assert "a.npz: ok" in capsys.readouterr().out
     assert (tmp_path / "01-a.npz.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "a.json").read_text())["logs"][0]["verdict"] == "ok"
@@ -305,20 +383,48 @@ def test_command_line(tmp_path, capsys):
 
 
 def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, capsys):
-    """A flying model's cable and mass are of use without a table; a mapping is not, and is not ignored in silence."""
+    """A flying model's cable and mass are of use without a table; a mapping is not, and is not
+    ignored in silence.
+    """
     log = log_of(flight())
     log.save(tmp_path / "a.npz")
     log.save(tmp_path / "b.npz")
-    mapping = '[table.time]\ncolumn = "t"\n[[table.channels]]\nname = "current"\ncolumns = ["i"]\nunit = "A"\n'
+    mapping = (
+        '[table.time]\ncolumn = "t"\n[[table.channels]]\nname = "current"\ncolumns = ["i"]\nunit ='
+        ' "A"\n'
+    )
     (tmp_path / "mine.toml").write_text(f'about = "a table"\n{mapping}')
     (tmp_path / "t.csv").write_text("t,i\n" + "".join(f"{0.01 * n},{n % 7}\n" for n in range(200)))
     check_with = ["diagnose", "check", "--no-pictures", "--config"]
     refused = "is not used: it says how the columns of a table are read"
-    for files, setup in (("a.npz", "mine.toml"), ("a.npz+b.npz", "mine.toml"), ("a.npz", "pendulum_encoder")):
+    for files, setup in (
+        ("a.npz", "mine.toml"),
+        ("a.npz+b.npz", "mine.toml"),
+        ("a.npz", "pendulum_encoder"),
+    ):
         name = str(tmp_path / setup) if setup.endswith(".toml") else setup
-        assert cli.main([*check_with, name, "+".join(str(tmp_path / file) for file in files.split("+"))]) == 2
+        assert (
+            cli.main(
+                [*check_with, name, "+".join(str(tmp_path / file) for file in files.split("+"))]
+            )
+            == 2
+        )
         assert refused in capsys.readouterr().err
-    assert cli.main(["diagnose", "explain", str(tmp_path / "a.npz"), "--config", str(tmp_path / "mine.toml")]) == 2
+    assert (
+        cli.main(
+            [
+                "diagnose",
+                "explain",
+                str(tmp_path / "a.npz"),
+                "--config",
+                str(tmp_path / "mine.toml"),
+            ]
+        )
+        == 2
+    )
     assert refused in capsys.readouterr().err
-    for files, setup in ((["a.npz", "t.csv"], str(tmp_path / "mine.toml")), (["a.npz"], "cf_payload")):
+    for files, setup in (
+        (["a.npz", "t.csv"], str(tmp_path / "mine.toml")),
+        (["a.npz"], "cf_payload"),
+    ):
         assert cli.main([*check_with, setup, *(str(tmp_path / file) for file in files)]) in (0, 1)

@@ -65,7 +65,13 @@ def test_hold_returns_the_last_valid_sample(log):
 )
 def test_contradictory_channels_are_refused(time, values, valid, said):
     with pytest.raises(LogError, match=said):
-        Channel(np.array(time), np.array(values), "m", "world", None if valid is None else np.array(valid))
+        Channel(
+            np.array(time),
+            np.array(values),
+            "m",
+            "world",
+            None if valid is None else np.array(valid),
+        )
 
 
 def test_unknown_frames_are_refused():
@@ -85,7 +91,9 @@ def test_standard_names_keep_their_unit_frame_and_shape():
 def test_missing_and_undeclared_channels_name_what_exists(log):
     with pytest.raises(LogError, match=r"no channel 'pos'; did you mean 'pos_w'"):
         log["pos"]
-    with pytest.raises(LogError, match=r"'payload_pos' was not declared; did you mean 'payload_pos_w'"):
+    with pytest.raises(
+        LogError, match=r"'payload_pos' was not declared; did you mean 'payload_pos_w'"
+    ):
         FlightRecorder().add(0.0, payload_pos=[0, 0, 0])
     recorder = FlightRecorder()
     recorder.add(0.0, pos_w=[0, 0, 0])
@@ -110,7 +118,9 @@ def test_incomplete_files_are_refused(log, tmp_path):
     arrays = dict(np.load(path))
     del arrays["pos_w/time"]
     np.savez(path, **arrays)
-    with pytest.raises(LogError, match="incomplete: no entry 'pos_w/time'; expected a flight log, it holds "):
+    with pytest.raises(
+        LogError, match="incomplete: no entry 'pos_w/time'; expected a flight log, it holds "
+    ):
         FlightLog.load(path)
     np.savez(path, header=np.zeros(3, dtype=np.uint8))
     with pytest.raises(LogError, match="incomplete: Expecting value"):
@@ -138,7 +148,9 @@ def test_csv_and_parquet_hold_the_same_table(log, tmp_path):
     assert table.column_names == list(rows[0])
     for name in table.column_names:
         from_csv = [row[name] for row in rows]
-        assert from_csv == ["" if value is None else str(value) for value in table[name].to_pylist()]
+        assert from_csv == [
+            "" if value is None else str(value) for value in table[name].to_pylist()
+        ]
     with pytest.raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
         export(log, tmp_path / "f.xlsx")
 

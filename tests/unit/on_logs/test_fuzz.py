@@ -1,4 +1,6 @@
-"""Damaged log files of every format: a flight log that can be looked at, or an error that says what; nothing else, and soon."""
+"""Damaged log files of every format: a flight log that can be looked at, or an error that says
+what; nothing else, and soon.
+"""
 
 import gzip
 import itertools
@@ -51,22 +53,45 @@ def patience(seconds: float = PATIENCE) -> Iterator[None]:
 
 def ulog(path: Path) -> None:
     """Position, attitude and rates."""
-    logfiles.write_ulg(path, {
-        ("vehicle_local_position", 0): (["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
-         [(20_000 * i, math.sin(0.1 * i), 2.0, -3.0, 5.0 * math.cos(0.1 * i), 0.0, 0.0) for i in range(SAMPLES)]),
-        ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"],
-         [(10_000 * i, math.cos(0.05 * i), math.sin(0.05 * i), 0.0, 0.0) for i in range(SAMPLES)]),
-        ("vehicle_angular_velocity", 0): (["uint64_t timestamp", "float[3] xyz"],
-         [(10_000 * i, 10.0, 0.0, 0.0) for i in range(SAMPLES)]),
-    })  # fmt: skip
+    logfiles.write_ulg(
+        path,
+        {
+            ("vehicle_local_position", 0): (
+                ["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
+                [
+                    (20_000 * i, math.sin(0.1 * i), 2.0, -3.0, 5.0 * math.cos(0.1 * i), 0.0, 0.0)
+                    for i in range(SAMPLES)
+                ],
+            ),
+            ("vehicle_attitude", 0): (
+                ["uint64_t timestamp", "float[4] q"],
+                [
+                    (10_000 * i, math.cos(0.05 * i), math.sin(0.05 * i), 0.0, 0.0)
+                    for i in range(SAMPLES)
+                ],
+            ),
+            ("vehicle_angular_velocity", 0): (
+                ["uint64_t timestamp", "float[3] xyz"],
+                [(10_000 * i, 10.0, 0.0, 0.0) for i in range(SAMPLES)],
+            ),
+        },
+    )
 
 
 def dataflash(path: Path) -> None:
     """Rates, accelerations, attitude and position."""
     imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
-    rows = [("IMU", (10_000 * i, i % 2, math.sin(0.1 * i), 0.2, 0.3, 0.0, 0.0, -9.81)) for i in range(SAMPLES)]
-    rows += [("ATT", (10_000 * i, 0, 10.0 * math.sin(0.05 * i), 0, 5.0, 0, 90.0)) for i in range(SAMPLES)]
-    rows += [("XKF1", (10_000 * i, 0, 0, 0, 0, 1.0, 0, 0, 0, 0.01 * i, 1.0, -2.0, 0, 0, 0, 0)) for i in range(SAMPLES)]
+    rows = [
+        ("IMU", (10_000 * i, i % 2, math.sin(0.1 * i), 0.2, 0.3, 0.0, 0.0, -9.81))
+        for i in range(SAMPLES)
+    ]
+    rows += [
+        ("ATT", (10_000 * i, 0, 10.0 * math.sin(0.05 * i), 0, 5.0, 0, 90.0)) for i in range(SAMPLES)
+    ]
+    rows += [
+        ("XKF1", (10_000 * i, 0, 0, 0, 0, 1.0, 0, 0, 0, 0.01 * i, 1.0, -2.0, 0, 0, 0, 0))
+        for i in range(SAMPLES)
+    ]
     logfiles.write_bin(path, {"IMU": imu, "ATT": logfiles.ATT, "XKF1": logfiles.XKF1}, rows)
 
 
@@ -77,8 +102,12 @@ def telemetry(path: Path) -> None:
     sender, data = common.MAVLink(None), b""
     for i in range(SAMPLES):
         for message in (
-            common.MAVLink_local_position_ned_message(20 * i, math.sin(0.1 * i), 2.0, -3.0, 0.1, 0.0, 0.5),
-            common.MAVLink_attitude_message(20 * i, 0.1 * math.sin(0.1 * i), 0.0, 0.0, 0.1, 0.0, 0.0),
+            common.MAVLink_local_position_ned_message(
+                20 * i, math.sin(0.1 * i), 2.0, -3.0, 0.1, 0.0, 0.5
+            ),
+            common.MAVLink_attitude_message(
+                20 * i, 0.1 * math.sin(0.1 * i), 0.0, 0.0, 0.1, 0.0, 0.0
+            ),
         ):
             data += struct.pack(">Q", 1_700_000_000_000_000 + 20_000 * i) + message.pack(sender)
     path.write_bytes(data)
@@ -92,16 +121,22 @@ def blackbox(path: Path) -> None:
 def own() -> FlightLog:
     """A log of ours."""
     time, rng = 0.01 * np.arange(SAMPLES), np.random.default_rng(0)
-    return FlightLog({
-        "pos_w": Channel(time, rng.normal(size=(SAMPLES, 3)), "m", "world"),
-        "command": Channel(time[::2], np.ones((SAMPLES // 2, 4)), "N, rad/s", "body"),
-        "attached": Channel(time, np.arange(SAMPLES) < SAMPLES // 2, "bool"),
-    })  # fmt: skip
+    return FlightLog(
+        {
+            "pos_w": Channel(time, rng.normal(size=(SAMPLES, 3)), "m", "world"),
+            "command": Channel(time[::2], np.ones((SAMPLES // 2, 4)), "N, rad/s", "body"),
+            "attached": Channel(time, np.arange(SAMPLES) < SAMPLES // 2, "bool"),
+        }
+    )
 
 
 def lines_of(folder: str, name: str) -> bytes:
     """The head of a real table."""
-    return b"".join(gzip.decompress((REAL / folder / name).read_bytes()).splitlines(keepends=True)[: SAMPLES + 1])
+    return b"".join(
+        gzip.decompress((REAL / folder / name).read_bytes()).splitlines(keepends=True)[
+            : SAMPLES + 1
+        ]
+    )
 
 
 def payload_table() -> bytes:
@@ -110,18 +145,42 @@ def payload_table() -> bytes:
 
 
 FORMATS: dict[str, Callable[[Path], object]] = {
-    "a.ulg": ulog, "a.BIN": dataflash, "a.tlog": telemetry, "a.bbl": blackbox, "a.npz": lambda path: own().save(path),
-    "export.csv": lambda path: export(own(), path), "export.parquet": lambda path: export(own(), path),
+    "a.ulg": ulog,
+    "a.BIN": dataflash,
+    "a.tlog": telemetry,
+    "a.bbl": blackbox,
+    "a.npz": lambda path: own().save(path),
+    "export.csv": lambda path: export(own(), path),
+    "export.parquet": lambda path: export(own(), path),
     "payload.csv": lambda path: path.write_bytes(payload_table()),
     "payload.csv.gz": lambda path: path.write_bytes(gzip.compress(payload_table())),
     "payload.csv.xz": lambda path: path.write_bytes(lzma.compress(payload_table())),
-    "decoded.csv": lambda path: path.write_bytes(lines_of("betaflight_bbl", "LOG00037_start.csv.gz")),
-}  # fmt: skip
-WORDS = (b"nan", b"inf", b"1e400", b"", b'"', b",", b"\n", b"\x00", b"\xff", b"abc", b"True", b"-", b"1e300", b"\r")
+    "decoded.csv": lambda path: path.write_bytes(
+        lines_of("betaflight_bbl", "LOG00037_start.csv.gz")
+    ),
+}
+WORDS = (
+    b"nan",
+    b"inf",
+    b"1e400",
+    b"",
+    b'"',
+    b",",
+    b"\n",
+    b"\x00",
+    b"\xff",
+    b"abc",
+    b"True",
+    b"-",
+    b"1e300",
+    b"\r",
+)
 
 
 def damaged(data: bytes, chance: random.Random) -> bytes:
-    """Bytes cut off, turned over, left out, doubled or replaced, now and then in the file's head."""
+    """Bytes cut off, turned over, left out, doubled or replaced, now and then in the
+    file's head.
+    """
     out = bytearray(data)
     for _ in range(chance.choice((1, 1, 2, 5))):
         at = chance.randrange(min(len(out), 2000) if chance.random() < 0.3 else len(out))
@@ -256,7 +315,10 @@ def test_bytes_that_do_not_inflate(tmp_path):
     ("channel", "words"),
     [
         (Channel(0.01 * np.arange(SAMPLES), np.full(SAMPLES, 3700.0), "V"), "no such pack"),
-        (Channel(0.01 * np.arange(SAMPLES), np.full((SAMPLES, 4), 40_000.0), "1"), "no shares of the full command"),
+        (
+            Channel(0.01 * np.arange(SAMPLES), np.full((SAMPLES, 4), 40_000.0), "1"),
+            "no shares of the full command",
+        ),
     ],
 )
 def test_sizes_that_only_another_unit_gives(channel, words):

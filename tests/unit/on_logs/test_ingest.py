@@ -1,4 +1,6 @@
-"""Readers of logs: every format, what is wrong with files, and the raw blackbox against another decoder."""
+"""Readers of logs: every format, what is wrong with files, and the raw blackbox against another
+decoder.
+"""
 
 import gzip
 import math
@@ -68,7 +70,9 @@ class TestCodec:
         return values
 
     def test_eight_fields_with_a_mask(self):
-        assert self.decode(blackbox_codec.TAG8_8SVB, bytes([0b101]) + signed_vb(-3) + signed_vb(500), 3) == [-3, 0, 500]
+        assert self.decode(
+            blackbox_codec.TAG8_8SVB, bytes([0b101]) + signed_vb(-3) + signed_vb(500), 3
+        ) == [-3, 0, 500]
         assert self.decode(blackbox_codec.TAG8_8SVB, signed_vb(-3), 1) == [-3]
         nine = bytes([0b10000000]) + signed_vb(7) + signed_vb(8)
         assert self.decode(blackbox_codec.TAG8_8SVB, nine, 9) == [0] * 7 + [7, 8]
@@ -79,7 +83,10 @@ class TestCodec:
             (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
             (packed("01" + "00" + bits(7, 4) + bits(-8, 4) + bits(-1, 4)), [7, -8, -1]),
             (packed("10" + bits(31, 6) + "00" + bits(-32, 6) + "00" + bits(-1, 6)), [31, -32, -1]),
-            (bytes([0b11_11_01_00]) + struct.pack("<bhi", -5, -300, -(2**31)), [-5, -300, -(2**31)]),
+            (
+                bytes([0b11_11_01_00]) + struct.pack("<bhi", -5, -300, -(2**31)),
+                [-5, -300, -(2**31)],
+            ),
         ],
     )
     def test_three_fields_with_a_selector(self, data, values):
@@ -100,9 +107,14 @@ class TestCodec:
         chance, widths = random.Random(3), (0, 4, 8, 16)
         for _ in range(200):
             kinds = [chance.randrange(4) for _ in range(4)]
-            values = [chance.randrange(-(1 << w - 1), 1 << w - 1) if w else 0 for w in (widths[k] for k in kinds)]
+            values = [
+                chance.randrange(-(1 << w - 1), 1 << w - 1) if w else 0
+                for w in (widths[k] for k in kinds)
+            ]
             tag = sum(kind << 2 * i for i, kind in enumerate(kinds))
-            data = bytes([tag]) + packed("".join(bits(v, widths[k]) for v, k in zip(values, kinds) if k))
+            data = bytes([tag]) + packed(
+                "".join(bits(v, widths[k]) for v, k in zip(values, kinds) if k)
+            )
             assert self.decode(blackbox_codec.TAG8_4S16, data, 4) == values
 
     def test_fourteen_bits_negated(self):
@@ -148,7 +160,9 @@ class TestBlackbox:
         assert log.corrupt >= 1
         assert len(clean) - 40 < len(log.main) < len(clean)
         known = {row.tobytes() for row in clean}
-        assert sum(row.tobytes() not in known for row in log.main) <= 1  # a damaged frame may still look like one
+        assert (
+            sum(row.tobytes() not in known for row in log.main) <= 1
+        )  # a damaged frame may still look like one
 
     def of(self, data: bytes):
         starts = [0, data.find(blackbox.MARKER, 1), len(data)]
@@ -198,12 +212,23 @@ class TestTables:
     def test_units_axes_and_quaternion_order(self, tmp_path):
         turn = Rotation.from_euler("ZYX", [0.5, -0.2, 0.1])  # forward-right-down in north-east-down
         x, y, z, w = turn.as_quat()
-        rows = ["t,n,e,d,qw,qx,qy,qz,r", *(f"{10 * i},{i},2,-3,{w},{x},{y},{z},90" for i in range(5))]
+        rows = [
+            "t,n,e,d,qw,qx,qy,qz,r",
+            *(f"{10 * i},{i},2,-3,{w},{x},{y},{z},90" for i in range(5)),
+        ]
         (log,) = read(
             written(tmp_path, rows, "a.csv.gz"),
             mapping(
                 ChannelMap("pos_w", ("n", "e", "d"), "cm", axes="x,-y,-z"),
-                ChannelMap("quat_wb", ("qw", "qx", "qy", "qz"), "1", "quaternion", "wxyz", "x,-y,-z", "x,-y,-z"),
+                ChannelMap(
+                    "quat_wb",
+                    ("qw", "qx", "qy", "qz"),
+                    "1",
+                    "quaternion",
+                    "wxyz",
+                    "x,-y,-z",
+                    "x,-y,-z",
+                ),
                 ChannelMap("turn", ("r",), "deg/s", frame="body"),
             ),
         )
@@ -220,7 +245,10 @@ class TestTables:
             written(tmp_path, ["t,r,p,y", *(f"{i},10,20,30" for i in range(3))]),
             mapping(ChannelMap("quat_wb", ("r", "p", "y"), "deg", "euler")),
         )
-        yaw, pitch, roll = (Rotation.from_euler(axis, angle, degrees=True) for axis, angle in (("z", 30), ("y", 20), ("x", 10)))
+        yaw, pitch, roll = (
+            Rotation.from_euler(axis, angle, degrees=True)
+            for axis, angle in (("z", 30), ("y", 20), ("x", 10))
+        )
         expected = (yaw * pitch * roll).as_matrix()
         assert Rotation.from_quat(log["quat_wb"].values[0]).as_matrix() == pytest.approx(expected)
 
@@ -229,7 +257,12 @@ class TestTables:
         (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
         notes = log.meta["ingest"]["x"]
         assert log["x"].time == pytest.approx([0, 0.01, 0.02, 0.04])
-        assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["blank"]) == (1, 1, 1, 1)
+        assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["blank"]) == (
+            1,
+            1,
+            1,
+            1,
+        )
 
     def test_held_values_are_one_measurement(self, tmp_path):
         rows = ["t,v", *(f"{10 * i},{i // 4}" for i in range(12))]
@@ -237,10 +270,16 @@ class TestTables:
         assert log["x"].time == pytest.approx([0, 0.04, 0.08])
 
     def test_blanks_are_no_samples_and_break_no_hold(self, tmp_path):
-        """Two streams in one table: rows of the one are blank in the other; a part of a vector that is blank is a bad sample."""
-        rows = ["t,v,a,b", *(f"{10 * i},{i // 6 if i % 2 else ''},{i if i % 3 else ''},{i}" for i in range(13))]
+        """Two streams in one table: rows of the one are blank in the other; a part of a vector that
+        is blank is a bad sample.
+        """
+        rows = [
+            "t,v,a,b",
+            *(f"{10 * i},{i // 6 if i % 2 else ''},{i if i % 3 else ''},{i}" for i in range(13)),
+        ]
         (log,) = read(
-            written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m", held=True), ChannelMap("y", ("a", "b"), "m"))
+            written(tmp_path, rows),
+            mapping(ChannelMap("x", ("v",), "m", held=True), ChannelMap("y", ("a", "b"), "m")),
         )
         assert log["x"].time == pytest.approx([0.01, 0.07])
         assert np.all(log["x"].valid)
@@ -250,17 +289,21 @@ class TestTables:
     @pytest.mark.parametrize(
         "text",
         [
-            "t;v\n0;1,5\n10;2,5\n20;3,5\n", "t\tv\n0\t1.5\n10\t2.5\n20\t3.5\n", "t v\n0 1.5\n10   2.5\n20 3.5\n",
+            "t;v\n0;1,5\n10;2,5\n20;3,5\n",
+            "t\tv\n0\t1.5\n10\t2.5\n20\t3.5\n",
+            "t v\n0 1.5\n10   2.5\n20 3.5\n",
             "t;v\n0;1.5\n10;2.5\n20;3.5\n",
         ],
-    )  # fmt: skip
+    )
     def test_separators_and_decimal_commas(self, tmp_path, text):
         (tmp_path / "a.csv").write_text(text)
         (log,) = read(tmp_path / "a.csv", mapping(ChannelMap("x", ("v",), "m")))
         assert log["x"].values == pytest.approx([1.5, 2.5, 3.5])
 
     def test_no_header_and_lists_in_cells(self, tmp_path):
-        (tmp_path / "a.csv").write_text('0,"[1.0, 2.0, 3.0]"\n10,"[1.5, 2.0, 3.0]"\n20,"[2.0, 2.0]"\n')
+        (tmp_path / "a.csv").write_text(
+            '0,"[1.0, 2.0, 3.0]"\n10,"[1.5, 2.0, 3.0]"\n20,"[2.0, 2.0]"\n'
+        )
         listed = ChannelMap("pos_w", tuple(f"p[{i}]" for i in range(3)), "m")
         (tmp_path / "b.csv").write_text("t,p\n" + (tmp_path / "a.csv").read_text())
         (log,) = read(tmp_path / "b.csv", mapping(listed))
@@ -276,10 +319,12 @@ class TestTables:
         logs = read(
             written(tmp_path, rows),
             mapping(
-                ChannelMap("x", ("v",), "m", clock="other"), ChannelMap("y", ("v",), "m"),
-                clocks={"other": TimeColumn("u", "s")}, split=Split("b"),
+                ChannelMap("x", ("v",), "m", clock="other"),
+                ChannelMap("y", ("v",), "m"),
+                clocks={"other": TimeColumn("u", "s")},
+                split=Split("b"),
             ),
-        )  # fmt: skip
+        )
         assert [log.meta["part"] for log in logs] == ["a", "b"]
         path = tmp_path / "a.csv"
         whole = mapping(ChannelMap("y", ("v",), "m"), split=Split("b"))
@@ -323,7 +368,9 @@ class TestTables:
             read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
 
     def test_a_table_cut_while_written_loses_its_last_row(self, tmp_path):
-        (log,) = read(written(tmp_path, ["t,v", "0,1", "1,2", "2"]), mapping(ChannelMap("x", ("v",), "m")))
+        (log,) = read(
+            written(tmp_path, ["t,v", "0,1", "1,2", "2"]), mapping(ChannelMap("x", ("v",), "m"))
+        )
         assert len(log["x"].time) == 2
 
     def test_damaged_files(self, tmp_path):
@@ -373,8 +420,19 @@ class TestAutopilots:
             path,
             {
                 ("vehicle_local_position", 0): (
-                    ["uint64_t timestamp", "float x", "float y", "float z", "float vx", "float vy", "float vz"],
-                    [(1_000_000 + 20_000 * i, 1.0, 2.0, -3.0 - i, 0.1, 0.2, -0.3) for i in range(5)],
+                    [
+                        "uint64_t timestamp",
+                        "float x",
+                        "float y",
+                        "float z",
+                        "float vx",
+                        "float vy",
+                        "float vz",
+                    ],
+                    [
+                        (1_000_000 + 20_000 * i, 1.0, 2.0, -3.0 - i, 0.1, 0.2, -0.3)
+                        for i in range(5)
+                    ],
                 ),
                 ("vehicle_attitude", 0): (
                     ["uint64_t timestamp", "float[4] q"],
@@ -387,7 +445,9 @@ class TestAutopilots:
         assert log["vel_w"].values[2] == pytest.approx([0.1, -0.2, 0.3])
         assert log["pos_w"].time[1] == pytest.approx(0.02)
         nose = Rotation.from_quat(log["quat_wb"].values[0]).apply([1.0, 0.0, 0.0])
-        assert nose == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)  # a quarter turn to the right, east is our -y
+        assert nose == pytest.approx(
+            [0.0, -1.0, 0.0], abs=1e-6
+        )  # a quarter turn to the right, east is our -y
 
     def test_dataflash(self, tmp_path):
         path = tmp_path / "a.BIN"
@@ -396,7 +456,9 @@ class TestAutopilots:
         rows += [("ATT", (1000 * i, 0, 0.0, 0, 0.0, 0, 90.0)) for i in range(5)]
         logfiles.write_bin(path, {"IMU": imu, "ATT": logfiles.ATT}, rows)
         (log,) = read(path)
-        assert log["rate_b"].values == pytest.approx(np.tile([0.1, -0.2, -0.3], (5, 1)))  # the first IMU alone
+        assert log["rate_b"].values == pytest.approx(
+            np.tile([0.1, -0.2, -0.3], (5, 1))
+        )  # the first IMU alone
         assert log["acc_b"].values[0] == pytest.approx([0.0, 0.0, 9.81], rel=1e-6)
         nose = Rotation.from_quat(log["quat_wb"].values[0]).apply([1.0, 0.0, 0.0])
         assert nose == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
@@ -406,7 +468,9 @@ class TestAutopilots:
 
         sender, data = common.MAVLink(None), b""
         for i in range(5):
-            message = common.MAVLink_local_position_ned_message(20 * i, 1.0, 2.0, -3.0, 0.0, 0.0, 0.5)
+            message = common.MAVLink_local_position_ned_message(
+                20 * i, 1.0, 2.0, -3.0, 0.0, 0.0, 0.5
+            )
             data += struct.pack(">Q", 1_700_000_000_000_000 + 20_000 * i) + message.pack(sender)
         path = tmp_path / "a.tlog"
         path.write_bytes(data)
@@ -423,7 +487,9 @@ class TestAutopilots:
             read(path)
 
 
-@pytest.mark.parametrize("path", sorted((config.configs_root() / "diagnose").glob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted((config.configs_root() / "diagnose").glob("*.toml")), ids=lambda p: p.stem
+)
 def test_shipped_mappings_name_channels_with_a_meaning_where_there_is_one(path):
     setup = setups.load(path.stem)
     names = [channel.name for channel in setup.table.channels]

@@ -17,11 +17,17 @@ SIDD = ("Qfffffffff", "TimeUS,Time,Targ,F,Gx,Gy,Gz,Ax,Ay,Az")
 
 @pytest.mark.parametrize(("axis", "sign"), [(7, 1.0), (8, -1.0), (9, -1.0)])
 def test_a_sweep_is_part_of_the_commanded_rate(tmp_path, axis, sign):
-    """Forward, right, down in the log: a sweep about y and z turns round in our frame; before and after it nothing is added."""
+    """Forward, right, down in the log: a sweep about y and z turns round in our frame; before and
+    after it nothing is added.
+    """
     rows = []
     for n in range(400):
         us = 10_000 * n
-        rows += [("IMU", (us, 0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.81)), ("ATT", (us, *[0.0] * 6)), ("RATE", (us, 5.0, 0.0, 5.0, 0.0, 5.0, 0.0))]
+        rows += [
+            ("IMU", (us, 0, 0.0, 0.0, 0.0, 0.0, 0.0, -9.81)),
+            ("ATT", (us, *[0.0] * 6)),
+            ("RATE", (us, 5.0, 0.0, 5.0, 0.0, 5.0, 0.0)),
+        ]
         if n == 100:
             rows.append(("SIDS", (us, axis, 86.0, 0.5, 15.0, 2.0, 0.0, 20.0, 2.0)))
         if 100 <= n < 300:

@@ -1,4 +1,6 @@
-"""The fit of a moving goal's velocity: the line through exact positions, its accuracy under noise, and both layouts' geometry."""
+"""The fit of a moving goal's velocity: the line through exact positions, its accuracy under noise,
+and both layouts' geometry.
+"""
 
 import dataclasses
 import math
@@ -50,13 +52,17 @@ def test_a_new_throw_forgets_the_last_one_and_an_unseen_goal_changes_nothing():
     np.testing.assert_allclose(velocity.numpy(), [[1.0, 0.0]] * 2, atol=2e-3)
     blind = torch.tensor([1e6, 0.0])
     fresh = torch.tensor([True, False])
-    sums, velocity = goal_motion.fit(sums, torch.tensor([0.0, 0.2]), torch.full((2, 2), 9.0), blind, fresh)
+    sums, velocity = goal_motion.fit(
+        sums, torch.tensor([0.0, 0.2]), torch.full((2, 2), 9.0), blind, fresh
+    )
     np.testing.assert_allclose(velocity.numpy(), [[0.0, 0.0], [1.0, 0.0]], atol=2e-3)
 
 
 @pytest.mark.parametrize("kind", ["state", "vision"])
 def test_both_layouts_find_the_goal_where_it_is(kind):
-    """Exact frames of random attitudes and places give the goal exactly; the camera's rays meet the ground there."""
+    """Exact frames of random attitudes and places give the goal exactly; the camera's rays meet the
+    ground there.
+    """
     params = config.load(Experiment, config.find("train", f"{kind}_moving"))
     layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
     rng = np.random.default_rng(1)
@@ -65,7 +71,9 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
     quat = np.concatenate((np.sin(angle / 2), np.ones((count, 1))), axis=1)
     quat = torch.tensor(quat / np.linalg.norm(quat, axis=1, keepdims=True), dtype=torch.float32)
     pos = torch.tensor(rng.uniform(-0.3, 0.3, (count, 3)) + [0, 0, 1.3], dtype=torch.float32)
-    goal = torch.tensor(np.pad(rng.uniform(-2.0, 2.0, (count, 2)), ((0, 0), (0, 1))), dtype=torch.float32)
+    goal = torch.tensor(
+        np.pad(rng.uniform(-2.0, 2.0, (count, 2)), ((0, 0), (0, 1))), dtype=torch.float32
+    )
     payload, zero = pos - torch.tensor([0.0, 0.0, 0.4]), torch.zeros(count, 3)
     rot, valid = ob.rotation_from_quat(quat), None
     seen = ob.state_part(pos, goal, payload)
@@ -76,18 +84,30 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
     place, weight = goal_motion.measured_goal(layout, frame, valid, camera)
     known = weight > 0
     assert known.float().mean() > 0.9
-    np.testing.assert_allclose(place[known].numpy(), goal[known, :2].numpy(), atol=2e-4)  # float32 at grazing rays
-    if kind == "vision":  # 1 / (sigma reach^2 / height)^2 for each of four corners, seen from straight above
-        above = torch.cat([frame[:1, :6] * 0, frame[:1, 6:9] * 0, torch.tensor([[1.0, 0, 0, 0, 1, 0]])], dim=1)
+    np.testing.assert_allclose(
+        place[known].numpy(), goal[known, :2].numpy(), atol=2e-4
+    )  # float32 at grazing rays
+    if (
+        kind == "vision"
+    ):  # 1 / (sigma reach^2 / height)^2 for each of four corners, seen from straight above
+        above = torch.cat(
+            [frame[:1, :6] * 0, frame[:1, 6:9] * 0, torch.tensor([[1.0, 0, 0, 0, 1, 0]])], dim=1
+        )
         above[0, 2] = 2.0
         over = torch.tensor([[0.03, 0.0, 0.0]])
-        points, valid = keypoints(camera, above[:, :3], torch.eye(3)[None], over, torch.tensor([[0.0, 0.0, 1.5]]))
-        _, weight = goal_motion.measured_goal(layout, torch.cat([above, points.flatten(1)], dim=1), valid, camera)
+        points, valid = keypoints(
+            camera, above[:, :3], torch.eye(3)[None], over, torch.tensor([[0.0, 0.0, 1.5]])
+        )
+        _, weight = goal_motion.measured_goal(
+            layout, torch.cat([above, points.flatten(1)], dim=1), valid, camera
+        )
         assert weight.item() == pytest.approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
 
 
 def test_accuracy_is_what_the_docstring_promises():
-    """Four measurements of 0.01 m, 20 ms apart, leave 0.2 m/s; the fit over half a second leaves a tenth of it."""
+    """Four measurements of 0.01 m, 20 ms apart, leave 0.2 m/s; the fit over half a second leaves a
+    tenth of it.
+    """
     rng = np.random.default_rng(2)
     truth = np.array([0.5, 0.0])
 

@@ -1,4 +1,6 @@
-"""Where keypoints lie: the truth without noise, one wrong point outvoted, nothing where nothing is seen, the goal kept in mind."""
+"""Where keypoints lie: the truth without noise, one wrong point outvoted, nothing where nothing is
+seen, the goal kept in mind.
+"""
 
 import dataclasses
 
@@ -13,11 +15,15 @@ from visthrow.onboard.goal_motion import fitted_goal, middle
 from visthrow.task import Experiment
 
 EXACT = 2e-3
-"""Of float32 at 2 m, and of the box's middle, which is not quite the image of the ball's centre [m], [-]."""
+"""Of float32 at 2 m, and of the box's middle, which is not quite the image of the ball's centre
+[m], [-].
+"""
 
 
 def scene():
-    """Layout, camera, a frame of noise-free keypoints of eight poses, their validity, goal - vehicle and lens - payload's ray."""
+    """Layout, camera, a frame of noise-free keypoints of eight poses, their validity, goal -
+    vehicle and lens - payload's ray.
+    """
     params = config.load(Experiment, config.find("train", "laptop_vision"))
     layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
     torch.manual_seed(1)
@@ -26,7 +32,9 @@ def scene():
     goal = torch.cat([torch.randn(8, 2), torch.zeros(8, 1)], -1)
     load = pos + torch.tensor([0.0, 0.0, -0.38]) + 0.08 * torch.randn(8, 3)
     points, valid = keypoints(camera, pos, rot, goal, load)
-    frame = torch.cat([ob.vehicle_part(pos, torch.zeros(8, 3), torch.zeros(8, 3), rot), points.flatten(1)], -1)
+    frame = torch.cat(
+        [ob.vehicle_part(pos, torch.zeros(8, 3), torch.zeros(8, 3), rot), points.flatten(1)], -1
+    )
     ray = load - pos - (rot @ camera.position_b)
     return layout, camera, frame, valid, (goal - pos)[:, :2], ray / ray.norm(dim=-1, keepdim=True)
 
@@ -43,12 +51,18 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     off = []
     for k in range(40):
         noisy = frame + 0.01 * torch.randn_like(frame)
-        sums, _, found, _, _ = fitted_goal(layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
+        sums, _, found, _, _ = fitted_goal(
+            layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
+        )
         off.append((found[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
         fresh = torch.zeros_like(fresh)
     assert torch.stack(off[-5:]).mean() < 0.4 * torch.stack(off[:1]).mean()
-    _, _, blind, shown, counts = fitted_goal(layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh)
-    torch.testing.assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
+    _, _, blind, shown, counts = fitted_goal(
+        layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh
+    )
+    torch.testing.assert_close(
+        blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5
+    )
     assert (blind[:, 5] == 1.0).all()
     assert counts[:, :4].all(), "corners read where the goal would be seen"
     assert not counts[:, 4:].any(), "the payload does not"
@@ -58,11 +72,17 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
 def test_a_goal_that_moves_is_where_it_is_now():
     layout, camera, frame, valid, offset, _ = scene()
     layout = dataclasses.replace(layout, motion=2)
-    sums, fresh, speed = goal_motion.empty_sums(8), torch.ones(8, dtype=torch.bool), torch.tensor([0.5, -0.3])
+    sums, fresh, speed = (
+        goal_motion.empty_sums(8),
+        torch.ones(8, dtype=torch.bool),
+        torch.tensor([0.5, -0.3]),
+    )
     for k in range(60):  # the vehicle moves with the goal: what it sees stays as it is
         moved = frame.clone()
         moved[:, :2] += speed * 0.02 * k
-        sums, velocity, found, _, _ = fitted_goal(layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh)
+        sums, velocity, found, _, _ = fitted_goal(
+            layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
+        )
         fresh = torch.zeros_like(fresh)
     torch.testing.assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
     torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=0.02)
@@ -82,7 +102,9 @@ def test_one_wrong_point_of_each_is_outvoted():
     for wrong in (15, 16, 25, 26):  # of the first corner, of the box's second side
         frame[:, wrong] = 0.4
     found = places(layout, frame, valid, camera)
-    assert (found[:, :2] - offset).abs().max() < 0.05  # the square's corners disagree by the middle's neighbours
+    assert (
+        found[:, :2] - offset
+    ).abs().max() < 0.05  # the square's corners disagree by the middle's neighbours
     assert (found[:, 2:5] - ray).norm(dim=-1).max() < 0.1  # half of the ball's angle
 
 
@@ -101,10 +123,15 @@ def test_what_is_not_seen_is_nought():
 def test_middle_is_the_median_of_what_is_valid():
     torch.manual_seed(0)
     points, valid = torch.randn(200, 4, 2), torch.rand(200, 4) > 0.4
-    expected = torch.where(valid.unsqueeze(-1), points, torch.nan).nanquantile(0.5, dim=1).nan_to_num(0.0)
+    expected = (
+        torch.where(valid.unsqueeze(-1), points, torch.nan).nanquantile(0.5, dim=1).nan_to_num(0.0)
+    )
     torch.testing.assert_close(middle(points, valid), expected)
 
 
 def test_a_layout_counts_it():
     params = config.load(Experiment, config.find("train", "laptop_vision")).task.observation
-    assert ob.layout_of(params).dimension == ob.layout_of(dataclasses.replace(params, located=False)).dimension + 6
+    assert (
+        ob.layout_of(params).dimension
+        == ob.layout_of(dataclasses.replace(params, located=False)).dimension + 6
+    )

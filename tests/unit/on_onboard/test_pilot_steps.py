@@ -1,4 +1,6 @@
-"""What a policy sees after steps that were late or missing: a history of steps a period apart, as in training."""
+"""What a policy sees after steps that were late or missing: a history of steps a period apart, as
+in training.
+"""
 
 import numpy as np
 import pytest
@@ -24,9 +26,14 @@ def seen(pilot: Pilot, time: float, now: float | None):
 def responsive(response=8):
     """A policy that is given the response of earlier steps too."""
     policy = simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0))
-    contract = {**policy.contract, "observation": {**policy.contract["observation"], "response": response}}
+    contract = {
+        **policy.contract,
+        "observation": {**policy.contract["observation"], "response": response},
+    }
     contract["observation"]["dimension"] = policy.obs_dim + response * RESPONSE
-    return Policy((torch.zeros(5, contract["observation"]["dimension"]),), policy.biases, "relu", contract)
+    return Policy(
+        (torch.zeros(5, contract["observation"]["dimension"]),), policy.biases, "relu", contract
+    )
 
 
 def flown(times, timed=True, policy=None):
@@ -52,10 +59,14 @@ def test_a_history_with_gaps_is_that_of_regular_steps(times):
     assert np.abs(flown(times, timed=False) - even).max() > 5e-3, "without the times it is not"
 
 
-@pytest.mark.parametrize("times", [[0, 1, 2, 3, 4, 6], [0, 1, 2, 9], [0, 1, 2, 3, 3.7, 4.2, 5, 6, 7, 8, 9, 10.7, 11]])
+@pytest.mark.parametrize(
+    "times", [[0, 1, 2, 3, 4, 6], [0, 1, 2, 9], [0, 1, 2, 3, 3.7, 4.2, 5, 6, 7, 8, 9, 10.7, 11]]
+)
 def test_a_response_with_gaps_is_that_of_regular_steps(times):
-    speeds = [flown(t, timed, responsive())[:, -8 * RESPONSE :].reshape(8, RESPONSE)[:, :6]
-              for t, timed in ((times, True), (range(times[-1] + 1), False), (times, False))]  # fmt: skip
+    speeds = [
+        flown(t, timed, responsive())[:, -8 * RESPONSE :].reshape(8, RESPONSE)[:, :6]
+        for t, timed in ((times, True), (range(times[-1] + 1), False), (times, False))
+    ]
     np.testing.assert_allclose(speeds[0], speeds[1], atol=2e-6)
     assert np.abs(speeds[2] - speeds[1]).max() > 5e-3, "without the times it is not"
 

@@ -1,4 +1,6 @@
-"""The policy file: equal to the training network, refused when damaged or under other conditions."""
+"""The policy file: equal to the training network, refused when damaged or under other
+conditions.
+"""
 
 import copy
 import io
@@ -18,7 +20,9 @@ EQUAL = 1e-6
 """Bar of the project: the exported network and the training network differ by no more than this."""
 
 SUMMATION = 1e-5
-"""float32 sums of 64 terms taken in another order: matrix-vector and matrix-matrix products are different code."""
+"""float32 sums of 64 terms taken in another order: matrix-vector and matrix-matrix products are
+different code.
+"""
 
 CONTRACT = {
     "observation": {"layout": "state", "dimension": OBS, "history": 3},
@@ -37,7 +41,9 @@ def make_actor(activation: str = "elu", normalized: bool = True):
     scales = torch.logspace(-3, 2, OBS)
     batch = TensorDict({"policy": torch.randn(512, OBS) * scales + scales}, batch_size=[512])
     spread = {"class_name": "GaussianDistribution", "init_std": 1.0}
-    actor = MLPModel(batch, {"actor": ["policy"]}, "actor", ACTIONS, [64, 32], activation, normalized, spread)
+    actor = MLPModel(
+        batch, {"actor": ["policy"]}, "actor", ACTIONS, [64, 32], activation, normalized, spread
+    )
     actor.train()
     actor.update_normalization(batch)
     return actor.eval(), batch
@@ -49,7 +55,9 @@ def policy() -> Policy:
     return Policy.from_actor_state(actor.state_dict(), "elu", CONTRACT, {"seed": 3})
 
 
-@pytest.mark.parametrize("activation", ["elu", "relu", "tanh", "selu", "lrelu", "swish", "gelu", "softplus", "mish"])
+@pytest.mark.parametrize(
+    "activation", ["elu", "relu", "tanh", "selu", "lrelu", "swish", "gelu", "softplus", "mish"]
+)
 @pytest.mark.parametrize("normalized", [True, False])
 def test_equal_to_the_training_network(activation, normalized, tmp_path):
     actor, batch = make_actor(activation, normalized)
@@ -126,7 +134,10 @@ def rewritten(path, change):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda a, h: h.update(format_version=FORMAT_VERSIONS[-1] + 1), "this program reads versions 1 and 2"),
+        (
+            lambda a, h: h.update(format_version=FORMAT_VERSIONS[-1] + 1),
+            "this program reads versions 1 and 2",
+        ),
         (lambda a, h: h.pop("contract"), "'contract' is None; expected a dict"),
         (lambda a, h: h.update(activation="relux"), "did you mean 'relu'"),
         (lambda a, h: a.pop("layer1_bias"), "no entry 'layer1_bias'"),
@@ -137,7 +148,10 @@ def rewritten(path, change):
             lambda a, h: a.update(layer2_bias=a["layer2_bias"] * np.nan),
             "layer 2 bias holds numbers that are not finite",
         ),
-        (lambda a, h: h["contract"]["observation"].update(dimension=69), "dimension 69, the network has 35"),
+        (
+            lambda a, h: h["contract"]["observation"].update(dimension=69),
+            "dimension 69, the network has 35",
+        ),
     ],
 )
 def test_incomplete_or_contradictory_files_are_refused(policy, tmp_path, change, said):
@@ -205,7 +219,11 @@ def test_a_full_disk_leaves_the_old_file(policy, tmp_path, monkeypatch):
 
 
 def test_states_of_other_networks_are_refused():
-    with pytest.raises(PolicyError, match=r"got rnn\.weight_ih_l0; expected the state of an rsl_rl MLPModel"):
-        Policy.from_actor_state({"rnn.weight_ih_l0": torch.zeros(1), "mlp.0.weight": torch.zeros(1, 1)}, "elu", {})
+    with pytest.raises(
+        PolicyError, match=r"got rnn\.weight_ih_l0; expected the state of an rsl_rl MLPModel"
+    ):
+        Policy.from_actor_state(
+            {"rnn.weight_ih_l0": torch.zeros(1), "mlp.0.weight": torch.zeros(1, 1)}, "elu", {}
+        )
     with pytest.raises(PolicyError, match="no mlp"):
         Policy.from_actor_state({}, "elu", {})

@@ -89,7 +89,9 @@ def test_a_batch_of_no_environments():
 
 
 def test_other_kinds_of_blocks_in_one_batch():
-    """A kernel is built for one choice of blocks; a vehicle of another would silently fly with the wrong ones."""
+    """A kernel is built for one choice of blocks; a vehicle of another would silently fly with the
+    wrong ones.
+    """
     other = changed("vehicle.aero.kind", "none").vehicle
     plant = paper_plant()
     with pytest.raises(ValueError, match=r"'none'.*expected the same blocks"):
@@ -115,7 +117,10 @@ def test_no_tethers():
     ("arguments", "message"),
     [
         ({"pos_w": np.zeros((2, 3))}, r"pos_w of shape \(2, 3\); expected \(3, 3\)"),
-        ({"pos_w": np.zeros((3, 3)), "quat_wb": np.zeros((3, 3))}, r"quat_wb of shape \(3, 3\); expected \(3, 4\)"),
+        (
+            {"pos_w": np.zeros((3, 3)), "quat_wb": np.zeros((3, 3))},
+            r"quat_wb of shape \(3, 3\); expected \(3, 4\)",
+        ),
         ({"pos_w": np.zeros((3, 3)), "rate_b": np.zeros(3)}, r"rate_b of shape \(3,\)"),
     ],
 )
@@ -126,7 +131,9 @@ def test_shapes_of_poses(arguments, message):
 
 
 def test_shape_of_the_cable():
-    with pytest.raises(ValueError, match=r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)"
+    ):
         HybridSim(paper_plant(), 3).place(np.zeros((3, 3)), cable_dir_w=np.zeros((3, 14, 3)))
 
 
@@ -151,9 +158,14 @@ def test_unknown_names():
 
 
 def test_get_is_a_copy():
-    """On the CPU an array's NumPy view is live memory: what was got must not change with the next step."""
+    """On the CPU an array's NumPy view is live memory: what was got must not change with the next
+    step.
+    """
     hybrid, quad = HybridSim(paper_plant(), 2), QuadSim(paper_plant().vehicle, 2)
-    for sim, names in ((hybrid, ("pos_w", "queue", "cable_dir_w", "payload_pos_w")), (quad, ("pos_w", "queue"))):
+    for sim, names in (
+        (hybrid, ("pos_w", "queue", "cable_dir_w", "payload_pos_w")),
+        (quad, ("pos_w", "queue")),
+    ):
         sim.set_command(np.tile([12.0, 3.0, -3.0, 1.0], (2, 1)))
         got = {name: sim.get(name) for name in names}
         kept = {name: value.copy() for name, value in got.items()}

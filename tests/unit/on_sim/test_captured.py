@@ -10,7 +10,9 @@ from sim.torch_bridge import captured
 
 
 class Old:
-    """Garbage in a circle, as what a replaced simulator leaves; frees memory when it is collected."""
+    """Garbage in a circle, as what a replaced simulator leaves; frees memory when it is
+    collected.
+    """
 
     def __init__(self, freed: list) -> None:
         self.me, self.freed = self, freed
@@ -30,7 +32,10 @@ def collects(request):
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_garbage_is_collected_before_a_capture_and_not_during_it(monkeypatch, collects, fails):
-    """On an H200 arrays of an earlier test, freed during a capture, ended it: Warp CUDA error 900."""
+    """On an H200 arrays of an earlier test, freed during a capture, ended it:
+
+    Warp CUDA error 900.
+    """
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", object)
     monkeypatch.setattr(torch.cuda, "graph", lambda graph, **options: contextlib.nullcontext())

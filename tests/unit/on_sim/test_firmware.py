@@ -9,24 +9,39 @@ from sim.effects.firmware import calibrated_voltage, controller_of, left_out
 from tests.plants import paper_plant
 
 SETTINGS = {
-    "rollPID": "11,20,8", "pitchPID": "22,20,8", "yawPID": "45,80,0", "ff_weight": "0,0,0", "iterm_relax_cutoff": "15",
-    "motor_idle": "550", "pidsum_limit": "500", "iterm_windup": "80", "gyro_lpf1_static_hz": "250", "gyro_lpf2_static_hz": "500",
-    "dterm_lpf2_static_hz": "150", "d_max": "8,8,0",
-}  # fmt: skip
+    "rollPID": "11,20,8",
+    "pitchPID": "22,20,8",
+    "yawPID": "45,80,0",
+    "ff_weight": "0,0,0",
+    "iterm_relax_cutoff": "15",
+    "motor_idle": "550",
+    "pidsum_limit": "500",
+    "iterm_windup": "80",
+    "gyro_lpf1_static_hz": "250",
+    "gyro_lpf2_static_hz": "500",
+    "dterm_lpf2_static_hz": "150",
+    "d_max": "8,8,0",
+}
 
 
 def test_a_gain_is_the_torque_that_the_motors_make_of_it():
-    """1 deg/s of error, by hand: P 11 puts 0.352319 of 1000 on each motor, beyond idle; two rise and two fall."""
+    """1 deg/s of error, by hand:
+
+    P 11 puts 0.352319 of 1000 on each motor, beyond idle; two rise and two fall.
+    """
     vehicle = paper_plant().vehicle
     c = controller_of(vehicle, SETTINGS, 0.66, vehicle.battery.reference_voltage)
     hover, step = math.sqrt(0.66 / 3.5), 0.352319e-3 * 0.945
     rise = 3.5 * ((hover + step) ** 2 - (hover - step) ** 2)
-    assert c.p_gain[0] * math.radians(1.0) == pytest.approx(2.0 * rise * vehicle.rotors.y[0], rel=1e-6)
+    assert c.p_gain[0] * math.radians(1.0) == pytest.approx(
+        2.0 * rise * vehicle.rotors.y[0], rel=1e-6
+    )
     assert c.p_gain[1] == pytest.approx(2.0 * c.p_gain[0], rel=1e-12)
     assert c.p_gain[2] * math.radians(1.0) == pytest.approx(
         2.0 * 45.0 / 11.0 * rise * vehicle.thrust.torque_ratio, rel=1e-6
     )
-    # pid_init.c: an I of 1 is 0.244381 of 1000 a degree, about yaw 2.5 times that; P of 1 is 0.032029 a degree a second.
+    # pid_init.c: an I of 1 is 0.244381 of 1000 a degree, about yaw 2.5 times that; P of 1 is
+    # 0.032029 a degree a second.
     assert c.i_gain[0] / c.p_gain[0] == pytest.approx(0.244381 * 20 / (0.032029 * 11))
     assert c.i_gain[2] / c.p_gain[2] == pytest.approx(2.5 * 0.244381 * 80 / (0.032029 * 45))
     assert c.gyro_time_constant == pytest.approx((1 / 250 + 1 / 500 + 1 / 150) / (2 * math.pi))
@@ -52,7 +67,9 @@ def test_settings_that_are_missing_are_named():
 
 
 def test_the_switch_keeps_the_hover():
-    """The block that mixes motor commands has the gains of the one that mixes thrusts, at the thrust of the hover."""
+    """The block that mixes motor commands has the gains of the one that mixes thrusts, at the
+    thrust of the hover.
+    """
     from sim.effects.blocks import SWITCHES
     from sim.effects.setting import Setting
 
@@ -60,4 +77,7 @@ def test_the_switch_keeps_the_hover():
     switched = SWITCHES["motor mixing"](Setting(plant)).plant.vehicle.controller
     assert switched.p_gain == plant.vehicle.controller.p_gain
     assert switched.mix_thrust == pytest.approx(plant.total_mass * 9.81 / 4)
-    assert dataclasses.replace(switched, kind="betaflight").max_thrust == plant.vehicle.controller.max_thrust
+    assert (
+        dataclasses.replace(switched, kind="betaflight").max_thrust
+        == plant.vehicle.controller.max_thrust
+    )

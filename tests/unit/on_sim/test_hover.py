@@ -1,4 +1,6 @@
-"""The hover controller on a quadrotor with a payload on a massless rigid rope: settles, damps the swing, recovers."""
+"""The hover controller on a quadrotor with a payload on a massless rigid rope: settles, damps the
+swing, recovers.
+"""
 
 import itertools
 
@@ -18,13 +20,13 @@ GOAL = np.array([0.0, 0.0, 2.0])
 
 
 class Pendulum:
-    """Quadrotor with a point mass on a massless rigid rope at its centre of mass, in float64; E of them at once.
+    """Quadrotor with a point mass on a massless rigid rope at its centre of mass, in float64; E of
+    them at once.
 
-    Source: Sreenath, Lee, Kumar, "Geometric control and differential flatness of a quadrotor UAV with a cable-suspended
-    load" (CDC 2013), eqs. 5-6, with q from vehicle to payload, F the thrust, l the rope's length:
-    ``(m_Q + m_L)(x_L'' + g e3) = (q . F - m_Q l |q'|^2) q`` and ``m_Q l w_q' = -q x F``.
-    Without payload: ``m_Q x'' = F - m_Q g e3``.
-    """
+    Source: Sreenath, Lee, Kumar, "Geometric control and differential flatness of a quadrotor UAV
+    with a cable-suspended load" (CDC 2013), eqs. 5-6, with q from vehicle to payload, F the thrust,
+    l the rope's length: ``(m_Q + m_L)(x_L'' + g e3) = (q . F - m_Q l |q'|^2) q`` and ``m_Q l w_q' =
+    -q x F``. Without payload: ``m_Q x'' = F - m_Q g e3``."""
 
     def __init__(
         self,
@@ -91,7 +93,13 @@ def turned(quat: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
     return np.column_stack((vector, quat[:, 3] * w - np.sum(quat[:, :3] * v, axis=1)))
 
 
-def fly(plant: Pendulum, duration: float, yaw: float = 0.0, params: HoverParams | None = None, told_mass=None):
+def fly(
+    plant: Pendulum,
+    duration: float,
+    yaw: float = 0.0,
+    params: HoverParams | None = None,
+    told_mass=None,
+):
     """Fly to GOAL; return times (T,), distances (T, E), swings (T, E), heights (T, E)."""
     controller = HoverController(params or HoverParams(), PERIOD, len(plant.pos_w))
     rows = []
@@ -111,7 +119,9 @@ def settled(times, distances, within):
 
 
 def test_the_plant_of_these_tests_conserves_energy():
-    """Falling freely with the rope whirling, what is lost comes from the step and vanishes with it."""
+    """Falling freely with the rope whirling, what is lost comes from the step and
+    vanishes with it.
+    """
 
     def drift(step: float) -> float:
         plant = Pendulum([0.0, 0.0, 50.0], step=step)
@@ -137,7 +147,9 @@ def energy(plant: Pendulum) -> float:
 
 
 def test_settles_from_half_a_metre_with_the_payload():
-    starts = GOAL + 0.5 * np.array([[1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.64, -0.48]])
+    starts = GOAL + 0.5 * np.array(
+        [[1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.64, -0.48]]
+    )
     times, distances, swings, _ = fly(Pendulum(starts), 6.0)
     for one in distances.T:
         assert settled(times, one, 0.10) < 1.6
@@ -154,7 +166,8 @@ def test_swing_is_damped_never_amplified(delay):
     peaks = [swings[(times > t) & (times <= t + 1.0)].max() for t in range(5)]
     assert max(peaks) <= start
     assert all(later < 0.7 * earlier for earlier, later in itertools.pairwise(peaks[:4]))
-    # With the vehicle held fast a frictionless pendulum would swing for ever: this damping is the controller's.
+    # With the vehicle held fast a frictionless pendulum would swing for ever: this damping is the
+    # controller's.
     assert peaks[4] < 0.02 * start
     assert distances.max() < 0.15
 
@@ -172,7 +185,10 @@ def test_integral_makes_up_for_a_wrong_mass():
     assert distances.max() > 0.05
     assert distances[-1, 0] < 0.01
     _, without, _, _ = fly(
-        Pendulum(GOAL), 12.0, told_mass=0.95 * (VEHICLE + PAYLOAD), params=HoverParams(integral_gain=0.0)
+        Pendulum(GOAL),
+        12.0,
+        told_mass=0.95 * (VEHICLE + PAYLOAD),
+        params=HoverParams(integral_gain=0.0),
     )
     assert without[-1, 0] > 0.05
 
@@ -180,7 +196,9 @@ def test_integral_makes_up_for_a_wrong_mass():
 @pytest.mark.parametrize("pitch", [1.3, 2.8, np.pi])
 def test_recovers_after_a_release_at_any_attitude(pitch):
     quat = (0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2))
-    _, distances, _, heights = fly(Pendulum(GOAL + [[1, 0, 0]], 0.0, 0.0, quat, (2.0, 0.0, 1.5)), 6.0)
+    _, distances, _, heights = fly(
+        Pendulum(GOAL + [[1, 0, 0]], 0.0, 0.0, quat, (2.0, 0.0, 1.5)), 6.0
+    )
     assert distances[-1, 0] < 0.03
     assert heights.min() > 0.8
 
@@ -190,7 +208,9 @@ def test_far_goals_are_approached_at_the_speed_limit():
     plant = Pendulum(GOAL - [[10.0, 0, 0]])
     controller = HoverController(params, PERIOD)
     for k in range(150):
-        plant.advance(k * PERIOD, controller.step(plant.pos_w, plant.quat_wb, plant.vel_w, GOAL, plant.mass))
+        plant.advance(
+            k * PERIOD, controller.step(plant.pos_w, plant.quat_wb, plant.vel_w, GOAL, plant.mass)
+        )
     assert plant.vel_w[0, 0] == pytest.approx(params.max_speed, rel=0.05)
 
 
@@ -200,7 +220,8 @@ def test_commands_by_hand():
     still = np.zeros((1, 3))
     hover = controller.step(still, level, still, still, 0.27)
     np.testing.assert_allclose(hover, [[0.27 * GRAVITY, 0, 0, 0]], atol=1e-12)
-    # Goal ahead (+x): lean forward, a positive turn about y (left). Goal to the left (+y): a negative turn about x.
+    # Goal ahead (+x): lean forward, a positive turn about y (left). Goal to the left (+y): a
+    # negative turn about x.
     assert controller.step(still, level, still, np.array([1.0, 0, 0]), 0.27)[0, 2] > 0.5
     assert controller.step(still, level, still, np.array([0, 1.0, 0]), 0.27)[0, 1] < -0.5
     controller.reset()
@@ -239,7 +260,10 @@ def test_a_batch_equals_singles_and_reset_is_masked():
     singles = [HoverController(HoverParams(), PERIOD) for _ in range(4)]
     for _ in range(3):
         together = batch.step(*state, goal, 0.27)
-        alone = [one.step(*(part[i : i + 1] for part in state), goal[i], 0.27) for i, one in enumerate(singles)]
+        alone = [
+            one.step(*(part[i : i + 1] for part in state), goal[i], 0.27)
+            for i, one in enumerate(singles)
+        ]
         np.testing.assert_array_equal(together, np.concatenate(alone))
     batch.reset(np.array([True, False, False, False]))
     fresh = HoverController(HoverParams(), PERIOD, 4).step(*state, goal, 0.27)
@@ -249,7 +273,13 @@ def test_a_batch_equals_singles_and_reset_is_masked():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"position_gain": -1.0}, {"max_rate": (1.0, -1.0, 1.0)}, {"max_tilt": 1.6}, {"max_thrust": 0.1}]
+    "wrong",
+    [
+        {"position_gain": -1.0},
+        {"max_rate": (1.0, -1.0, 1.0)},
+        {"max_tilt": 1.6},
+        {"max_thrust": 0.1},
+    ],
 )
 def test_nonsense_parameters_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

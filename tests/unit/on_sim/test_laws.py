@@ -1,4 +1,6 @@
-"""Laws as blocks: the kernel's factors are the grammar's, by name and by value; a law pushes as it says."""
+"""Laws as blocks: the kernel's factors are the grammar's, by name and by value; a law pushes as it
+says.
+"""
 
 import dataclasses
 
@@ -24,16 +26,25 @@ def knots(seed: int = 0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     quat, cable = rng.normal(size=4), rng.normal(size=3)
     value = {
-        "time": np.array([0.0, 0.1]), "pos_w": rng.normal(size=3), "vel_w": rng.normal(size=3), "rate_b": rng.normal(size=3),
-        "quat_wb": quat / np.linalg.norm(quat), "payload_vel_w": rng.normal(size=3), "payload_pos_w": rng.normal(size=3),
-        "cable_dir_w": cable / np.linalg.norm(cable), "tension": 0.7, "mount_b": rng.normal(size=3),
-    }  # fmt: skip
+        "time": np.array([0.0, 0.1]),
+        "pos_w": rng.normal(size=3),
+        "vel_w": rng.normal(size=3),
+        "rate_b": rng.normal(size=3),
+        "quat_wb": quat / np.linalg.norm(quat),
+        "payload_vel_w": rng.normal(size=3),
+        "payload_pos_w": rng.normal(size=3),
+        "cable_dir_w": cable / np.linalg.norm(cable),
+        "tension": 0.7,
+        "mount_b": rng.normal(size=3),
+    }
     out = {name: v if name == "time" else np.stack([v, v]) for name, v in value.items()}
     return out | {"thrust": np.array([2.5, 2.9])}
 
 
 def kernels_factors():
-    """The kernel's own factors at the moment that they see: scalars by name, vectors by block and name."""
+    """The kernel's own factors at the moment that they see: scalars by name, vectors by block and
+    name.
+    """
     t = types("float64")
     Around = make_struct("Around", laws._around(t))
     k = knots()
@@ -54,9 +65,13 @@ def kernels_factors():
         wp.launch(one, 1, [around], [out], device="cpu")
         return out.numpy()[0]
 
-    # All kernels come before the first launch, which compiles the module: each that came after one would compile it again.
+    # All kernels come before the first launch, which compiles the module: each that came after one
+    # would compile it again.
     reals = {name: kernel(name, factor, t.real) for name, factor in scalars.items()}
-    vec3s = {b: {n: kernel(f"{b.replace(' ', '_')}_{n}", f, t.vec3) for n, f in of.items()} for b, of in vectors.items()}
+    vec3s = {
+        b: {n: kernel(f"{b.replace(' ', '_')}_{n}", f, t.vec3) for n, f in of.items()}
+        for b, of in vectors.items()
+    }
     return (
         {name: value(one, t.real) for name, one in reals.items()},
         {b: {n: value(one, t.vec3) for n, one in of.items()} for b, of in vec3s.items()},
@@ -75,7 +90,9 @@ def test_factors_are_the_grammars():
         assert set(vectors[block]) == set(of), block
         for name, factor in of.items():
             found = vectors[block][name]
-            np.testing.assert_allclose(found, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}")
+            np.testing.assert_allclose(
+                found, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}"
+            )
     assert names() == (tuple(scalars), {block: tuple(of) for block, of in vectors.items()})
 
 
@@ -88,7 +105,10 @@ def test_a_law_is_compiled_in_only_where_it_is():
 
 def test_laws_are_part_of_the_configuration():
     path = config.find("train", "state")
-    text = f'laws = [{{block = "payload force", factors = [], vector = "vertical_cross_vel", coefficient = 0.02}}]\nbase = "{path}"'
+    text = (
+        'laws = [{block = "payload force", factors = [], vector = "vertical_cross_vel",'
+        f' coefficient = 0.02}}]\nbase = "{path}"'
+    )
     experiment = config.loads(Experiment, text)
     assert experiment.laws == (SWIRL,)
     assert config.loads(Experiment, config.dumps(experiment)) == experiment

@@ -1,4 +1,6 @@
-"""The start of an episode: every range and distribution of the paper's randomisation, recovered from the states."""
+"""The start of an episode: every range and distribution of the paper's randomisation, recovered
+from the states.
+"""
 
 import dataclasses
 from functools import lru_cache
@@ -44,7 +46,11 @@ def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
 
 
 def test_the_file_holds_the_numbers_of_the_paper():
-    """Sec. III-C: +-0.5/0.5/0.3 m and m/s, 20 deg, 30 deg/s, mass 5 %, six cables over 6 %, 15 deg and deg/s."""
+    """Sec.
+
+    III-C: +-0.5/0.5/0.3 m and m/s, 20 deg, 30 deg/s, mass 5 %, six cables over 6 %, 15 deg and
+    deg/s.
+    """
     z = spreads()
     assert z.position == z.velocity == (0.5, 0.5, 0.3)
     assert z.attitude_deg == (20.0,) * 3
@@ -57,9 +63,13 @@ def test_the_file_holds_the_numbers_of_the_paper():
 def test_position_velocity_and_rates(axis):
     sim, z = started(), spreads()
     home = np.array([0.0, 0.0, z.spawn_height])[axis]
-    assert_uniform(sim.get("pos_w")[:, axis].astype(float) - home, -z.position[axis], z.position[axis])
+    assert_uniform(
+        sim.get("pos_w")[:, axis].astype(float) - home, -z.position[axis], z.position[axis]
+    )
     assert_uniform(sim.get("vel_w")[:, axis].astype(float), -z.velocity[axis], z.velocity[axis])
-    assert_uniform(np.degrees(sim.get("rate_b")[:, axis].astype(float)), -z.rate_deg[axis], z.rate_deg[axis])
+    assert_uniform(
+        np.degrees(sim.get("rate_b")[:, axis].astype(float)), -z.rate_deg[axis], z.rate_deg[axis]
+    )
 
 
 def test_attitude():
@@ -74,12 +84,16 @@ def test_attitude():
 
 
 def cable_angles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Azimuth and tilt [rad] of the cable in the body frame and the cable's own velocity there [1/s]."""
+    """Azimuth and tilt [rad] of the cable in the body frame and the cable's own velocity there
+    [1/s].
+    """
     sim = started()
     quat = sim.get("quat_wb").astype(float)
     back = quat * [-1.0, -1.0, -1.0, 1.0]
     down = rotate(back, sim.get("cable_dir_w")[:, 0].astype(float))
-    swing = rotate(back, sim.get("cable_vel_w")[:, 0].astype(float)) - np.cross(sim.get("rate_b"), down)
+    swing = rotate(back, sim.get("cable_vel_w")[:, 0].astype(float)) - np.cross(
+        sim.get("rate_b"), down
+    )
     azimuth = np.arctan2(-down[:, 0], down[:, 1])
     azimuth = np.where(np.cos(azimuth) < 0.0, azimuth + np.pi, azimuth)
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
@@ -91,7 +105,9 @@ def test_cable_hangs_yawed_then_rolled():
     """``Rz(azimuth) Rx(tilt) (0, 0, -1)``; an azimuth can be read off where there is a tilt."""
     azimuth, tilt, down, _ = cable_angles()
     bound = spreads().cable_angle_deg
-    rebuilt = np.stack((-np.sin(azimuth) * np.sin(tilt), np.cos(azimuth) * np.sin(tilt), -np.cos(tilt)), -1)
+    rebuilt = np.stack(
+        (-np.sin(azimuth) * np.sin(tilt), np.cos(azimuth) * np.sin(tilt), -np.cos(tilt)), -1
+    )
     np.testing.assert_allclose(rebuilt, down, atol=1e-6)
     assert_uniform(np.degrees(tilt), -bound, bound)
     assert_uniform(np.degrees(azimuth[np.abs(tilt) > 0.01]), -bound, bound)
@@ -123,11 +139,15 @@ def test_mass_and_battery():
 
 
 def test_six_cables_for_good():
-    """The length belongs to the environment: it is there before and after a reset, each as often as the others."""
+    """The length belongs to the environment: it is there before and after a reset, each as often as
+    the others.
+    """
     sim, z = started(), spreads()
     lengths = np.linalg.norm(np.diff(sim.cable_points_w(), axis=1), axis=-1).sum(axis=1)
     nominal = paper_plant().rope.length
-    expected = nominal * np.linspace(1.0 - z.tether_spread, 1.0 + z.tether_spread, z.tether_variants)
+    expected = nominal * np.linspace(
+        1.0 - z.tether_spread, 1.0 + z.tether_spread, z.tether_variants
+    )
     np.testing.assert_allclose(lengths, expected[np.arange(COUNT) % z.tether_variants], rtol=1e-5)
     densities = {round(r.rope_mass / r.length, 12) for r in tether_lengths(paper_plant().rope, z)}
     assert len(densities) == 1, "the mass per metre is kept"
@@ -146,7 +166,10 @@ def test_goals_fill_the_disk_evenly():
 def test_draws_are_independent():
     sim = started()
     columns = np.column_stack(
-        [sim.get(k).reshape(COUNT, -1)[:, :3] for k in ("pos_w", "vel_w", "rate_b", "mass_scale", "charge_used")]
+        [
+            sim.get(k).reshape(COUNT, -1)[:, :3]
+            for k in ("pos_w", "vel_w", "rate_b", "mass_scale", "charge_used")
+        ]
         + [sim.goal_w.numpy()[:, :2]]
     )
     apart = np.corrcoef(columns.T) - np.eye(columns.shape[1])
@@ -166,7 +189,12 @@ def test_every_reset_draws_anew():
 def test_without_spreads_the_start_is_exact():
     names = ("position", "velocity", "attitude_deg", "rate_deg")
     still = dataclasses.replace(
-        spreads(), mass=0.0, cable_angle_deg=0.0, cable_rate_deg=0.0, battery_used=0.0, goal_radius=0.0,
+        spreads(),
+        mass=0.0,
+        cable_angle_deg=0.0,
+        cable_rate_deg=0.0,
+        battery_used=0.0,
+        goal_radius=0.0,
         **{name: (0.0, 0.0, 0.0) for name in names},
     )
     sim = HybridSim(paper_plant(), 2)

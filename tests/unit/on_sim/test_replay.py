@@ -1,4 +1,6 @@
-"""The replay: the simulator's own flights come back, events fall where they should, lanes do not see each other."""
+"""The replay: the simulator's own flights come back, events fall where they should, lanes do not
+see each other.
+"""
 
 import dataclasses
 import os
@@ -21,7 +23,9 @@ ROUNDING = 1e-11  # m, rad: of the same operations in another order, after 400 s
 
 
 def plant():
-    """The paper's plant in float64: its delay of 22 ms and its lag of 110 ms end steps of 2 ms, in both simulators alike."""
+    """The paper's plant in float64: its delay of 22 ms and its lag of 110 ms end steps of 2 ms, in
+    both simulators alike.
+    """
     base = paper_plant()
     return dataclasses.replace(base, sim=dataclasses.replace(base.sim, precision="float64"))
 
@@ -38,41 +42,97 @@ def flight():
     sim.place(pos_w=np.array([[0.0, 0.0, 1.5]]), cable_dir_w=np.tile(tilt, (1, 15, 1)))
     own = [name for name in rk.STATE_FIELDS if not name.startswith(("payload", "slack"))]
     start = {name: sim.get(name) for name in own} | {"payload_pos_w": sim.get("payload_pos_w")}
-    start |= {"payload_vel_w": sim.get("payload_vel_w"), "slack_first": np.zeros(1), "slack_last": np.zeros(1)}
+    start |= {
+        "payload_vel_w": sim.get("payload_vel_w"),
+        "slack_first": np.zeros(1),
+        "slack_last": np.zeros(1),
+    }
     times, commands = [-1.0], [sim.get("queue")[0, 0]]
     seen = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "rate_b")}
     for k in range(PERIODS):
         times.append(0.02 * k)
-        commands.append(np.array([2.6 * (1 + 0.2 * np.sin(0.4 * k)), 1.5 * np.sin(0.3 * k), 1.5 * np.cos(0.2 * k), 0.3]))
+        commands.append(
+            np.array(
+                [
+                    2.6 * (1 + 0.2 * np.sin(0.4 * k)),
+                    1.5 * np.sin(0.3 * k),
+                    1.5 * np.cos(0.2 * k),
+                    0.3,
+                ]
+            )
+        )
         sim.set_command(commands[-1][None], one(k == RELEASED_AT))
         sim.step()
         for name, values in seen.items():
             values.append(sim.get(name)[0].copy())
-    return start, np.array(times), np.array(commands), {name: np.array(values) for name, values in seen.items()}
+    return (
+        start,
+        np.array(times),
+        np.array(commands),
+        {name: np.array(values) for name, values in seen.items()},
+    )
 
 
 def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIODS, **lane):
-    """Replay the flight in some lanes; returns the vectors seen by group, each (stamps, lanes, 3), and all there is."""
+    """Replay the flight in some lanes; returns the vectors seen by group, each (stamps, lanes, 3),
+    and all there is.
+    """
     start, times, commands, seen = flight
     stamps = 0.02 * (1 + np.arange(PERIODS)) if stamps is None else stamps
     hanging = stamps <= 0.02 * RELEASED_AT + 0.1
     quats = seen["quat_wb"][np.clip(np.round(stamps / 0.02).astype(int) - 1, 0, PERIODS - 1)]
-    data = {"command_time": times, "command": commands, "vehicle_time": stamps, "vehicle_quat": quats,
-            "payload_time": stamps[hanging], "gyro_time": stamps}  # fmt: skip
+    data = {
+        "command_time": times,
+        "command": commands,
+        "vehicle_time": stamps,
+        "vehicle_quat": quats,
+        "payload_time": stamps[hanging],
+        "gyro_time": stamps,
+    }
     n, m = len(stamps), int(hanging.sum())
-    windows = {"start": 0.0, "end": end, "first_knot": 0.0, "knots": 9, "payload": rk.ATTACHED,
-               "latch": 0.02 * RELEASED_AT, "clock_zero": 0.0, "command_first": 0, "command_last": len(times),
-               "vehicle_first": 0, "vehicle_count": n, "payload_first": 0, "payload_count": m, "gyro_first": 0,
-               "gyro_count": n}  # fmt: skip
-    lanes = {"window": 0, "plant": 0, "state": 0, "axis": -1, "knot": 0, "size": 0.0, "substep": 0.002, "keep": -1, "resume": -1,
-             "parent": -1, "shared": 0} | lane  # fmt: skip
+    windows = {
+        "start": 0.0,
+        "end": end,
+        "first_knot": 0.0,
+        "knots": 9,
+        "payload": rk.ATTACHED,
+        "latch": 0.02 * RELEASED_AT,
+        "clock_zero": 0.0,
+        "command_first": 0,
+        "command_last": len(times),
+        "vehicle_first": 0,
+        "vehicle_count": n,
+        "payload_first": 0,
+        "payload_count": m,
+        "gyro_first": 0,
+        "gyro_count": n,
+    }
+    lanes = {
+        "window": 0,
+        "plant": 0,
+        "state": 0,
+        "axis": -1,
+        "knot": 0,
+        "size": 0.0,
+        "substep": 0.002,
+        "keep": -1,
+        "resume": -1,
+        "parent": -1,
+        "shared": 0,
+    } | lane
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
     plants = [generalised(Setting(p)).plant for p in plants]  # as a diagnosis flies them
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
-    flown = engine.run(start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9)
+    flown = engine.run(
+        start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9
+    )
     out = flown.seen
-    return {"pos": out[0 : 2 * n : 2], "turn": out[1 : 2 * n : 2], "payload": out[2 * n : 2 * n + m],
-            "rate": out[2 * n + m : 3 * n + m]}, flown  # fmt: skip
+    return {
+        "pos": out[0 : 2 * n : 2],
+        "turn": out[1 : 2 * n : 2],
+        "payload": out[2 * n : 2 * n + m],
+        "rate": out[2 * n + m : 3 * n + m],
+    }, flown
 
 
 def test_replay_is_the_simulator(flight):
@@ -80,16 +140,28 @@ def test_replay_is_the_simulator(flight):
     truth = flight[3]
     assert np.abs(seen["pos"][:, 0] - truth["pos_w"]).max() < ROUNDING
     assert np.abs(seen["turn"]).max() < ROUNDING
-    assert np.abs(seen["payload"][:, 0] - truth["payload_pos_w"][: len(seen["payload"])]).max() < ROUNDING
+    assert (
+        np.abs(seen["payload"][:, 0] - truth["payload_pos_w"][: len(seen["payload"])]).max()
+        < ROUNDING
+    )
     assert np.abs(seen["rate"][:, 0] - truth["rate_b"]).max() < 1e3 * ROUNDING
     assert all(len(build.replay.module.execs) == 1 for build in _BUILDS.values()), "compiled once"
 
 
 def test_commands_switch_where_they_should(flight):
-    """A delay longer by a tenth of a substep moves the flight as its derivative says: nothing is rounded to steps."""
+    """A delay longer by a tenth of a substep moves the flight as its derivative says: nothing is
+    rounded to steps.
+    """
     late = [0.0, 2e-4, 2e-3]
-    plants = [dataclasses.replace(plant(), vehicle=dataclasses.replace(
-        plant().vehicle, queue=dataclasses.replace(plant().vehicle.queue, delay=0.022 + x))) for x in late]  # fmt: skip
+    plants = [
+        dataclasses.replace(
+            plant(),
+            vehicle=dataclasses.replace(
+                plant().vehicle, queue=dataclasses.replace(plant().vehicle.queue, delay=0.022 + x)
+            ),
+        )
+        for x in late
+    ]
     seen, _ = replay(flight, plants, count=3, plant=np.arange(3))
     small, large = ((seen["pos"][:, i] - seen["pos"][:, 0]) / late[i] for i in (1, 2))
     assert np.abs(large - small).max() < 0.05 * np.abs(large).max()
@@ -102,11 +174,16 @@ def test_release_falls_between_steps(flight):
     before = seen["payload"][:, 0]
     assert len(before) == np.count_nonzero(stamps <= 0.5)
     lags = [0.1037, 0.1038]
-    plants = [dataclasses.replace(plant(), release=dataclasses.replace(plant().release, lag=x)) for x in lags]
+    plants = [
+        dataclasses.replace(plant(), release=dataclasses.replace(plant().release, lag=x))
+        for x in lags
+    ]
     ends = replay(flight, plants, count=2, plant=np.arange(2), keep=np.array([0, 0]))[1].ends
     shift = ends["payload_pos_w"][1] - ends["payload_pos_w"][0]
     assert 0.0 < np.linalg.norm(shift) < 1e-3
-    half = [dataclasses.replace(plants[0], release=dataclasses.replace(plant().release, lag=0.10375))]
+    half = [
+        dataclasses.replace(plants[0], release=dataclasses.replace(plant().release, lag=0.10375))
+    ]
     middle = replay(flight, half, keep=0)[1].ends["payload_pos_w"][0] - ends["payload_pos_w"][0]
     np.testing.assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
 
@@ -125,8 +202,14 @@ def test_latent_forces_push(flight):
     force = 0.01
     mass = plant().vehicle.body.mass
     knots = np.arange(9)
-    seen, _ = replay(flight, [plant()], count=10, axis=np.append(np.full(9, 2), -1), knot=np.append(knots, 0),
-                     size=np.append(np.full(9, force), 0.0))  # fmt: skip
+    seen, _ = replay(
+        flight,
+        [plant()],
+        count=10,
+        axis=np.append(np.full(9, 2), -1),
+        knot=np.append(knots, 0),
+        size=np.append(np.full(9, force), 0.0),
+    )
     pushed = np.sum(seen["pos"][:, :9] - seen["pos"][:, 9:], axis=1)
     early = 0.02 * (1 + np.arange(PERIODS)) < 0.12  # before the rope answers
     time = 0.02 * (1 + np.arange(PERIODS))[early]
@@ -136,27 +219,55 @@ def test_latent_forces_push(flight):
 
 
 def test_latent_lanes_may_leave_the_nominal_one_at_a_knot(flight):
-    """To the bit what they see who fly the whole window, before the release and after it, with the rope still on or not."""
+    """To the bit what they see who fly the whole window, before the release and after it, with the
+    rope still on or not.
+    """
     tail = dataclasses.replace(plant(), release=dataclasses.replace(plant().release, rope_tail=0.3))
     pushed = np.arange(1, 9)
-    given = {"count": 9, "axis": np.append(-1, pushed % 9), "knot": np.append(0, pushed), "keep": np.append(0, np.full(8, -1)),
-             "size": np.append(0.0, np.full(8, 0.01))}  # fmt: skip
+    given = {
+        "count": 9,
+        "axis": np.append(-1, pushed % 9),
+        "knot": np.append(0, pushed),
+        "keep": np.append(0, np.full(8, -1)),
+        "size": np.append(0.0, np.full(8, 0.01)),
+    }
     for p in (plant(), tail):
         whole, _ = replay(flight, [p], **given)
-        left, _ = replay(flight, [p], **given, resume=np.append(-1, pushed - 1), parent=np.append(-1, np.zeros(8, dtype=int)))
+        left, _ = replay(
+            flight,
+            [p],
+            **given,
+            resume=np.append(-1, pushed - 1),
+            parent=np.append(-1, np.zeros(8, dtype=int)),
+        )
         for name, value in whole.items():
             np.testing.assert_array_equal(left[name], value)
 
 
 def test_lanes_that_are_seen_otherwise_ride_along(flight):
-    """To the bit what they see who fly by themselves, with late and early stamps, while another lane leaves the nominal one."""
+    """To the bit what they see who fly by themselves, with late and early stamps, while another
+    lane leaves the nominal one.
+    """
     late = SensingParams(vehicle_delay=0.006, scale=0.01)
     seen = [SensingParams(), late, SensingParams(payload_delay=-0.003, gyro_bias=(0.1, 0.0, 0.0))]
-    given = {"count": 4, "plant": np.array([0, 1, 2, 0]), "axis": np.array([-1, -1, -1, 2]), "size": 0.01, "knot": 4,
-             "keep": np.array([0, -1, -1, -1])}  # fmt: skip
+    given = {
+        "count": 4,
+        "plant": np.array([0, 1, 2, 0]),
+        "axis": np.array([-1, -1, -1, 2]),
+        "size": 0.01,
+        "knot": 4,
+        "keep": np.array([0, -1, -1, -1]),
+    }
     alone, _ = replay(flight, [plant()] * 3, seen, **given)
-    sharing, _ = replay(flight, [plant()] * 3, seen, **given, shared=np.array([2, 0, 0, 0]), resume=np.array([-1, -1, -1, 3]),
-                       parent=np.array([-1, -1, -1, 0]))  # fmt: skip
+    sharing, _ = replay(
+        flight,
+        [plant()] * 3,
+        seen,
+        **given,
+        shared=np.array([2, 0, 0, 0]),
+        resume=np.array([-1, -1, -1, 3]),
+        parent=np.array([-1, -1, -1, 0]),
+    )
     for name, value in alone.items():
         np.testing.assert_array_equal(sharing[name], value)
         assert np.any(value[:, 0] != value[:, 1]) or np.any(value[:, 0] != value[:, 2])
@@ -164,16 +275,26 @@ def test_lanes_that_are_seen_otherwise_ride_along(flight):
 
 def test_sensors(flight):
     x = SensingParams(
-        vehicle_delay=0.003, payload_delay=0.004, frame_tilt=(0.02, -0.01, 0.03), marker_rotation=(0.01, 0.02, -0.03),
-        marker_offset=(0.01, -0.02, 0.03), payload_offset=(0.001, 0.002, 0.003), scale=0.01, gyro_bias=(0.1, 0.2, 0.3),
-    )  # fmt: skip
+        vehicle_delay=0.003,
+        payload_delay=0.004,
+        frame_tilt=(0.02, -0.01, 0.03),
+        marker_rotation=(0.01, 0.02, -0.03),
+        marker_offset=(0.01, -0.02, 0.03),
+        payload_offset=(0.001, 0.002, 0.003),
+        scale=0.01,
+        gyro_bias=(0.1, 0.2, 0.3),
+    )
     stamps = 0.02 * (2 + np.arange(PERIODS - 4))
-    ideal, _ = replay(flight, [plant()], stamps=np.sort(np.concatenate((stamps - 0.003, stamps - 0.004, stamps))))
+    ideal, _ = replay(
+        flight, [plant()], stamps=np.sort(np.concatenate((stamps - 0.003, stamps - 0.004, stamps)))
+    )
     seen, _ = replay(flight, [plant()], [x], stamps=stamps)
     at = np.argsort(np.argsort(np.concatenate((stamps - 0.003, stamps - 0.004, stamps))))
     n = len(stamps)
     true_quat = Rotation.from_quat(flight[3]["quat_wb"][1 : 1 + n])
-    nearest = flight[3]["quat_wb"][np.clip(np.round((stamps - 0.003) / 0.02).astype(int) - 1, 0, PERIODS - 1)]
+    nearest = flight[3]["quat_wb"][
+        np.clip(np.round((stamps - 0.003) / 0.02).astype(int) - 1, 0, PERIODS - 1)
+    ]
     attitude = Rotation.from_quat(nearest) * Rotation.from_rotvec(ideal["turn"][at[:n], 0])
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
     wanted = 1.01 * frame.apply(ideal["pos"][at[:n], 0] + attitude.apply(x.marker_offset))
@@ -183,23 +304,32 @@ def test_sensors(flight):
     m = len(seen["payload"])
     wanted = 1.01 * frame.apply(ideal["payload"][at[n : n + m], 0] + np.array(x.payload_offset))
     np.testing.assert_allclose(seen["payload"][:, 0], wanted, atol=1e-9)
-    np.testing.assert_allclose(seen["rate"][:, 0] - ideal["rate"][at[2 * n :], 0], np.tile(x.gyro_bias, (n, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        seen["rate"][:, 0] - ideal["rate"][at[2 * n :], 0], np.tile(x.gyro_bias, (n, 1)), atol=1e-9
+    )
 
 
 def com_velocity(ends):
     """Velocity of the centre of mass of payload and loose rope at the end of a lane [m/s]."""
     rope = plant().rope
     u, link, rod = ends["cable_vel_w"][0], rope.length / 15, rope.rope_mass / 15
-    below = np.array([(rope.payload_mass + rod * (14 - i)) * link + rod * link / 2 for i in range(15)])
+    below = np.array(
+        [(rope.payload_mass + rod * (14 - i)) * link + rod * link / 2 for i in range(15)]
+    )
     below[-1] += rope.payload_mass * rope.payload_offset
     root = ends["payload_vel_w"][0] - link * u.sum(0) - rope.payload_offset * u[-1]
     return root + (below[:, None] * u).sum(0) / (rope.payload_mass + rope.rope_mass)
 
 
 def test_rope_that_leaves_falls_with_the_payload(flight):
-    """The centre of mass of payload and loose rope is a projectile; the payload, which the rope tugs at, is not."""
+    """The centre of mass of payload and loose rope is a projectile; the payload, which the rope
+    tugs at, is not.
+    """
     tail = dataclasses.replace(plant(), release=dataclasses.replace(plant().release, rope_tail=1.0))
-    early, late = (replay(flight, [tail], keep=0, stamps=np.array([0.4]), end=end)[1].ends for end in (0.56, 0.78))
+    early, late = (
+        replay(flight, [tail], keep=0, stamps=np.array([0.4]), end=end)[1].ends
+        for end in (0.56, 0.78)
+    )
     fallen = 0.22 * np.array([0.0, 0.0, -9.81])
     np.testing.assert_allclose(com_velocity(late) - com_velocity(early), fallen, atol=1e-9)
     assert np.linalg.norm(late["payload_vel_w"][0] - early["payload_vel_w"][0] - fallen) > 1e-4

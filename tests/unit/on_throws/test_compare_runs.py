@@ -1,4 +1,6 @@
-"""The table of throws from HIL run folders: several policies, targets and throws a folder, failed throws, wrong folders."""
+"""The table of throws from HIL run folders: several policies, targets and throws a folder, failed
+throws, wrong folders.
+"""
 
 import json
 
@@ -14,16 +16,27 @@ from visthrow.task.measurement import Throws
 from visthrow.throws import from_runs
 
 
-def log(policy="vision", goal=(2.0, 0.0, 0.0), landed=(2.1, 0.05, 0.04), sha="a", home=(0.0, 0.0, 1.333)) -> FlightLog:
+def log(
+    policy="vision", goal=(2.0, 0.0, 0.0), landed=(2.1, 0.05, 0.04), sha="a", home=(0.0, 0.0, 1.333)
+) -> FlightLog:
     """A throw of five ticks whose commands change by 0.1 each."""
     result = {"success": landed is not None, "failure": None if landed else "stale poses"}
     if landed:
         error = float(np.hypot(landed[0] - goal[0], landed[1] - goal[1]))
         result |= {"landing_w": list(landed), "error": error, "duration": 1.05}
-    recorder = FlightRecorder({
-        "policy": policy, "policy_sha256": sha * 64, "layout": "vision", "plant": "poses", "plant_meaning": "poses of mavlink",
-        "goal_w": list(goal), "home_w": list(home), "times": {"policy_start": 1.0, "recovery": 1.1}, "result": result,
-    })  # fmt: skip
+    recorder = FlightRecorder(
+        {
+            "policy": policy,
+            "policy_sha256": sha * 64,
+            "layout": "vision",
+            "plant": "poses",
+            "plant_meaning": "poses of mavlink",
+            "goal_w": list(goal),
+            "home_w": list(home),
+            "times": {"policy_start": 1.0, "recovery": 1.1},
+            "result": result,
+        }
+    )
     for n in range(5):
         before, now = np.full(5, 0.1 * n), np.full(5, 0.1 * (n + 1))
         observation = np.zeros(69)
@@ -34,7 +47,10 @@ def log(policy="vision", goal=(2.0, 0.0, 0.0), landed=(2.1, 0.05, 0.04), sha="a"
 
 def test_a_row_a_policy_and_target():
     logs = [log(landed=(2.0 + x, 0.0, 0.04)) for x in (-0.1, 0.1, 0.3)] + [log(landed=None)]
-    logs += [log(goal=(1.5, 0.0, 0.0), landed=(1.5, 0.2, 0.04)), log("state", landed=(2.0, 0.0, 0.04), sha="b")]
+    logs += [
+        log(goal=(1.5, 0.0, 0.0), landed=(1.5, 0.2, 0.04)),
+        log("state", landed=(2.0, 0.0, 0.04), sha="b"),
+    ]
     first, second = from_runs.entries(logs)
     assert (first.name, second.name) == ("state", "vision")
     at_15, at_2 = second.throws
@@ -48,7 +64,9 @@ def test_a_row_a_policy_and_target():
 
 
 def test_a_goal_to_the_side_of_another_hover_point():
-    (entry,) = from_runs.entries([log(goal=(1.0, 4.0, 0.0), home=(1.0, 2.0, 1.3), landed=(0.9, 4.1, 0.04))])
+    (entry,) = from_runs.entries(
+        [log(goal=(1.0, 4.0, 0.0), home=(1.0, 2.0, 1.3), landed=(0.9, 4.1, 0.04))]
+    )
     (throws,) = entry.throws
     assert throws.target == 2.0
     np.testing.assert_allclose(throws.landing_w, [[2.1, 0.1]], atol=1e-9)
@@ -78,18 +96,26 @@ def test_the_command(tmp_path, capsys):
     assert "3 throws of 2 runs" in text
     assert "0.101 ± 0.106, 1.125 ± 0.029" in text, "the paper's figures beside ours"
     assert "do not say" in text
-    assert {path.name for path in out.iterdir()} == {"compare-runs.md", "compare-runs.csv", "compare-runs.png"}
+    assert {path.name for path in out.iterdir()} == {
+        "compare-runs.md",
+        "compare-runs.csv",
+        "compare-runs.png",
+    }
     rows = json.loads((tmp_path / "t.json").read_text())["rows"]
     flown = next(row for row in rows if row["policy"] == "always")
     assert flown["error_mean"] == pytest.approx(2.0, abs=0.02)
-    assert isinstance(from_runs.entries([FlightLog.load(folder / "throw-01.npz")])[0].throws[0], Throws)
+    assert isinstance(
+        from_runs.entries([FlightLog.load(folder / "throw-01.npz")])[0].throws[0], Throws
+    )
 
 
 def test_what_holds_no_throws(tmp_path, capsys):
     assert main(["compare", "--from", str(tmp_path / "none")]) == 2
     assert "no such folder" in capsys.readouterr().err
     (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
+    with pytest.raises(
+        LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"
+    ):
         from_runs.logs_of([tmp_path])
     bare = FlightLog({}, {"policy": "x"})
     with pytest.raises(LogError, match="holds no throw of a run"):

@@ -14,7 +14,9 @@ FULL = 3.5
 
 @pytest.fixture(params=["vision", "vision_betaflight"])
 def plant(request):
-    """The paper's vehicle: by its own controller's full thrust, and by that of a firmware's at the voltage of its calibration."""
+    """The paper's vehicle: by its own controller's full thrust, and by that of a firmware's at the
+    voltage of its calibration.
+    """
     return make_motors(request.param, 3)
 
 
@@ -41,14 +43,18 @@ def test_it_stands_until_its_rotors_carry_it(plant):
 
 
 def test_thrust_goes_with_the_square_of_the_command_and_is_what_the_accelerometer_shows(plant):
-    """``f = k_f (full_speed u V / V_ref)^2`` a rotor, over the mass that it carries; the rope hangs straight meanwhile."""
+    """``f = k_f (full_speed u V / V_ref)^2`` a rotor, over the mass that it carries; the rope hangs
+    straight meanwhile.
+    """
     weight = plant.mass[0] * GRAVITY
     fly(plant, command_for(plant, 1.3 * weight), 0.4)
     slow = plant.look()["motor_speed"].mean()
     fly(plant, 1.5 * command_for(plant, weight), 0.15)
     assert plant.look()["motor_speed"].mean() > slow
     thrust = (plant.look()["motor_speed"] ** 2).sum() * FULL / 4000.0**2
-    assert plant.force_b[2] * plant.mass[0] == pytest.approx(thrust, rel=0.12)  # inflow and drag take their share
+    assert plant.force_b[2] * plant.mass[0] == pytest.approx(
+        thrust, rel=0.12
+    )  # inflow and drag take their share
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,9 @@ def test_key_depends_on_every_entry_and_not_on_their_order():
     base = unit()
     assert results.key_of(dict(reversed(base.items()))) == results.key_of(base)
     changed = {name: {**base, name: "other"} for name in base}
-    assert len({results.key_of(u) for u in changed.values()} | {results.key_of(base)}) == len(base) + 1
+    assert (
+        len({results.key_of(u) for u in changed.values()} | {results.key_of(base)}) == len(base) + 1
+    )
 
 
 def test_result_survives_its_file(tmp_path):
@@ -50,7 +52,11 @@ def test_result_survives_its_file(tmp_path):
 
 def test_batches_are_joined_in_order_and_moving_goals_count():
     made = [results.Result({**unit(), "batch": b}, columns(b)) for b in (1, 0)]
-    made.append(results.Result(unit(5), {**columns(), "goal_w": np.array([[2.1, 0.1], [2.0, 0.2], [np.nan, np.nan]])}))
+    made.append(
+        results.Result(
+            unit(5), {**columns(), "goal_w": np.array([[2.1, 0.1], [2.0, 0.2], [np.nan, np.nan]])}
+        )
+    )
     made.append(results.Result({**unit(), "batch": 1, "throws": 2}, columns(9)))
     moving, whole = results.join(made)
     assert whole.unit == {**unit(), "throws": 6}
@@ -85,7 +91,9 @@ def test_work_does_only_what_is_missing(tmp_path):
     known = {results.key_of(unit(1)): results.Result(unit(1), columns(1))}
     found = results.work([unit(0), unit(1), unit(2), unit(2)], tmp_path, function, known)
     assert calls == [0, 2]
-    assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == pytest.approx([0.1235, 1.1235, 2.1235], abs=1e-4)
+    assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == pytest.approx(
+        [0.1235, 1.1235, 2.1235], abs=1e-4
+    )
 
 
 WORKER = """
@@ -116,7 +124,9 @@ def test_killed_and_started_again_it_loses_and_repeats_nothing(tmp_path):
     finished = {json.loads(path.read_text())["unit"]["seed"] for path in folder.glob("*.json")}
     assert 3 <= len(finished) < 12
     before = log.read_text().split()
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
+    again = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+    )
     assert float(again.stdout) == sum(range(12))
     after = [int(x) for x in log.read_text().split()[len(before) :]]
     assert not finished & set(after)

@@ -27,7 +27,9 @@ from visthrow.throws.recorded import fly
 from visthrow.view.tables import csv_text, markdown
 
 LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
-ENERGY_DRIFT = 0.02  # of a swinging rope in half a second: first-order velocity of Verlet steps of 1 ms
+ENERGY_DRIFT = (
+    0.02  # of a swinging rope in half a second: first-order velocity of Verlet steps of 1 ms
+)
 JOIN = 2e-3  # [m]: what the ball moves at most between two samples beyond v dt, half g dt^2
 
 
@@ -35,7 +37,9 @@ def dropping_policy(name: str = "state", release: float = 1.0) -> Policy:
     """A policy that hovers with fixed thrust and asks for the release at once."""
     experiment = config.load(Experiment, config.find("train", name))
     contract = contract_of(experiment)
-    weight = 9.81 * (experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass)
+    weight = 9.81 * (
+        experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass
+    )
     throttle = 2.0 * (weight / experiment.task.action.max_thrust) ** 0.5 - 1.0
     width = contract["observation"]["dimension"]
     bias = torch.tensor([throttle, 0.0, 0.0, 0.0, release])
@@ -77,7 +81,9 @@ def test_loose_rope_keeps_its_links_and_its_energy():
 
 def test_loose_rope_ends_on_the_ground():
     points = np.column_stack((np.zeros(9), np.zeros(9), np.linspace(0.3, 0.07, 9)))
-    rope = LooseRope(points, np.tile([0.3, 0.0, -4.0], (9, 1)), np.array([0.0, 0.0, 0.04]), np.zeros(3))
+    rope = LooseRope(
+        points, np.tile([0.3, 0.0, -4.0], (9, 1)), np.array([0.0, 0.0, 0.04]), np.zeros(3)
+    )
     rope.sink(2.0, 0.003 - 0.04)
     resting = rope.points_w(np.array([0.0, 0.0, 0.04]))
     assert resting[:-1, 2].min() > 0.0
@@ -113,13 +119,18 @@ def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
 def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     experiment = config.load(Experiment, config.find("train", "state"))
     plant = make_plant("hybrid", experiment, 400)
-    truth, seen = plant.state, plant.measured()  # right after a reset nothing has moved yet, so nothing is late
+    truth, seen = (
+        plant.state,
+        plant.measured(),
+    )  # right after a reset nothing has moved yet, so nothing is late
     for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
         spread = (getattr(seen, name) - getattr(truth, name)).std()
         assert spread == pytest.approx(experiment.task.noise.observation_step, rel=0.1)
     np.testing.assert_allclose(np.linalg.norm(seen.quat_wb, axis=1), 1.0)
     angle = 2.0 * np.linalg.norm(seen.quat_wb[:, :3], axis=1)
-    assert angle.mean() == pytest.approx(1.6 * 0.01, rel=0.1)  # mean length of three normal deviates: 1.596
+    assert angle.mean() == pytest.approx(
+        1.6 * 0.01, rel=0.1
+    )  # mean length of three normal deviates: 1.596
     with pytest.raises(ConfigError, match="did you mean 'hybrid'"):
         make_plant("hybird", experiment)
 
@@ -134,7 +145,9 @@ def test_measurements_of_the_hybrid_plant_are_late():
     for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
         middle = 0.5 * (getattr(before, name) + getattr(now, name))
         np.testing.assert_allclose(getattr(seen, name), middle, atol=1e-12)
-    np.testing.assert_array_equal(HybridPlant(experiment, 2).measured().pos_w, HybridPlant(experiment, 2).state.pos_w)
+    np.testing.assert_array_equal(
+        HybridPlant(experiment, 2).measured().pos_w, HybridPlant(experiment, 2).state.pos_w
+    )
 
 
 def test_a_flight_goes_from_hover_to_hover(flown):
@@ -143,9 +156,13 @@ def test_a_flight_goes_from_hover_to_hover(flown):
     assert result["hovering_again"]
     assert times["latch"] == pytest.approx(times["policy_start"])
     assert times["separation"] - times["latch"] == pytest.approx(0.11, abs=1e-6)
-    assert result["error"] == pytest.approx(np.hypot(*(np.array(result["landing_w"][:2]) - [0.5, 0.1])))
+    assert result["error"] == pytest.approx(
+        np.hypot(*(np.array(result["landing_w"][:2]) - [0.5, 0.1]))
+    )
     fall = np.sqrt(2 * (flown["separation"].values[0, 2] - 0.04) / 9.81)
-    assert times["landing"] - times["separation"] == pytest.approx(fall, abs=0.05), "it is dropped, nearly at rest"
+    assert times["landing"] - times["separation"] == pytest.approx(fall, abs=0.05), (
+        "it is dropped, nearly at rest"
+    )
     assert set(STANDARD_CHANNELS) <= set(flown.channels)
     assert "measured_pos_w" in flown
 
@@ -158,7 +175,9 @@ def test_a_flights_modes_and_commands(flown):
     assert len(flown["action"].time) == np.count_nonzero(flying)
     assert flown["command"].time[0] == 0.0
     assert np.abs(flown["pos_w"].values[-1] - [0, 0, 1.333]).max() < 0.1
-    assert flown["cable_points_w"].values[-1][:, 2].max() < 0.03, "the rope lies on the ground at last"
+    assert flown["cable_points_w"].values[-1][:, 2].max() < 0.03, (
+        "the rope lies on the ground at last"
+    )
 
 
 def test_a_flight_without_release_fails_and_recovers(tmp_path):
@@ -168,7 +187,8 @@ def test_a_flight_without_release_fails_and_recovers(tmp_path):
     bounds = dataclasses.replace(loaded.experiment.task.bounds, time_limit=0.3)
     task = dataclasses.replace(loaded.experiment.task, bounds=bounds)
     log = fly(
-        dataclasses.replace(loaded, experiment=dataclasses.replace(loaded.experiment, task=task)), [1.0, 0.0, 0.0]
+        dataclasses.replace(loaded, experiment=dataclasses.replace(loaded.experiment, task=task)),
+        [1.0, 0.0, 0.0],
     )
     assert not log.meta["result"]["success"]
     assert "no release within 0.3 s" in log.meta["result"]["failure"]
@@ -179,7 +199,19 @@ def test_a_flight_without_release_fails_and_recovers(tmp_path):
 def test_fly_writes_its_files(dropper, tmp_path, capsys):
     out = tmp_path / "out"
     assert (
-        main(["fly", "--policy", str(dropper), "--target", "0.5", "--out", str(out), "--json", str(out / "r.json")])
+        main(
+            [
+                "fly",
+                "--policy",
+                str(dropper),
+                "--target",
+                "0.5",
+                "--out",
+                str(out),
+                "--json",
+                str(out / "r.json"),
+            ]
+        )
         == 0
     )
     told = capsys.readouterr().out
@@ -188,7 +220,9 @@ def test_fly_writes_its_files(dropper, tmp_path, capsys):
     result = json.loads((out / "r.json").read_text())["result"]
     assert f"{result['error']:.3f} m from the target" in told
     verified = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "throw.rrd")], capture_output=True, text=True
+        [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "throw.rrd")],
+        capture_output=True,
+        text=True,
     )
     assert verified.returncode == 0, verified.stderr
 
@@ -223,17 +257,23 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
 
 
 def test_protocol_on_the_reference_plant(dropper, monkeypatch):
-    """A drop from hover lands below the hover point, so far from the target as that is; in parts or as a whole."""
+    """A drop from hover lands below the hover point, so far from the target as that is; in parts or
+    as a whole.
+    """
     pytest.importorskip("mujoco")
     monkeypatch.setattr(reference_protocol, "HOVER_TIME", 0.1)
     loaded = load_policy(dropper)
-    got = reference_protocol.fly_batch([loaded], "reference-realistic", reference_protocol.Job((0,), 1.0, 0, 2, 7))
+    got = reference_protocol.fly_batch(
+        [loaded], "reference-realistic", reference_protocol.Job((0,), 1.0, 0, 2, 7)
+    )
     assert got["success"].all()
     assert np.abs(got["landing_w"]).max() < 0.25
     np.testing.assert_allclose(got["error"], np.linalg.norm(got["landing_w"] - [1.0, 0.0], axis=1))
     assert np.all((got["duration"] > 0.4) & (got["duration"] < 0.7))
     assert np.all(got["clearance"] > 0.2)
-    assert np.all(got["smoothness"] < 0.6), "one jump of the release does not count, the four commands stand still"
+    assert np.all(got["smoothness"] < 0.6), (
+        "one jump of the release does not count, the four commands stand still"
+    )
     assert np.ptp(got["landing_w"][:, 0]) > 0.0
 
 
@@ -242,9 +282,13 @@ def test_processes_throw_what_one_process_throws(dropper, tmp_path):
     pytest.importorskip("mujoco")
     dropping_policy("vision").save(tmp_path / "other.npz")
     loaded = [load_policy(dropper), load_policy(tmp_path / "other.npz")]
-    with reference_protocol.Throwing(loaded, (1.0,), 2, "reference-realistic", 7, together=True) as throwing:
+    with reference_protocol.Throwing(
+        loaded, (1.0,), 2, "reference-realistic", 7, together=True
+    ) as throwing:
         rows = throwing.results(show=False)
-    alone = reference_protocol.fly_batch(loaded, "reference-realistic", reference_protocol.Job((0, 1), 1.0, 0, 2, 7))
+    alone = reference_protocol.fly_batch(
+        loaded, "reference-realistic", reference_protocol.Job((0, 1), 1.0, 0, 2, 7)
+    )
     for policy, row in enumerate(rows):
         part = slice(2 * policy, 2 * policy + 2)
         np.testing.assert_array_equal(row[0].landing_w, alone["landing_w"][part])
@@ -260,7 +304,9 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
     assert main(["demo", "--out", str(tmp_path / "out")]) == 0
     told = capsys.readouterr().out
     assert "needs MuJoCo" in told
-    listed = [line.strip() for line in told.partition("Files:")[2].splitlines() if line.startswith("  ")]
+    listed = [
+        line.strip() for line in told.partition("Files:")[2].splitlines() if line.startswith("  ")
+    ]
     assert sorted(listed) == sorted(str(path) for path in (tmp_path / "out").iterdir())
     assert len(listed) == 6
 
@@ -269,7 +315,10 @@ def test_plan_covers_every_throw_once():
     jobs = reference_protocol.plan(2, (1.5, 2.0), 120, seed=3)
     for policy in range(2):
         for target in (1.5, 2.0):
-            assert sum(job.count for job in jobs if job.policies == (policy,) and job.target == target) == 120
+            assert (
+                sum(job.count for job in jobs if job.policies == (policy,) and job.target == target)
+                == 120
+            )
     together = reference_protocol.plan(2, (2.0,), 6, seed=3, together=True)
     assert [job.policies for job in together] == [(0, 1)]
 
@@ -293,7 +342,9 @@ def test_failures_name_their_cause():
     assert flight.failures[4] is None
     flight.judge(now)
     assert flight.failures[0] is None
-    for message, cause in zip(flight.failures[1:], ("altitude", "further than", "hit", "tilted"), strict=True):
+    for message, cause in zip(
+        flight.failures[1:], ("altitude", "further than", "hit", "tilted"), strict=True
+    ):
         assert cause in message
     assert flight.open.tolist() == [True, False, False, False, False]
     assert flight.failed.tolist() == [False, True, True, True, True]
@@ -307,7 +358,10 @@ def throws(error: float, success: int = 4) -> Throws:
 
 
 def test_table_says_success_rate_and_leaves_failures_blank():
-    rows = [{"policy": n, "layout": "state", **throws(0.1, s).summary()} for n, s in (("a", 4), ("b", 3), ("c", 0))]
+    rows = [
+        {"policy": n, "layout": "state", **throws(0.1, s).summary()}
+        for n, s in (("a", 4), ("b", 3), ("c", 0))
+    ]
     text = markdown(rows, "title")
     lines = text.splitlines()
     assert len({len(line) for line in lines[2:]}) == 1, "columns line up"
@@ -333,7 +387,10 @@ def test_names_are_made_unique(dropper):
         (["fly", "--policy", "DROPPER", "--target", "1", "2", "3"], "a distance, or x and y"),
         (["fly", "--policy", "DROPPER", "--plant", "real"], "no plant 'real'"),
         (["fly", "--policy", "DROPPER", "--config", "vision"], "trained under other conditions"),
-        (["fly", "--policy", "DROPPER", "--set", "release.lag=0.2"], "release.lag: trained with 0.11, here 0.2"),
+        (
+            ["fly", "--policy", "DROPPER", "--set", "release.lag=0.2"],
+            "release.lag: trained with 0.11, here 0.2",
+        ),
         (["compare", "DROPPER", "--throws", "0"], "--throws 0"),
         (["compare", "DROPPER", "--targets", "9"], "from 0 to 3 m"),
         (["compare", "DROPPER", "--targets", "1", "1"], "twice"),
@@ -348,7 +405,9 @@ def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, cap
 
 
 @pytest.mark.parametrize("command", ["fly", "compare"])
-def test_a_folder_that_cannot_be_made_is_refused_before_the_work(command, dropper, tmp_path, capsys, monkeypatch):
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
+    command, dropper, tmp_path, capsys, monkeypatch
+):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr("sim.hybrid.HybridSim.step", None)  # nothing may fly
     policy = ["--policy", str(dropper)] if command == "fly" else [str(dropper)]

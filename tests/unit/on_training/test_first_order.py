@@ -1,4 +1,6 @@
-"""First-order training: its backward pass against torch's autograd of the same surrogate and against the simulator itself."""
+"""First-order training: its backward pass against torch's autograd of the same surrogate and
+against the simulator itself.
+"""
 
 import itertools
 from types import SimpleNamespace
@@ -14,17 +16,35 @@ from visthrow.task import Experiment
 from visthrow.training.first_order.surrogate import TAUT
 from visthrow.training.trainer import Trainer
 
-SMALL = ['algorithm="first_order"', "ppo.environments=24", "ppo.hidden=[16,16]", "ppo.steps=8", "first_order.horizon=14",
-         "first_order.initial_release=-0.3"]  # fmt: skip
-QUIET = ["task.noise.observation_step=0", "task.noise.observation_bias=0", "task.noise.command_step=0",
-         "task.noise.command_bias=0", "camera.noise.step_std=0", "camera.noise.bias_std=0"]  # fmt: skip
+SMALL = [
+    'algorithm="first_order"',
+    "ppo.environments=24",
+    "ppo.hidden=[16,16]",
+    "ppo.steps=8",
+    "first_order.horizon=14",
+    "first_order.initial_release=-0.3",
+]
+QUIET = [
+    "task.noise.observation_step=0",
+    "task.noise.observation_bias=0",
+    "task.noise.command_step=0",
+    "task.noise.command_bias=0",
+    "camera.noise.step_std=0",
+    "camera.noise.bias_std=0",
+]
 
 SECOND_ORDER = 0.01
-"""A rotation's derivative is taken to second order in a step's turn, and the turn from the rates at its ends."""
+"""A rotation's derivative is taken to second order in a step's turn, and the turn from the rates at
+its ends.
+"""
 LEAST_COSINE, MOST_BIAS = 0.97, 0.15
-"""Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the rates) lets them differ."""
+"""Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
+rates) lets them differ.
+"""
 LEARNT = 0.5
-"""Landing error that the small task is brought under [m]; goals lie within 1 m, dropped payloads 0.65 m off on average."""
+"""Landing error that the small task is brought under [m]; goals lie within 1 m, dropped payloads
+0.65 m off on average.
+"""
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,7 +52,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def first_order(name="state", *changes):
     """A first-order training of a small network that has been made to react to what it sees."""
-    found = Trainer(config.load(Experiment, config.find("train", name), [*SMALL, *changes]), "cpu", 3).algorithm
+    found = Trainer(
+        config.load(Experiment, config.find("train", name), [*SMALL, *changes]), "cpu", 3
+    ).algorithm
     with torch.no_grad():
         found.network.mlp[-1].weight.mul_(5.0)
     return found
@@ -62,7 +84,9 @@ def exponential(vector):
 
 
 def advance(fo, true, k, x, response, commands):
-    """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the decay."""
+    """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the
+    decay.
+    """
     dt, pl = fo.cfg.sim.control_period, fo.flights
     M, m = pl.mass[:, None], pl.load_mass[:, None]
     response_of, force, tension = (fo.surrogate[name] for name in ("response", "force", "tension"))
@@ -77,7 +101,12 @@ def advance(fo, true, k, x, response, commands):
     drag = (axes * force[1:]) @ axes.mT @ x["vel"][..., None]
     f = force[0] * 0.5 * (response[k] + y)[:, :1] * z - drag[..., 0]
     arms = true.load_pos - true.pos - (rots @ pl.mount[..., None])[..., 0]
-    arm = x["load_pos"] - x["pos"] - (x["rot"] @ pl.mount[..., None])[..., 0] + 0.5 * dt * (x["load_vel"] - x["vel"])
+    arm = (
+        x["load_pos"]
+        - x["pos"]
+        - (x["rot"] @ pl.mount[..., None])[..., 0]
+        + 0.5 * dt * (x["load_vel"] - x["vel"])
+    )
     arm = at(0.5 * (arms[k] + arms[k + 1]), arm)
     u = at(0.5 * (true.load_vel - true.vel)[k : k + 2].sum(0), x["load_vel"] - x["vel"])
     length = arm.norm(dim=-1, keepdim=True)
@@ -92,30 +121,54 @@ def advance(fo, true, k, x, response, commands):
     load_vel = at(true.load_vel[k + 1], x["load_vel"] - dt * pull * n / m)
     pos = at(true.pos[k + 1], x["pos"] + 0.5 * dt * (x["vel"] + vel))
     load_pos = at(true.load_pos[k + 1], x["load_pos"] + 0.5 * dt * (x["load_vel"] + load_vel))
-    return {"pos": pos, "vel": vel, "rot": rot, "load_pos": load_pos, "load_vel": load_vel, "response": y}
+    return {
+        "pos": pos,
+        "vel": vel,
+        "rot": rot,
+        "load_pos": load_pos,
+        "load_vel": load_vel,
+        "response": y,
+    }
 
 
 def reference(fo, by):
-    """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's autograd."""
+    """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's
+    autograd.
+    """
     true, b, layout = SimpleNamespace(**fo.flights.x), fo, fo.env.layout
     extra = torch.zeros_like(b.layers.action, requires_grad=True)
-    rots, late = ob.rotation_from_quat(true.quat), (b.env.pose_age / fo.cfg.sim.control_period)[:, None]
-    x = {name: getattr(true, name)[0].clone() for name in ("pos", "vel", "load_pos", "load_vel", "response")} | {"rot": rots[0]}
+    rots, late = (
+        ob.rotation_from_quat(true.quat),
+        (b.env.pose_age / fo.cfg.sim.control_period)[:, None],
+    )
+    x = {
+        name: getattr(true, name)[0].clone()
+        for name in ("pos", "vel", "load_pos", "load_vel", "response")
+    } | {"rot": rots[0]}
     poses, responses, commands, cost = [], [], [], 0.0
-    previous, history = fo.env._start_action.expand(24, -1), torch.zeros(24, 1 + layout.history, layout.payload)
+    previous, history = (
+        fo.env._start_action.expand(24, -1),
+        torch.zeros(24, 1 + layout.history, layout.payload),
+    )
     for k in range(fo.p.horizon):
         responses.append(x["response"])
-        pose = torch.cat([ob.vehicle_part(x["pos"], x["vel"], x["response"][:, 1:], x["rot"]), x["load_pos"]], -1)
+        pose = torch.cat(
+            [ob.vehicle_part(x["pos"], x["vel"], x["response"][:, 1:], x["rot"]), x["load_pos"]], -1
+        )
         poses.append(pose)
         seen = torch.lerp(pose, poses[max(k - 1, 0)], late)
-        frame = torch.cat([seen[:, :15], ob.state_part(seen[:, :3], b.env.views.goal_w, seen[:, 15:])], -1)
+        frame = torch.cat(
+            [seen[:, :15], ob.state_part(seen[:, :3], b.env.views.goal_w, seen[:, 15:])], -1
+        )
         fresh = torch.full((24,), k == 0)
         obs, history = ob.observe(layout, frame, None, previous, torch.ones(24), history, fresh)
         obs = at(b.flights.obs[k], obs)
         action = decided(fo, obs) + extra[k]
         previous = at(act.clip_action(b.layers.action[k]), action)
         throttle = (0.5 * (b.layers.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
-        scale = torch.cat([fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1)
+        scale = torch.cat(
+            [fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1
+        )
         commands.append(action[:, :4] * scale)
         x = advance(fo, true, k, x, responses, commands)
         x = {name: slowed(value, fo.p.decay) for name, value in x.items()}
@@ -140,7 +193,10 @@ def test_backward_pass_equals_autograd_of_the_same_surrogate():
     assert (fo.flights.steps == fo.p.horizon).all()
     assert fo.layers.action.abs().max() < 1.0
     torch.manual_seed(0)
-    by = {n: torch.randn_like(fo.flights.x[n]) for n in ("pos", "vel", "load_pos", "load_vel", "response")}
+    by = {
+        n: torch.randn_like(fo.flights.x[n])
+        for n in ("pos", "vel", "load_pos", "load_vel", "response")
+    }
     found, expected = backward(fo, by), reference(fo, by)
     size = expected.square().mean(1).sqrt()
     off = (found - expected).square().mean(1).sqrt()
@@ -158,13 +214,20 @@ def test_weights_get_what_autograd_gives_them():
     parameters = list(fo.network.mlp.parameters())
     expected = torch.autograd.grad(decided(fo, fo.flights.obs), parameters, by_action)
     for parameter, gradient in zip(parameters, expected, strict=True):
-        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item())
+        torch.testing.assert_close(
+            parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item()
+        )
     assert by_action.any(), "nothing was differentiated"
 
 
 def test_flights_stop_where_nothing_counts_any_more():
-    """Flown on to the horizon, which a latch that is not quite one asks for, they have the same derivatives."""
-    fo, found = first_order("state", "first_order.initial_release=1.0", "first_order.horizon=20"), []
+    """Flown on to the horizon, which a latch that is not quite one asks for, they have the same
+    derivatives.
+    """
+    fo, found = (
+        first_order("state", "first_order.initial_release=1.0", "first_order.horizon=20"),
+        [],
+    )
     start = fo.env.state_dict()
     for latched in (1.0, 1.0 - 1e-12):
         fo.env.load_state_dict(start)
@@ -172,34 +235,54 @@ def test_flights_stop_where_nothing_counts_any_more():
         fo._latched, fo._first = latched, 0
         fo.rollout()
         fo.derivatives()
-        found.append((fo.flights.last, fo.flights.steps.clone(), fo.layers.by_action[: fo.flights.last].clone()))
+        found.append(
+            (
+                fo.flights.last,
+                fo.flights.steps.clone(),
+                fo.layers.by_action[: fo.flights.last].clone(),
+            )
+        )
     (short, stopped_at, stopped), (long, flown_to, flown) = found
     assert short < long == fo.p.horizon
     assert len(set(stopped_at.tolist())) > 1, "flights stop one by one"
     assert (stopped_at < flown_to).all()
     assert flown.any()
     assert not flown[short:].any()
-    torch.testing.assert_close(stopped, flown[:short], rtol=1e-3, atol=1e-5 * flown.abs().max().item())  # products of fewer rows
+    torch.testing.assert_close(
+        stopped, flown[:short], rtol=1e-3, atol=1e-5 * flown.abs().max().item()
+    )  # products of fewer rows
 
 
-SLOWER = ["vehicle.queue.delay=0.045", "vehicle.motor.time_constant=0.06", "rope.payload_mass=0.08", "rope.length=0.5"]
+SLOWER = [
+    "vehicle.queue.delay=0.045",
+    "vehicle.motor.time_constant=0.06",
+    "rope.payload_mass=0.08",
+    "rope.length=0.5",
+]
 
 
 @pytest.mark.parametrize("vehicle", [[], SLOWER], ids=["own", "slower"])
 def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
-    """Where the payload lands against thrust, roll and pitch commands at earlier steps, by differences of the simulator.
+    """Where the payload lands against thrust, roll and pitch commands at earlier steps, by
+    differences of the simulator.
 
-    Yaw moves the landing by a thirtieth of what the others do, which is less than what a surrogate leaves.
-    """
-    fo = first_order("state", *QUIET, *vehicle, "task.start.tether_variants=1", "first_order.decay=1.0")
+    Yaw moves the landing by a thirtieth of what the others do, which is less than what a surrogate
+    leaves."""
+    fo = first_order(
+        "state", *QUIET, *vehicle, "task.start.tether_variants=1", "first_order.decay=1.0"
+    )
     torch.manual_seed(5)
-    plan = fo.env._start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor([0.1, 0.25, 0.25, 0.25, 0.0])
+    plan = fo.env._start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor(
+        [0.1, 0.25, 0.25, 0.25, 0.0]
+    )
     start = fo.env.state_dict()
 
     def fly(actions):
         fo.env.load_state_dict(start)
         left = iter(actions)
-        monkeypatch.setattr(fo.layers, "forward", lambda k, seen, flying: fo.layers.action[k].copy_(next(left)))
+        monkeypatch.setattr(
+            fo.layers, "forward", lambda k, seen, flying: fo.layers.action[k].copy_(next(left))
+        )
         fo.rollout()
         return fo.flights.landing[-1].clone()
 
@@ -207,13 +290,24 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     assert (fo.flights.steps == fo.p.horizon).all()
     x = {name: fo.flights.x[name].clone().requires_grad_() for name in ("load_pos", "load_vel")}
     up = x["load_vel"][-1, :, 2]
-    time = (up + (up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)).sqrt()) / GRAVITY
+    time = (
+        up
+        + (
+            up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)
+        ).sqrt()
+    ) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
     torch.testing.assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
     monkeypatch.setattr(fo.layers, "back", lambda k, flown: None)
     found = []
     for axis in range(2):
-        by = dict(zip(x, torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True), strict=True))
+        by = dict(
+            zip(
+                x,
+                torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True),
+                strict=True,
+            )
+        )
         found.append(backward(fo, by))
     size = 0.02  # normalised; float32 resolves the landing to 1e-5 of the 2e-3 m that this makes
     for axis in range(2):
@@ -229,22 +323,49 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
 
 
 def small_task():
-    """A gentle task that a small network makes headway in within seconds: one start, near goals, no early release."""
-    words = [f"task.start.{name}=[0,0,0]" for name in ("position", "velocity", "attitude_deg", "rate_deg")]
+    """A gentle task that a small network makes headway in within seconds: one start, near goals, no
+    early release.
+    """
+    words = [
+        f"task.start.{name}=[0,0,0]"
+        for name in ("position", "velocity", "attitude_deg", "rate_deg")
+    ]
     words += [f"task.start.{name}=0" for name in ("mass", "cable_angle_deg", "cable_rate_deg")]
-    words += ["task.start.goal_radius=1.0", "ppo.environments=32", "ppo.hidden=[32,32]", "ppo.minibatches=1"]
-    words += [f"first_order.{word}" for word in ("horizon=40", "iterations=100", "learning_rate=4e-3", "initial_release=-0.5",
-                                                 "final_width=0.1", "first_release=20", "latched=[2.0,3.0]", "free=[2.0,3.0]",
-                                                 "sharp=0.7")]  # fmt: skip
-    return config.load(Experiment, config.find("train", "state"), ['algorithm="first_order"', *words])
+    words += [
+        "task.start.goal_radius=1.0",
+        "ppo.environments=32",
+        "ppo.hidden=[32,32]",
+        "ppo.minibatches=1",
+    ]
+    words += [
+        f"first_order.{word}"
+        for word in (
+            "horizon=40",
+            "iterations=100",
+            "learning_rate=4e-3",
+            "initial_release=-0.5",
+            "final_width=0.1",
+            "first_release=20",
+            "latched=[2.0,3.0]",
+            "free=[2.0,3.0]",
+            "sharp=0.7",
+        )
+    ]
+    return config.load(
+        Experiment, config.find("train", "state"), ['algorithm="first_order"', *words]
+    )
 
 
 def thrown(turn):
-    """Share released and mean landing error over the last of 60 iterations; ``turn`` alters the surrogate."""
+    """Share released and mean landing error over the last of 60 iterations; ``turn`` alters the
+    surrogate.
+    """
     trainer = Trainer(small_task(), "cpu", 1)
     turn(trainer.algorithm.surrogate)
     figures = [trainer.step() for _ in range(60)][-5:]
-    return tuple(sum(row[name] for row in figures) / len(figures) for name in ("released", "landing_error"))
+    return tuple(
+        sum(row[name] for row in figures) / len(figures) for name in ("released", "landing_error")
+    )
 
 
 def learnt(released, error):

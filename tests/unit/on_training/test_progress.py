@@ -49,9 +49,13 @@ def test_the_picture_shows_errors_landings_and_the_time_left(tmp_path, monkeypat
     assert "0.0500 m, 1.000 s, landed 66.7 %" in text
     assert sum(line.count("o") for line in last[-13:] if "|" in line) == 1
     assert "1" in "".join(line.split("|")[-2] for line in last if line.count("|") == 3)
-    heights = [int(part.split("A")[0]) for part in text.split("\x1b[")[1:] if part.split("A")[0].isdigit()]
+    heights = [
+        int(part.split("A")[0]) for part in text.split("\x1b[")[1:] if part.split("A")[0].isdigit()
+    ]
     assert heights
-    assert set(heights) == {text.split(f"\x1b[{heights[0]}A")[0].count("\n")}  # each picture covers the one before
+    assert set(heights) == {
+        text.split(f"\x1b[{heights[0]}A")[0].count("\n")
+    }  # each picture covers the one before
     assert float(rows_of(tmp_path / "p.csv")[-1]["error_2m"]) == pytest.approx(0.05)
     assert float(rows_of(tmp_path / "p.csv")[-1]["landed_2m"]) == pytest.approx(2 / 3)
 
@@ -64,15 +68,25 @@ def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, cl
     with progress.TrainLog(tmp_path / "p.csv", 1000, 10, done=2, minutes=1.0) as log:
         clock[0] += 10.0
         log.row(FIGURES | {"iteration": 3}, throws())
-    assert [(int(r["iteration"]), float(r["wall_s"])) for r in rows_of(tmp_path / "p.csv")] == [(1, 10.0), (2, 20.0), (3, 30.0)]
+    assert [(int(r["iteration"]), float(r["wall_s"])) for r in rows_of(tmp_path / "p.csv")] == [
+        (1, 10.0),
+        (2, 20.0),
+        (3, 30.0),
+    ]
     assert "0:50 left" in capsys.readouterr().out  # the minute ends before the seven iterations
 
 
 def test_what_no_throw_reaches_is_no_error():
-    nothing = Throws(2.0, np.zeros(3, dtype=bool), *(np.full((3, 2), np.nan), *(np.full(3, np.nan) for _ in range(4))))
+    nothing = Throws(
+        2.0,
+        np.zeros(3, dtype=bool),
+        *(np.full((3, 2), np.nan), *(np.full(3, np.nan) for _ in range(4))),
+    )
     assert np.isnan(progress.evaluated(nothing)["error_2m"])
     assert not nothing.within(100.0)
     assert not throws().within(0.1)  # two of three land
-    good = Throws(2.0, np.ones(3, dtype=bool), np.zeros((3, 2)), *(np.full(3, 0.04) for _ in range(4)))
+    good = Throws(
+        2.0, np.ones(3, dtype=bool), np.zeros((3, 2)), *(np.full(3, 0.04) for _ in range(4))
+    )
     assert good.within(0.05)
     assert not good.within(0.03)

@@ -1,4 +1,6 @@
-"""``visthrow camera``: a config from every kind of calibration, which then trains and flies; whether a lens fits its pictures."""
+"""``visthrow camera``: a config from every kind of calibration, which then trains and flies;
+whether a lens fits its pictures.
+"""
 
 import re
 import subprocess
@@ -29,15 +31,18 @@ BOARDS = {
     "circles": BoardParams(7, 5, 0.04, "circles"),
     "charuco": BoardParams(7, 5, 0.04, "charuco", 0.03),
 }
-WRITERS = {name: getattr(lens_files, f"write_{name}") for name in ("opencv", "kalibr", "ros", "basalt")}
+WRITERS = {
+    name: getattr(lens_files, f"write_{name}") for name in ("opencv", "kalibr", "ros", "basalt")
+}
 
-OCAM = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world
+OCAM = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss), for cam2world
 
 5 -2.065170e+02 0.000000e+00 2.207161e-03 -4.879622e-06 1.865656e-08
 
-#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB). These are used by world2cam
+#polynomial coefficients for the inverse mapping function (ocam_model.invpol). world2cam
 
-12 294.182260 152.289570 -12.191217 27.959546 8.241525 -1.970397 10.689256 1.871609 -6.437684 0.430037 3.215544 0.921484
+12 294.182260 152.289570 -12.191217 27.959546 8.241525 -1.970397 10.689256 1.871609 -6.437684 \
+0.430037 3.215544 0.921484
 
 #center: "row" and "column", starting from 0 (C convention)
 
@@ -51,16 +56,25 @@ OCAM = """#polynomial coefficients for the DIRECT mapping function (ocam_model.s
 
 480 752
 """
-"""A published calibration of a 752 x 480 px fisheye by the toolbox itself (README of OCamCalib's C++ port for VI-SLAM)."""
-OCAM_PX = 0.5  # measured 0.28 px at most: the file's own two polynomials differ by as much, and our model has no shear
+"""A published calibration of a 752 x 480 px fisheye by the toolbox itself (README of OCamCalib's
+C++ port for VI-SLAM).
+"""
+# measured 0.28 px at most: the file's own two polynomials differ by as much, and our model has no
+# shear
+OCAM_PX = 0.5
 REPROJECTED_PX = {"chessboard": 0.15, "circles": 0.1, "charuco": 0.45}
 """Measured 0.064, 0.029 and 0.22 px on rendered pictures with hard edges."""
 
 
 def texture(board: BoardParams, scale: int) -> tuple[np.ndarray, float]:
-    """A printed board, grey, ``scale`` pixels a square, and where its first point lies in it [squares]."""
+    """A printed board, grey, ``scale`` pixels a square, and where its first point lies in it
+    [squares].
+    """
     if board.pattern == "charuco":
-        return board.charuco().generateImage((scale * (board.columns + 1), scale * (board.rows + 1))), 1.0
+        return (
+            board.charuco().generateImage((scale * (board.columns + 1), scale * (board.rows + 1))),
+            1.0,
+        )
     page = np.full((scale * (board.rows + 1), scale * (board.columns + 1)), 255, np.uint8)
     for j in range(board.rows + 1):
         for i in range(board.columns + 1):
@@ -73,9 +87,26 @@ def texture(board: BoardParams, scale: int) -> tuple[np.ndarray, float]:
 
 def pictures(board: BoardParams, lens: Fisheye) -> list[np.ndarray]:
     """Pictures of a board in eight poses, shape (H, W) of the lens."""
-    tilts = [(0.1, 0.2, 0.0), (-0.5, 0.3, 0.2), (0.4, -0.5, -0.3), (0.4, 0.3, 0.1),
-             (0.6, 0.1, 0.4), (-0.3, -0.6, 0.5), (0.0, 0.0, 0.7), (0.5, 0.5, 0.2)]  # fmt: skip
-    places = [(0.0, 0.0), (0.13, 0.1), (-0.14, 0.1), (-0.16, -0.1), (0.12, -0.13), (0.0, 0.14), (0.0, -0.14), (0.05, 0.0)]
+    tilts = [
+        (0.1, 0.2, 0.0),
+        (-0.5, 0.3, 0.2),
+        (0.4, -0.5, -0.3),
+        (0.4, 0.3, 0.1),
+        (0.6, 0.1, 0.4),
+        (-0.3, -0.6, 0.5),
+        (0.0, 0.0, 0.7),
+        (0.5, 0.5, 0.2),
+    ]
+    places = [
+        (0.0, 0.0),
+        (0.13, 0.1),
+        (-0.14, 0.1),
+        (-0.16, -0.1),
+        (0.12, -0.13),
+        (0.0, 0.14),
+        (0.0, -0.14),
+        (0.05, 0.0),
+    ]
     samples, scale = 3, 60
     page, first = texture(board, scale)
     page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
@@ -83,13 +114,22 @@ def pictures(board: BoardParams, lens: Fisheye) -> list[np.ndarray]:
     found = []
     for tilt, place in zip(tilts, places, strict=True):
         rot_cm = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64))
-        origin = torch.tensor([*place, 0.18], dtype=torch.float64) - rot_cm @ torch.from_numpy(board.corners_m().mean(0))
+        origin = torch.tensor([*place, 0.18], dtype=torch.float64) - rot_cm @ torch.from_numpy(
+            board.corners_m().mean(0)
+        )
         normal = rot_cm[:, 2]
         depth = (normal @ origin) / (rays @ normal)
         on_board = (rays * depth[..., None] - origin) @ rot_cm / board.square_size
         u, v = ((on_board[..., i] + first + 1.0) * scale - 0.5 for i in (0, 1))
         inside = (seen & (depth > 0.0)).numpy()
-        drawn = cv2.remap(page, u.float().numpy(), v.float().numpy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
+        drawn = cv2.remap(
+            page,
+            u.float().numpy(),
+            v.float().numpy(),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=110,
+        )
         drawn = np.where(inside, drawn, 0).astype(np.float32)
         mean = drawn.reshape(lens.params.height, samples, lens.params.width, samples).mean((1, 3))
         found.append(np.round(mean).astype(np.uint8))
@@ -104,7 +144,9 @@ def boards(tmp_path_factory):
     def folder(name: str):
         if not (root / name).exists():
             (root / name).mkdir()
-            for i, image in enumerate(pictures(BOARDS[name], Fisheye(LARGE if name == "charuco" else LENS))):
+            for i, image in enumerate(
+                pictures(BOARDS[name], Fisheye(LARGE if name == "charuco" else LENS))
+            ):
                 cv2.imwrite(str(root / name / f"{i}.png"), image)
         return root / name
 
@@ -113,7 +155,14 @@ def boards(tmp_path_factory):
 
 def words(board: BoardParams) -> list[str]:
     marker = [str(board.marker_size)] if board.marker_size else []
-    return ["--board", board.pattern, str(board.columns), str(board.rows), str(board.square_size), *marker]
+    return [
+        "--board",
+        board.pattern,
+        str(board.columns),
+        str(board.rows),
+        str(board.square_size),
+        *marker,
+    ]
 
 
 def calibration(kind: str, folder, boards) -> list[str]:
@@ -129,21 +178,38 @@ def calibration(kind: str, folder, boards) -> list[str]:
 
 
 def off_px(found: FisheyeParams, truth: FisheyeParams = LENS) -> float:
-    """Greatest distance of a lens from the true one within 54 deg of the axis, which the boards cover [px]."""
-    theta, turn = (x.ravel() for x in np.meshgrid(np.linspace(0.05, 0.95, 20), np.linspace(0, 6, 12)))
-    rays = torch.from_numpy(np.column_stack([np.sin(theta) * np.cos(turn), np.sin(theta) * np.sin(turn), np.cos(theta)]))
-    return float((Fisheye(found).project(rays)[0] - Fisheye(truth).project(rays)[0]).norm(dim=-1).max())
+    """Greatest distance of a lens from the true one within 54 deg of the axis, which the boards
+    cover [px].
+    """
+    theta, turn = (
+        x.ravel() for x in np.meshgrid(np.linspace(0.05, 0.95, 20), np.linspace(0, 6, 12))
+    )
+    rays = torch.from_numpy(
+        np.column_stack([np.sin(theta) * np.cos(turn), np.sin(theta) * np.sin(turn), np.cos(theta)])
+    )
+    return float(
+        (Fisheye(found).project(rays)[0] - Fisheye(truth).project(rays)[0]).norm(dim=-1).max()
+    )
 
 
 SLOW = {"opencv", "ros", "basalt", "ocam", "circles", "charuco"}
-"""Kinds whose config trains and flies in the slow run alone; kalibr and chessboard do by default."""
+"""Kinds whose config trains and flies in the slow run alone; kalibr and chessboard do by default.
+"""
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in SLOW)) for k in (*WRITERS, "ocam", *BOARDS)])
-def test_every_calibration_becomes_a_config_that_trains_and_flies(kind, tmp_path, boards, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(k, marks=[pytest.mark.slow] * (k in SLOW)) for k in (*WRITERS, "ocam", *BOARDS)],
+)
+def test_every_calibration_becomes_a_config_that_trains_and_flies(
+    kind, tmp_path, boards, capsys, monkeypatch
+):
     monkeypatch.setattr(trainer, "EVALUATED", 20)
     camera = tmp_path / "camera.toml"
-    assert main(["camera", "calibrate", *calibration(kind, tmp_path, boards), "--out", str(camera)]) == 0
+    assert (
+        main(["camera", "calibrate", *calibration(kind, tmp_path, boards), "--out", str(camera)])
+        == 0
+    )
     said = capsys.readouterr().out
     lens = config.load(CameraParams, camera).fisheye
     if kind in WRITERS:
@@ -153,11 +219,50 @@ def test_every_calibration_becomes_a_config_that_trains_and_flies(kind, tmp_path
         assert float(said.split("reprojection error ")[1].split()[0]) < REPROJECTED_PX[kind]
     else:
         assert "fitted to 0." in said
-    out, small = tmp_path / "run", ["--set", "ppo.environments=16", "--set", "ppo.steps=4", "--set", "ppo.hidden=[16]"]
-    assert main(["train", "vision", "--set", f"camera={camera}", "--iterations", "1", "--device", "cpu", "--out", str(out), *small]) == 0
+    out, small = (
+        tmp_path / "run",
+        [
+            "--set",
+            "ppo.environments=16",
+            "--set",
+            "ppo.steps=4",
+            "--set",
+            "ppo.hidden=[16]",
+        ],
+    )
+    assert (
+        main(
+            [
+                "train",
+                "vision",
+                "--set",
+                f"camera={camera}",
+                "--iterations",
+                "1",
+                "--device",
+                "cpu",
+                "--out",
+                str(out),
+                *small,
+            ]
+        )
+        == 0
+    )
     policy = Policy.load(out / "policy.npz")
     assert policy.contract["camera"]["fisheye"]["fx"] == lens.fx
-    main(["fly", "--policy", str(out / "policy.npz"), "--device", "cpu", "--out", str(tmp_path / "flown"), "--target", "1.5"])
+    main(
+        [
+            "fly",
+            "--policy",
+            str(out / "policy.npz"),
+            "--device",
+            "cpu",
+            "--out",
+            str(tmp_path / "flown"),
+            "--target",
+            "1.5",
+        ]
+    )
     assert "policy 'run' on" in capsys.readouterr().out
     assert (tmp_path / "flown" / "throw.rrd").stat().st_size > 0
 
@@ -183,28 +288,59 @@ def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, caps
     camera, out = tmp_path / "camera.toml", tmp_path / "seen.png"
     assert main(["camera", "calibrate", str(tmp_path / "ros.yaml"), "--out", str(camera)]) == 0
     frame = str(boards("chessboard") / "0.png")
-    assert main(["camera", "show", str(camera), frame, *words(BOARDS["chessboard"]), "--straight", "100", "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "camera",
+                "show",
+                str(camera),
+                frame,
+                *words(BOARDS["chessboard"]),
+                "--straight",
+                "100",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "4 of 4 keypoints of the goal, 4 of 4 of the payload" in said
     assert float(said.split("(blue): ")[1].split()[0]) < 0.2
     before, after = cv2.imread(frame), cv2.imread(str(out))
     coloured = np.ptp(after.astype(int), axis=-1) > 60
-    assert coloured.sum() > 35 * 8, "35 corners and the keypoints are drawn in colour on a grey picture"
+    assert coloured.sum() > 35 * 8, (
+        "35 corners and the keypoints are drawn in colour on a grey picture"
+    )
     assert np.ptp(before.astype(int), axis=-1).max() == 0
     assert cv2.imread(str(tmp_path / "seen_straight.png")).shape == (320, 320, 3)
 
 
 def test_a_rendered_scene_says_nothing_of_a_missing_gpu(tmp_path):
     """In a process of its own: Warp's library writes to stderr when it starts, once."""
-    words = [sys.executable, "-m", "visthrow.cli", "camera", "show", "fisheye", "--out", str(tmp_path / "a.png")]
+    words = [
+        sys.executable,
+        "-m",
+        "visthrow.cli",
+        "camera",
+        "show",
+        "fisheye",
+        "--out",
+        str(tmp_path / "a.png"),
+    ]
     shown = subprocess.run(words, capture_output=True, text=True, check=True)
     assert "in view: 4 of 4 keypoints of the goal" in shown.stdout
     assert shown.stderr == ""
 
 
 def test_a_payload_below_the_ground_is_not_drawn(tmp_path, capsys):
-    assert main(["camera", "show", "fisheye", "--hangs", "1.4", "--out", str(tmp_path / "a.png")]) == 2
-    assert "--hangs 1.4 below --height 1.333; expected a payload above the ground" in capsys.readouterr().err
+    assert (
+        main(["camera", "show", "fisheye", "--hangs", "1.4", "--out", str(tmp_path / "a.png")]) == 2
+    )
+    assert (
+        "--hangs 1.4 below --height 1.333; expected a payload above the ground"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "a.png").exists()
 
 
@@ -215,12 +351,18 @@ def test_ocam_agrees_with_its_own_inverse_polynomial(tmp_path):
     name, lens, _ = read(path)
     assert name == "ocam"
     inverse = np.array([float(x) for x in OCAM.splitlines()[6].split()[1:]])
-    theta, turn = (x.ravel() for x in np.meshgrid(np.radians(np.linspace(5, 85, 17)), np.linspace(0, 6, 12)))
+    theta, turn = (
+        x.ravel() for x in np.meshgrid(np.radians(np.linspace(5, 85, 17)), np.linspace(0, 6, 12))
+    )
     down, right, ahead = np.sin(theta) * np.sin(turn), np.sin(theta) * np.cos(turn), np.cos(theta)
-    rho = np.polyval(inverse[::-1], np.arctan2(-ahead, np.hypot(down, right))) / np.hypot(down, right)
+    rho = np.polyval(inverse[::-1], np.arctan2(-ahead, np.hypot(down, right))) / np.hypot(
+        down, right
+    )
     row = 241.800066 + 1.000330 * rho * down + 0.000219 * rho * right
     column = 394.552874 + 0.000257 * rho * down + rho * right
-    pixels = Fisheye(lens).project(torch.from_numpy(np.column_stack([right, down, ahead])))[0].numpy()
+    pixels = (
+        Fisheye(lens).project(torch.from_numpy(np.column_stack([right, down, ahead])))[0].numpy()
+    )
     assert np.hypot(pixels[:, 0] - column, pixels[:, 1] - row).max() < OCAM_PX
 
 
@@ -232,12 +374,21 @@ def test_the_format_is_told_from_the_text(kind, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["{notes}", "--out", "{out}"], "of no known format; expected a calibration of opencv, kalibr, ros, basalt, ocam"),
+        (
+            ["{notes}", "--out", "{out}"],
+            "of no known format; expected a calibration of opencv, kalibr, ros, basalt, ocam",
+        ),
         (["{ocam}", "--out", "{out}"], "lines of numbers.*expected five"),
         (["{notes}", "--format", "pinhole", "--out", "{out}"], "'pinhole'; expected one of"),
         (["{folder}", "--out", "{out}"], r"--board \(missing\); expected --board chessboard"),
-        (["{folder}", "--board", "charuco", "7", "5", "0.04", "--out", "{out}"], "marker of 0.0 m; expected a side above 0"),
-        (["{folder}", "--board", "chessboard", "7", "5", "0.04", "--out", "{out}"], "no picture in"),
+        (
+            ["{folder}", "--board", "charuco", "7", "5", "0.04", "--out", "{out}"],
+            "marker of 0.0 m; expected a side above 0",
+        ),
+        (
+            ["{folder}", "--board", "chessboard", "7", "5", "0.04", "--out", "{out}"],
+            "no picture in",
+        ),
         (["{ocam}", "--out", "{notes}"], r"notes\.txt; expected a file that ends in \.toml"),
     ],
 )
@@ -246,7 +397,9 @@ def test_wrong_input_is_named(words, message, tmp_path, capsys):
     notes.write_text("not a calibration\n")
     ocam.write_text("\n".join(OCAM.splitlines()[:8]))
     folder.mkdir()
-    filled = [w.format(notes=notes, ocam=ocam, folder=folder, out=tmp_path / "c.toml") for w in words]
+    filled = [
+        w.format(notes=notes, ocam=ocam, folder=folder, out=tmp_path / "c.toml") for w in words
+    ]
     assert main(["camera", "calibrate", *filled]) == 2
     assert re.search(message, capsys.readouterr().err)
     assert notes.read_text() == "not a calibration\n"

@@ -1,4 +1,6 @@
-"""A flight as MCAP, read back by the library's own reader; throws on another rope by allowance; tables beside it."""
+"""A flight as MCAP, read back by the library's own reader; throws on another rope by allowance;
+tables beside it.
+"""
 
 import base64
 import json
@@ -17,7 +19,11 @@ reader = pytest.importorskip("mcap.reader")
 def flown(tmp_path_factory):
     """Folder of one throw, exported to all formats."""
     folder = tmp_path_factory.mktemp("flown")
-    exports = [word for ending in ("mcap", "parquet", "csv") for word in ("--export", str(folder / f"flight.{ending}"))]
+    exports = [
+        word
+        for ending in ("mcap", "parquet", "csv")
+        for word in ("--export", str(folder / f"flight.{ending}"))
+    ]
     assert main(["fly", "--device", "cpu", "--out", str(folder), "--target", "1.5", *exports]) == 0
     return folder
 
@@ -26,7 +32,10 @@ def messages(folder, topic: str) -> list[tuple[str, int, dict]]:
     """Schema, log time [ns] and content of a topic's messages."""
     with (folder / "flight.mcap").open("rb") as file:
         found = reader.make_reader(file).iter_messages(topics=[topic])
-        return [(schema.name, message.log_time, json.loads(message.data)) for schema, _, message in found]
+        return [
+            (schema.name, message.log_time, json.loads(message.data))
+            for schema, _, message in found
+        ]
 
 
 def test_poses_and_commands_read_back_as_they_were_flown(flown):
@@ -36,10 +45,15 @@ def test_poses_and_commands_read_back_as_they_were_flown(flown):
     assert {name for name, _, _ in moved} == {"foxglove.FrameTransform"}
     places = [[content["translation"][axis] for axis in "xyz"] for _, _, content in moved]
     np.testing.assert_array_equal(places, log["pos_w"].values)
-    np.testing.assert_allclose([1e-9 * stamp for _, stamp, _ in moved], log["pos_w"].time - begin, atol=1e-9)
+    np.testing.assert_allclose(
+        [1e-9 * stamp for _, stamp, _ in moved], log["pos_w"].time - begin, atol=1e-9
+    )
     turned = [[content["rotation"][axis] for axis in "xyzw"] for _, _, content in moved]
     np.testing.assert_array_equal(turned, log["quat_wb"].values)
-    sent = [[c["thrust_n"], c["rate_x"], c["rate_y"], c["rate_z"]] for _, _, c in messages(flown, "/command")]
+    sent = [
+        [c["thrust_n"], c["rate_x"], c["rate_y"], c["rate_z"]]
+        for _, _, c in messages(flown, "/command")
+    ]
     np.testing.assert_array_equal(sent, log["command"].values)
 
 
@@ -47,7 +61,9 @@ def test_pictures_decode_and_show_keypoints(flown):
     pictures = messages(flown, "/camera/keypoints")
     assert {name for name, _, _ in pictures} == {"foxglove.CompressedImage"}
     assert len(pictures) > 50
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[40][2]["data"]), np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(
+        np.frombuffer(base64.b64decode(pictures[40][2]["data"]), np.uint8), cv2.IMREAD_COLOR
+    )
     assert image.shape == (640, 640, 3)
     green = (image[..., 1] > 150) & (image[..., 2] < 110)
     assert green.sum() > 20, "the goal's corners"
@@ -58,7 +74,9 @@ def test_every_channel_is_there_with_its_unit_and_schema(flown):
     with (flown / "flight.mcap").open("rb") as file:
         summary = reader.make_reader(file).get_summary()
         file.seek(0)
-        about = {record.name: record.metadata for record in reader.make_reader(file).iter_metadata()}
+        about = {
+            record.name: record.metadata for record in reader.make_reader(file).iter_metadata()
+        }
     topics = {channel.topic: channel for channel in summary.channels.values()}
     assert {f"/signals/{name}" for name in log.channels} <= set(topics)
     assert topics["/signals/pos_w"].metadata == {"unit": "m", "frame": "world"}
@@ -76,7 +94,17 @@ def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, caps
 
 
 def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
-    words = ["fly", "--policy", "state", "--device", "cpu", "--out", str(tmp_path), "--set", "rope.length=0.4"]
+    words = [
+        "fly",
+        "--policy",
+        "state",
+        "--device",
+        "cpu",
+        "--out",
+        str(tmp_path),
+        "--set",
+        "rope.length=0.4",
+    ]
     assert main(words) == 2
     assert "--allow rope.length" in capsys.readouterr().err
     assert main([*words, "--allow", "rope.length"]) == 0

@@ -29,12 +29,16 @@ class More(Few):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"lag": -1e-9}, "lag is -1e-09; expected 0 or more"), ({"lag": math.nan}, "lag is nan; expected 0 or more"),
-        ({"share": 0.0}, "share is 0.0; expected above 0 and below 1"), ({"share": 1.0}, "share is 1.0; expected above 0 and below 1"),
-        ({"channel": 13}, "channel is 13; expected 1 to 12"), ({"rates": (1.0, 0.0)}, "rates is (1.0, 0.0); expected above 0"),
-        ({"hold": 0.6}, "hold is 0.6; expected above 0 and at most 0.5"), ({"weight": 0.0}, "weight is 0.0; expected above 0"),
+        ({"lag": -1e-9}, "lag is -1e-09; expected 0 or more"),
+        ({"lag": math.nan}, "lag is nan; expected 0 or more"),
+        ({"share": 0.0}, "share is 0.0; expected above 0 and below 1"),
+        ({"share": 1.0}, "share is 1.0; expected above 0 and below 1"),
+        ({"channel": 13}, "channel is 13; expected 1 to 12"),
+        ({"rates": (1.0, 0.0)}, "rates is (1.0, 0.0); expected above 0"),
+        ({"hold": 0.6}, "hold is 0.6; expected above 0 and at most 0.5"),
+        ({"weight": 0.0}, "weight is 0.0; expected above 0"),
     ],
-)  # fmt: skip
+)
 def test_what_lies_outside_is_named_with_its_bound(wrong, message):
     with pytest.raises(ConfigError) as caught:
         More(**wrong)

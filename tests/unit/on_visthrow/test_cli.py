@@ -19,13 +19,29 @@ from visthrow.training import device
 ROOT = Path(__file__).resolve().parents[3]
 
 HELP_BUDGET = 0.5
-"""[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few runs counts."""
+"""[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few
+runs counts.
+"""
 
-HEAVY = {"torch", "warp", "rsl_rl", "tensordict", "cv2", "kornia", "rerun", "matplotlib", "scipy", "mujoco", "numpy"}
+HEAVY = {
+    "torch",
+    "warp",
+    "rsl_rl",
+    "tensordict",
+    "cv2",
+    "kornia",
+    "rerun",
+    "matplotlib",
+    "scipy",
+    "mujoco",
+    "numpy",
+}
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-m", "visthrow.cli", *arguments], capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-m", "visthrow.cli", *arguments], capture_output=True, text=True
+    )
 
 
 @pytest.fixture
@@ -60,10 +76,18 @@ def test_help_is_quick_and_names_every_command():
 
 
 def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
-    """``python -m visthrow.cli`` looks into the working folder first; a user's ``camera.py`` lies there."""
+    """``python -m visthrow.cli`` looks into the working folder first; a user's ``camera.py`` lies
+    there.
+    """
     (tmp_path / "camera.py").write_text("")
     words = [sys.executable, "-m", "visthrow.cli", "config", "camera", "fisheye"]
-    result = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    result = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
     assert result.returncode == 2
     assert f"{tmp_path / 'camera.py'} hides visthrow's own package" in result.stderr
     assert "Traceback" not in result.stderr
@@ -74,13 +98,20 @@ def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
 )
 def test_configurations_and_misspelt_names_import_neither_torch_nor_warp(does):
     code = f"import sys; from visthrow.cli import main; main({does}); print(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert {"torch", "warp"}.isdisjoint(result.stdout.split())
 
 
 def test_help_imports_nothing_heavy():
-    code = "import sys; from visthrow.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = (
+        "import sys; from visthrow.cli import build_parser; build_parser().format_help();"
+        " print(*sys.modules)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert HEAVY.isdisjoint(result.stdout.split())
 
 
@@ -135,7 +166,9 @@ def test_a_missing_optional_package_names_the_extra(command, capsys):
 
 def test_the_command_s_status_is_returned(command):
     command(3)
-    assert cli.main(["try", "--device", "cpu", "--set", "a=1", "--set", "b.c=2", "--json", "x"]) == 3
+    assert (
+        cli.main(["try", "--device", "cpu", "--set", "a=1", "--set", "b.c=2", "--json", "x"]) == 3
+    )
     command(None)
     assert cli.main(["try"]) == 0
 
@@ -144,7 +177,20 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
     from sim.params import VehicleParams
     from visthrow import config
 
-    assert cli.main(["config", "vehicle", "paper", "--set", "body.mass=0.25", "--json", str(tmp_path / "a.json")]) == 0
+    assert (
+        cli.main(
+            [
+                "config",
+                "vehicle",
+                "paper",
+                "--set",
+                "body.mass=0.25",
+                "--json",
+                str(tmp_path / "a.json"),
+            ]
+        )
+        == 0
+    )
     printed = config.loads(VehicleParams, capsys.readouterr().out)
     assert printed.body.mass == 0.25
     assert '"mass": 0.25' in (tmp_path / "a.json").read_text()
@@ -169,13 +215,22 @@ def test_config_mistakes(arguments, said, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["camera", "show", "fisheye", "--target", "nan", "0"], "--target: 'nan'; expected a finite number"),
-        (["camera", "show", "fisheye", "--height", "-1"], "--height: '-1'; expected a number above 0"),
+        (
+            ["camera", "show", "fisheye", "--target", "nan", "0"],
+            "--target: 'nan'; expected a finite number",
+        ),
+        (
+            ["camera", "show", "fisheye", "--height", "-1"],
+            "--height: '-1'; expected a number above 0",
+        ),
         (["train", "state", "--minutes", "inf"], "--minutes: 'inf'; expected a finite number"),
         (["diagnose", "map", "a.csv", "--mass", "-2"], "--mass: '-2'; expected a number above 0"),
         (["fly", "--seed", "-1"], "--seed: '-1'; expected a whole number of 0 or more"),
         (["hil", "check", "--speed", "0"], "--speed: '0'; expected a number above 0"),
-        (["hil", "fake", "--msp-port", "70000"], "--msp-port: '70000'; expected a port, 1 to 65535"),
+        (
+            ["hil", "fake", "--msp-port", "70000"],
+            "--msp-port: '70000'; expected a port, 1 to 65535",
+        ),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, capsys):

@@ -75,7 +75,10 @@ def test_values_arrive_with_their_types(write):
         (("mass = 2", "mass = 1979-05-27"), ["mass", "date", "a number"]),
         (("mass = 2", f"mass = 1{'0' * 400}"), ["mass", "a finite number"]),
         (("mass = 2\n", ""), ["missing mass", "a number", "given: name, count, inner"]),
-        (("mass = 2", "mas = 2"), ["mas", "unknown key", "did you mean 'mass'?", "count, flag, inner"]),
+        (
+            ("mass = 2", "mas = 2"),
+            ["mas", "unknown key", "did you mean 'mass'?", "count, flag, inner"],
+        ),
         (('kind = "a"', 'kind = "c"'), ["inner.kind", "'c'", "one of 'a', 'b'"]),
         (("[1, 2.5]", "[1]"), ["inner.gain", "a list of 1", "a list of 2"]),
         (("[1, 2.5]", "[1, true]"), ["inner.gain[1]", "True (bool)"]),
@@ -151,7 +154,11 @@ class Rows:
 def test_a_table_among_like_ones_lies_on_top_of_its_base():
     text = "[rows.z]\nbase = 'y'\nc = 5\n[rows.x]\na = 1\nb = [2, 3]\n[rows.y]\nbase = 'x'\na = 4\n"
     loaded = config.loads(Rows, text)
-    assert loaded.rows == {"z": Row("z", 4, (2, 3), 5), "x": Row("x", 1, (2, 3)), "y": Row("y", 4, (2, 3))}
+    assert loaded.rows == {
+        "z": Row("z", 4, (2, 3), 5),
+        "x": Row("x", 1, (2, 3)),
+        "y": Row("y", 4, (2, 3)),
+    }
     assert list(loaded.rows) == ["z", "x", "y"], "in the order of the file"
     assert config.loads(Rows, config.dumps(loaded)) == loaded
     assert config.loads(Rows, text, ["rows.x.a=7"]).rows["x"].a == 7
@@ -160,13 +167,19 @@ def test_a_table_among_like_ones_lies_on_top_of_its_base():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[rows.x]\na = 1\nb = [1, 2]\n[rows.y]\nbase = 'z'", "rows.y.base: got 'z'; expected another table; known: x"),
+        (
+            "[rows.x]\na = 1\nb = [1, 2]\n[rows.y]\nbase = 'z'",
+            "rows.y.base: got 'z'; expected another table; known: x",
+        ),
         ("[rows.x]\nbase = 'y'\n[rows.y]\nbase = 'x'", "rows.y.base: got 'x'"),
         ("[rows.x]\nbase = 'x'", "rows.x.base: got 'x'"),
         ("[rows.x]\nbase = { a = 1 }", "rows.x.base: got a table"),
         ("[rows.x]\na = 1\nb = [1, 2]\n[rows.y]\nbase = 'x'\nd = 1", "rows.y.d: unknown key"),
         ("[rows.x]\na = 1\n[rows.y]\nbase = 'x'", "missing b"),
-        ("[rows.x]\nname = 'y'\na = 1\nb = [1, 2]", "rows.x.name: got 'y'; expected the heading, 'x'"),
+        (
+            "[rows.x]\nname = 'y'\na = 1\nb = [1, 2]",
+            "rows.x.name: got 'y'; expected the heading, 'x'",
+        ),
     ],
 )
 def test_a_wrong_base_of_a_table_is_refused(text, said):
@@ -185,9 +198,18 @@ def test_circles_are_refused(write):
 def test_overrides_apply_in_order_after_includes(write):
     write("inner.toml", 'kind = "b"\ngain = [3, 4]')
     path = write("a.toml", GOOD)
-    overrides = ["inner=" + str(path.parent / "inner.toml"), "inner.gain=[7, 8]", "name=plain words", "layers=[]",
-                 "limit=2", "count=4", "count=5", 'spare={kind="a", gain=[0, 0]}', "inner.table={k=1}",
-                 "inner.table.m=2"]  # fmt: skip
+    overrides = [
+        "inner=" + str(path.parent / "inner.toml"),
+        "inner.gain=[7, 8]",
+        "name=plain words",
+        "layers=[]",
+        "limit=2",
+        "count=4",
+        "count=5",
+        'spare={kind="a", gain=[0, 0]}',
+        "inner.table={k=1}",
+        "inner.table.m=2",
+    ]
     loaded = config.load(Outer, path, overrides)
     assert loaded.inner == Inner("b", (7.0, 8.0), {"k": 1.0, "m": 2.0})
     assert (loaded.name, loaded.layers, loaded.limit, loaded.count) == ("plain words", (), 2.0, 5)

@@ -1,4 +1,6 @@
-"""What no plant, camera or training can be is refused where the configuration is read, and a copied file finds its base."""
+"""What no plant, camera or training can be is refused where the configuration is read, and a copied
+file finds its base.
+"""
 
 import pytest
 
@@ -22,18 +24,58 @@ from visthrow.task import Experiment
         ("task", "state", "noise.command_step=-1", "command_step"),
         ("train", "state", "ppo.iterations=-3", "1 or more"),
         ("train", "state", "ppo.discount=1.5", "discount"),
-        ("train", "state", "vehicle.body.mass=210", "weigh 210.062 kg, 2.06e+03 N, but thrust is 14 N at most"),  # grams
+        (
+            "train",
+            "state",
+            "vehicle.body.mass=210",
+            "weigh 210.062 kg, 2.06e+03 N, but thrust is 14 N at most",
+        ),  # grams
         ("train", "state", "rope.payload_mass=12", "it cannot hover"),
-        ("train", "state", "task.action.max_thrust=2", "asked up to 2 N (task.action.max_thrust): it cannot hover"),
+        (
+            "train",
+            "state",
+            "task.action.max_thrust=2",
+            "asked up to 2 N (task.action.max_thrust): it cannot hover",
+        ),
         ("train", "state", "rope.length=34", "the payload hangs 34.053 m"),  # centimetres
         ("train", "state", "vehicle=x500", "did you mean 'vehicle/x500.toml'?"),
-        ("train", "state", "task.start.spawn_height=133", "expected within task.bounds.altitude, 0.5 to 3 m"),
-        ("train", "state", "release.lag=110", "release.lag is 110 s, and a throw is over after 5 s"),  # milliseconds
+        (
+            "train",
+            "state",
+            "task.start.spawn_height=133",
+            "expected within task.bounds.altitude, 0.5 to 3 m",
+        ),
+        (
+            "train",
+            "state",
+            "release.lag=110",
+            "release.lag is 110 s, and a throw is over after 5 s",
+        ),  # milliseconds
         ("train", "state", "vehicle.motor.time_constant=33", "vehicle.motor.time_constant is 33 s"),
-        ("train", "state", "vehicle.rotors.x=[68,68,-68,-68]", "vehicle.rotors reach 68.0381 m"),  # millimetres
-        ("train", "state", "vehicle.body.inertia=[2500,2500,4000]", "puts 0.21 kg 138 m from its middle"),  # g cm^2
-        ("train", "state", "vehicle.thrust.k_f=2.4e-9", "blade tips of 1.45e+03 m/s for 3.5 N"),  # N/rpm^2
-        ("train", "state", "vehicle.thrust.k_f=1", "expected more than the air through the rotor, 17.9 m/s"),
+        (
+            "train",
+            "state",
+            "vehicle.rotors.x=[68,68,-68,-68]",
+            "vehicle.rotors reach 68.0381 m",
+        ),  # millimetres
+        (
+            "train",
+            "state",
+            "vehicle.body.inertia=[2500,2500,4000]",
+            "puts 0.21 kg 138 m from its middle",
+        ),  # g cm^2
+        (
+            "train",
+            "state",
+            "vehicle.thrust.k_f=2.4e-9",
+            "blade tips of 1.45e+03 m/s for 3.5 N",
+        ),  # N/rpm^2
+        (
+            "train",
+            "state",
+            "vehicle.thrust.k_f=1",
+            "expected more than the air through the rotor, 17.9 m/s",
+        ),
     ],
 )
 def test_the_command_refuses(kind, name, change, message, capsys):

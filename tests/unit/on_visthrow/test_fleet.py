@@ -1,4 +1,6 @@
-"""Vehicles of a class: drawn as stated, flown in their own units, and one policy for all as an ordinary one for each."""
+"""Vehicles of a class: drawn as stated, flown in their own units, and one policy for all as an
+ordinary one for each.
+"""
 
 import dataclasses
 
@@ -35,7 +37,9 @@ def experiment(*overrides: str, policy: str = "any") -> Experiment:
 
 
 def of(name: str, policy: str = "any") -> Experiment:
-    return experiment(f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0", policy=policy)
+    return experiment(
+        f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0", policy=policy
+    )
 
 
 def random_policy(of: Experiment, seed: int = 0) -> Policy:
@@ -44,14 +48,26 @@ def random_policy(of: Experiment, seed: int = 0) -> Policy:
     width = contract["observation"]["dimension"]
     mean, std = 0.3 * torch.randn(width), 0.2 + torch.rand(width)
     return Policy(
-        (0.3 * torch.randn(16, width), 0.3 * torch.randn(5, 16)), (torch.randn(16), torch.randn(5)), "tanh", contract, {}, mean, std, 0.01
+        (0.3 * torch.randn(16, width), 0.3 * torch.randn(5, 16)),
+        (torch.randn(16), torch.randn(5)),
+        "tanh",
+        contract,
+        {},
+        mean,
+        std,
+        0.01,
     )
 
 
 def test_a_vehicle_is_the_same_in_every_draw_and_another_under_another_seed():
-    few, many = experiment("fleet.count=2", "fleet.first=7"), experiment("fleet.count=5", "fleet.first=4")
+    few, many = (
+        experiment("fleet.count=2", "fleet.first=7"),
+        experiment("fleet.count=5", "fleet.first=4"),
+    )
     assert members(few) == members(many)[3:]
-    assert members(few)[0] != members(experiment("fleet.count=2", "fleet.first=7", "fleet.seed=2"))[0]
+    assert (
+        members(few)[0] != members(experiment("fleet.count=2", "fleet.first=7", "fleet.seed=2"))[0]
+    )
     assert len({m.units.mass for m in members(many)}) == 5
 
 
@@ -62,13 +78,25 @@ def test_drawn_vehicles_lie_in_the_ranges_and_follow_size():
     mass = np.array([p.vehicle.body.mass for p in drawn])
     assert fleet.mass[0] <= mass.min() < 0.04
     assert 1.5 < mass.max() <= fleet.mass[1]
-    strength = np.array([4 * p.vehicle.controller.max_thrust / (p.total_mass * GRAVITY) for p in drawn])
+    strength = np.array(
+        [4 * p.vehicle.controller.max_thrust / (p.total_mass * GRAVITY) for p in drawn]
+    )
     assert fleet.least_thrust - 1e-9 <= strength.min() < 6.0 < strength.max()
     size = mass / known.vehicle.body.mass
     for name, exponent, value, reference in (
         ("arm", 1 / 3, [p.vehicle.rotors.x[0] for p in drawn], known.vehicle.rotors.x[0]),
-        ("thrust", 1.0, [p.vehicle.controller.max_thrust for p in drawn], known.vehicle.controller.max_thrust),
-        ("motor_lag", 1 / 6, [p.vehicle.motor.time_constant for p in drawn], known.vehicle.motor.time_constant),
+        (
+            "thrust",
+            1.0,
+            [p.vehicle.controller.max_thrust for p in drawn],
+            known.vehicle.controller.max_thrust,
+        ),
+        (
+            "motor_lag",
+            1 / 6,
+            [p.vehicle.motor.time_constant for p in drawn],
+            known.vehicle.motor.time_constant,
+        ),
         ("rope", 1 / 3, [p.rope.length for p in drawn], known.rope.length),
         ("delay", 0.0, [p.vehicle.queue.delay for p in drawn], 1.0),
         ("lag", 0.0, [p.release.lag for p in drawn], 1.0),
@@ -85,7 +113,9 @@ def test_named_vehicles_lie_in_the_class(name):
     fleet, known, plant = base.fleet, plant_of(base), plant_of(of(name))
     v, ratio = plant.vehicle, known.vehicle.body.mass / plant.vehicle.body.mass
     alike = in_units(known, Units(ratio ** (1 / 3), ratio))
-    arm = np.hypot(v.rotors.x[0], v.rotors.y[0]) / np.hypot(alike.vehicle.rotors.x[0], alike.vehicle.rotors.y[0])
+    arm = np.hypot(v.rotors.x[0], v.rotors.y[0]) / np.hypot(
+        alike.vehicle.rotors.x[0], alike.vehicle.rotors.y[0]
+    )
     factors = {
         "thrust": v.controller.max_thrust / alike.vehicle.controller.max_thrust,
         "arm": arm,
@@ -98,29 +128,49 @@ def test_named_vehicles_lie_in_the_class(name):
         "delay": v.queue.delay,
         "mass": v.body.mass,
     }
-    outside = {key: x for key, x in factors.items() if not getattr(fleet, key)[0] <= x <= getattr(fleet, key)[1]}
+    outside = {
+        key: x
+        for key, x in factors.items()
+        if not getattr(fleet, key)[0] <= x <= getattr(fleet, key)[1]
+    }
     assert not outside
     assert 4 * v.controller.max_thrust / (plant.total_mass * GRAVITY) >= fleet.least_thrust
 
 
 def test_a_vehicle_flies_the_same_in_a_batch_as_alone_to_the_bit():
     plants = [member.plant for member in members(experiment())]
-    parts = {f"{name}s": [getattr(p, name) for p in plants] for name in ("vehicle", "rope", "release")}
+    parts = {
+        f"{name}s": [getattr(p, name) for p in plants] for name in ("vehicle", "rope", "release")
+    }
     together = HybridSim(plants[0], 6, **parts)
-    commands = np.random.default_rng(0).uniform((1.0, -3.0, -3.0, -1.0), (6.0, 3.0, 3.0, 1.0), (25, 1, 4))
+    commands = np.random.default_rng(0).uniform(
+        (1.0, -3.0, -3.0, -1.0), (6.0, 3.0, 3.0, 1.0), (25, 1, 4)
+    )
 
     def fly(sim: HybridSim) -> dict[str, np.ndarray]:
         sim.place(np.tile([0.0, 0.0, 1.3], (sim.count, 1)))
         for k, command in enumerate(commands):
             sim.set_command(np.repeat(command, sim.count, 0), np.full(sim.count, k >= 16))
             sim.step()
-        return {name: sim.get(name) for name in ("pos_w", "quat_wb", "motor_speed", "landing_w", "time_to_impact", "cable_dir_w")}
+        return {
+            name: sim.get(name)
+            for name in (
+                "pos_w",
+                "quat_wb",
+                "motor_speed",
+                "landing_w",
+                "time_to_impact",
+                "cable_dir_w",
+            )
+        }
 
     batch = fly(together)
     for k, plant in enumerate(plants):
         single = fly(HybridSim(plant, 1))
         for name, value in single.items():
-            np.testing.assert_array_equal(batch[name][[k, k + 3]], np.repeat(value, 2, 0), err_msg=f"{k}: {name}")
+            np.testing.assert_array_equal(
+                batch[name][[k, k + 3]], np.repeat(value, 2, 0), err_msg=f"{k}: {name}"
+            )
     assert len(np.unique(batch["landing_w"][:, 0])) == 3
 
 
@@ -134,19 +184,39 @@ def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them(
     env.carry(torch.ones(12, 5))
     queued = env.views.command[:, 0]
     for e in range(12):
-        assert float(queued[e]) == pytest.approx(drawn[e % 6 // 2].max_thrust, rel=0.1)  # noise of commands
+        assert float(queued[e]) == pytest.approx(
+            drawn[e % 6 // 2].max_thrust, rel=0.1
+        )  # noise of commands
 
 
 def quiet(base: Experiment) -> Experiment:
     """The experiment without noise, latency, faults of the camera or other masses and ropes."""
     task = base.task
-    clear = dict.fromkeys(("step_std", "bias_std", "drop_probability", "wrong_probability", "held_probability", "scale_std"), 0.0)
+    clear = dict.fromkeys(
+        (
+            "step_std",
+            "bias_std",
+            "drop_probability",
+            "wrong_probability",
+            "held_probability",
+            "scale_std",
+        ),
+        0.0,
+    )
     mount = dataclasses.replace(base.camera.mount, rotation_error_std=0.0, position_error_std=0.0)
-    camera = dataclasses.replace(base.camera, mount=mount, noise=dataclasses.replace(base.camera.noise, **clear))
-    noise = dataclasses.replace(task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0)
+    camera = dataclasses.replace(
+        base.camera, mount=mount, noise=dataclasses.replace(base.camera.noise, **clear)
+    )
+    noise = dataclasses.replace(
+        task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
+    )
     start = dataclasses.replace(task.start, mass=0.0, tether_variants=1)
     observation = dataclasses.replace(task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
-    return dataclasses.replace(base, camera=camera, task=dataclasses.replace(task, noise=noise, start=start, observation=observation))
+    return dataclasses.replace(
+        base,
+        camera=camera,
+        task=dataclasses.replace(task, noise=noise, start=start, observation=observation),
+    )
 
 
 @pytest.mark.parametrize("kind", ["any", "any_vision"])
@@ -155,7 +225,10 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
     base = quiet(of(name, kind))
     policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
     own, one = specialised(policy, base)
-    pilot, units = Pilot(own, one.camera if kind == "any_vision" else None, 4), members(base)[0].units
+    pilot, units = (
+        Pilot(own, one.camera if kind == "any_vision" else None, 4),
+        members(base)[0].units,
+    )
     assert pilot.period == pytest.approx(0.02 * units.time)
     assert own.total_mass == pytest.approx(plant_of(base).total_mass)
     most, rates = members(base)[0].max_thrust, torch.tensor(base.task.action.max_rate)
@@ -163,14 +236,26 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
     for _ in range(15):
         wanted = policy.act(shown)
         state, size = {k: v.numpy() for k, v in env.views.state.items()}, units.length
-        payload, goal = env.views.out["payload_pos_w"].numpy() * size, env.views.goal_w.numpy() * size
+        payload, goal = (
+            env.views.out["payload_pos_w"].numpy() * size,
+            env.views.goal_w.numpy() * size,
+        )
         out = pilot.act(
-            state["pos_w"] * size, state["quat_wb"], state["vel_w"] * size / units.time, state["rate_b"] / units.time, payload, goal
+            state["pos_w"] * size,
+            state["quat_wb"],
+            state["vel_w"] * size / units.time,
+            state["rate_b"] / units.time,
+            payload,
+            goal,
         )
         np.testing.assert_allclose(out.action, act.clip_action(wanted).numpy(), atol=SAME)
         command = act.command_from_action(torch.from_numpy(out.action), most, rates)
-        np.testing.assert_allclose(out.command[:, 0], command[:, 0] * units.size((1, 1, -2)), rtol=SAME)
-        np.testing.assert_allclose(out.command[:, 1:], command[:, 1:] / units.time, rtol=SAME, atol=SAME)
+        np.testing.assert_allclose(
+            out.command[:, 0], command[:, 0] * units.size((1, 1, -2)), rtol=SAME
+        )
+        np.testing.assert_allclose(
+            out.command[:, 1:], command[:, 1:] / units.time, rtol=SAME, atol=SAME
+        )
         shown = env.carry(wanted)["actor"]
     assert one.rope.length == plant_of(base).rope.length
 
@@ -190,13 +275,17 @@ def test_one_vehicles_experiment_is_the_same_task_at_its_size():
 
 def test_a_policy_of_one_vehicle_is_not_specialised():
     base = config.load(Experiment, config.find("train", "state"))
-    with pytest.raises(PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"):
+    with pytest.raises(
+        PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"
+    ):
         specialised(random_policy(base), of("x500"))
 
 
 @pytest.mark.parametrize("name", ["crazyflie_brushless", "x500"])
 def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(name, tmp_path):
-    loaded = load_policy("any", overrides=[f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"'])
+    loaded = load_policy(
+        "any", overrides=[f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"']
+    )
     size = loaded.experiment.rope.length / 0.33
     log = fly(loaded, [2.0 * size, 0.0, 0.0])
     assert log.meta["result"]["success"]
@@ -208,7 +297,10 @@ def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(name, 
 
 
 def test_ranges_that_nothing_can_be_drawn_from_are_refused():
-    with pytest.raises(config.ConfigError, match=r"fleet\.mass is 2\.0 to 0\.03; expected an ascending range above 0"):
+    with pytest.raises(
+        config.ConfigError,
+        match=r"fleet\.mass is 2\.0 to 0\.03; expected an ascending range above 0",
+    ):
         experiment("fleet.mass=[2.0, 0.03]")
     with pytest.raises(config.ConfigError, match=r"fleet\.count is -1"):
         experiment("fleet.count=-1")

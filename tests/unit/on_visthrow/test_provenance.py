@@ -24,12 +24,21 @@ class Settings:
 
 def test_record_is_complete_and_free_of_names(monkeypatch):
     monkeypatch.setattr(
-        sys, "argv", ["/home/somebody/bin/visthrow", "train", "--out=/data/x/run", "--set", "a.b=0.5/2"]
+        sys,
+        "argv",
+        ["/home/somebody/bin/visthrow", "train", "--out=/data/x/run", "--set", "a.b=0.5/2"],
     )
     record = provenance.collect()
     assert record["command"] == "visthrow train --out=run --set a.b=0.5/2"
     assert {"commit", "time", "versions", "processors"} <= record.keys()
-    assert record["versions"].keys() >= {"visthrow", "python", "numpy", "torch", "warp-lang", "rsl-rl-lib"}
+    assert record["versions"].keys() >= {
+        "visthrow",
+        "python",
+        "numpy",
+        "torch",
+        "warp-lang",
+        "rsl-rl-lib",
+    }
     text = json.dumps({key: record[key] for key in record if key != "command"})
     for private in (socket.gethostname(), f"/{getpass.getuser()}/", "/home/"):
         assert private not in text
@@ -39,15 +48,22 @@ def test_a_command_is_one_that_a_shell_takes(monkeypatch):
     main = types.ModuleType("__main__")
     main.__spec__ = types.SimpleNamespace(name="tests.bench.train")
     monkeypatch.setitem(sys.modules, "__main__", main)
-    monkeypatch.setattr(sys, "argv", ["/root/tests/bench/train.py", "state", "--set", 'algorithm="first_order"'])
-    assert provenance.command() == "python -m tests.bench.train state --set 'algorithm=\"first_order\"'"
+    monkeypatch.setattr(
+        sys, "argv", ["/root/tests/bench/train.py", "state", "--set", 'algorithm="first_order"']
+    )
+    assert (
+        provenance.command()
+        == "python -m tests.bench.train state --set 'algorithm=\"first_order\"'"
+    )
     main.__spec__.name = "visthrow.cli.__main__"
     monkeypatch.setattr(sys, "argv", ["/root/visthrow/cli/__main__.py", "demo"])
     assert provenance.command() == "python -m visthrow.cli demo"
 
 
 def test_commit_of_a_copy_without_history_is_what_it_was_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "visthrow" / "common" / "provenance.py"))
+    monkeypatch.setattr(
+        provenance, "__file__", str(tmp_path / "visthrow" / "common" / "provenance.py")
+    )
     monkeypatch.delenv(provenance.COMMIT_VARIABLE, raising=False)
     assert provenance.commit() == "unknown"
     monkeypatch.setenv(provenance.COMMIT_VARIABLE, "abc123")
@@ -76,5 +92,7 @@ def test_writing_where_a_file_stands_in_the_way_names_the_place(tmp_path):
 def test_json_has_no_nan(tmp_path):
     import numpy as np
 
-    write_json(tmp_path / "a.json", {"a": float("nan"), "b": np.float32(1.5), "c": np.array([1.0, np.inf])})
+    write_json(
+        tmp_path / "a.json", {"a": float("nan"), "b": np.float32(1.5), "c": np.array([1.0, np.inf])}
+    )
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": 1.5, "c": [1.0, None]}

@@ -8,10 +8,14 @@ from visthrow.common import statistics as st
 
 TRIALS = 300
 COVERAGE = 0.045
-"""Allowed distance of the coverage from 95 % over :data:`TRIALS` trials: four standard deviations, and the bootstrap's own bias."""
+"""Allowed distance of the coverage from 95 % over :data:`TRIALS` trials: four standard deviations,
+and the bootstrap's own bias.
+"""
 
 CLOSED = 0.06
-"""Of an interval's width: noise of the bootstrap's quantiles at 20,000 draws is 2 %, the rest is the sample's skew."""
+"""Of an interval's width: noise of the bootstrap's quantiles at 20,000 draws is 2 %, the rest is
+the sample's skew.
+"""
 
 
 def test_interval_of_a_mean_is_the_closed_form():
@@ -26,7 +30,10 @@ def test_interval_of_a_mean_is_the_closed_form():
 
 
 def test_two_levels_carry_the_scatter_of_the_runs():
-    """Variance of the bootstrap mean: (variance of run means + mean of throw variances / N) / runs, as drawn."""
+    """Variance of the bootstrap mean:
+
+    (variance of run means + mean of throw variances / N) / runs, as drawn.
+    """
     rng = np.random.default_rng(2)
     groups = [rng.normal(m, 0.01, 50) for m in (0.02, 0.03, 0.05, 0.06)]
     samples = st._resampled(groups, np.random.default_rng(0), 40000)
@@ -44,20 +51,28 @@ def covered(make, truth: float) -> float:
 
 def test_coverage_of_a_mean_of_skewed_throws():
     """Landing errors are Rayleigh-like: lengths of normal misses."""
-    share = covered(lambda rng: st.mean(rng.rayleigh(0.02, 100), draws=800), 0.02 * np.sqrt(np.pi / 2))
+    share = covered(
+        lambda rng: st.mean(rng.rayleigh(0.02, 100), draws=800), 0.02 * np.sqrt(np.pi / 2)
+    )
     assert abs(share - 0.95) < COVERAGE
 
 
 def test_coverage_of_a_ratio_and_a_difference():
-    share = covered(lambda rng: st.ratio(rng.rayleigh(0.06, 80), rng.rayleigh(0.02, 80), draws=800), 3.0)
+    share = covered(
+        lambda rng: st.ratio(rng.rayleigh(0.06, 80), rng.rayleigh(0.02, 80), draws=800), 3.0
+    )
     assert abs(share - 0.95) < COVERAGE
     gap = 0.01 * np.sqrt(np.pi / 2)
-    share = covered(lambda rng: st.difference(rng.rayleigh(0.03, 80), rng.rayleigh(0.02, 80), draws=800), gap)
+    share = covered(
+        lambda rng: st.difference(rng.rayleigh(0.03, 80), rng.rayleigh(0.02, 80), draws=800), gap
+    )
     assert abs(share - 0.95) < COVERAGE
 
 
 def test_throws_alone_miss_the_scatter_between_runs():
-    """Eight runs whose true means scatter: pooling their throws claims far too much, two levels do not."""
+    """Eight runs whose true means scatter: pooling their throws claims far too much, two levels do
+    not.
+    """
     rng = np.random.default_rng(4)
     pooled = two = 0
     for _ in range(150):
@@ -65,7 +80,9 @@ def test_throws_alone_miss_the_scatter_between_runs():
         pooled += 0.03 in st.mean(np.concatenate(groups), draws=400)
         two += 0.03 in st.mean(groups, draws=400)
     assert pooled / 150 < 0.6
-    assert two / 150 > 0.85  # the percentile interval of eight runs is known to be short: 0.90 expected
+    assert (
+        two / 150 > 0.85
+    )  # the percentile interval of eight runs is known to be short: 0.90 expected
 
 
 def test_pairs_remove_what_both_share():

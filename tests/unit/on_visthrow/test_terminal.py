@@ -11,7 +11,12 @@ def test_a_curve_falls_from_left_to_right_on_a_logarithmic_axis():
     falling = [(t, 1.0 * 0.1 ** (t / 10.0)) for t in range(11)]
     lines = terminal.curve([(".", falling)], 22, 11, "[m]")
     assert len(lines) == 13
-    marks = [(row, line.index(".") - 8) for row, line in enumerate(lines[:11]) if "." in line[8:] for line in ["        " + line[8:]]]
+    marks = [
+        (row, line.index(".") - 8)
+        for row, line in enumerate(lines[:11])
+        if "." in line[8:]
+        for line in ["        " + line[8:]]
+    ]
     assert [row for row, _ in marks] == list(range(11))  # a straight line
     assert [column for _, column in marks] == sorted(column for _, column in marks)
     assert lines[0].startswith("     1 |")
@@ -20,7 +25,9 @@ def test_a_curve_falls_from_left_to_right_on_a_logarithmic_axis():
 
 
 def test_later_series_stand_over_earlier_ones_and_what_is_no_number_is_left_out():
-    lines = terminal.curve([(".", [(1.0, 0.1), (2.0, math.nan), (3.0, -1.0)]), ("o", [(1.0, 0.1)])], 20, 5, "[m]")
+    lines = terminal.curve(
+        [(".", [(1.0, 0.1), (2.0, math.nan), (3.0, -1.0)]), ("o", [(1.0, 0.1)])], 20, 5, "[m]"
+    )
     text = "".join(line[8:] for line in lines[:5])
     assert text.count("o") == 1
     assert "." not in text
@@ -44,6 +51,8 @@ def test_blocks_stand_side_by_side():
     assert terminal.side_by_side(["ab", "c"], ["x"], 2) == ["ab  x", "c"]
 
 
-@pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (65.2, "1:05"), (3661, "1:01:01"), (math.inf, "-")])
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0, "0:00"), (65.2, "1:05"), (3661, "1:01:01"), (math.inf, "-")]
+)
 def test_clock(seconds, text):
     assert terminal.clock(seconds) == text

@@ -33,18 +33,30 @@ def endless(number: int) -> int:
 
 def test_one_process_works_here_and_in_order():
     seen = []
-    assert list(done(lambda x: seen.append(os.getpid()) or x, [3, 1, 2])) == [(0, 3), (1, 1), (2, 2)]
+    assert list(done(lambda x: seen.append(os.getpid()) or x, [3, 1, 2])) == [
+        (0, 3),
+        (1, 1),
+        (2, 2),
+    ]
     assert set(seen) == {os.getpid()}
 
 
 @pytest.mark.slow
 def test_processes_do_each_task_once():
-    assert sorted(done(squared, [3.0, 1.0, 2.0, 5.0, 4.0], 2)) == [(0, 9.0), (1, 1.0), (2, 4.0), (3, 25.0), (4, 16.0)]
+    assert sorted(done(squared, [3.0, 1.0, 2.0, 5.0, 4.0], 2)) == [
+        (0, 9.0),
+        (1, 1.0),
+        (2, 4.0),
+        (3, 25.0),
+        (4, 16.0),
+    ]
     assert list(done(math.sqrt, [], 2)) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("function", "message"), [(refused, "^no [12]"), (killed, "ended with status 7")])
+@pytest.mark.parametrize(
+    ("function", "message"), [(refused, "^no [12]"), (killed, "ended with status 7")]
+)
 def test_an_error_or_a_dead_process_ends_the_work(function, message):
     with pytest.raises(VisthrowError, match=message):
         list(done(function, [1, 2], 2))

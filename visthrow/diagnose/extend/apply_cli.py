@@ -16,29 +16,64 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from visthrow.diagnose.inputs.opening import DEFAULT_PLANT
 
     parser.epilog = (
-        "examples:\n"
-        "  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a configuration on top of the diagnosed one\n"
-        "  visthrow train mine.toml                                             train in it\n"
-        "  visthrow diagnose explain flights --plant mine.toml                  and diagnose it again: nothing should be left\n"
-        "  visthrow diagnose explain others.csv --config mine.toml              of another model: its worth on flights that it never saw\n"
+        "examples:\n  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a"
+        " configuration on top of the diagnosed one\n  visthrow train mine.toml                    "
+        "                         train in it\n  visthrow diagnose explain flights --plant"
+        " mine.toml                  and diagnose it again: nothing should be left\n  visthrow"
+        " diagnose explain others.csv --config mine.toml              of another model: its worth"
+        " on flights that it never saw\n"
     )
-    parser.add_argument("diagnosis", metavar="FILE", help="diagnosis.json of an explain, or a blackbox: its firmware's rate controller")
     parser.add_argument(
-        "--plant", metavar="NAME", help=f"the configuration that was diagnosed (default: as it says; with a blackbox {DEFAULT_PLANT})"
+        "diagnosis",
+        metavar="FILE",
+        help="diagnosis.json of an explain, or a blackbox: its firmware's rate controller",
     )
-    parser.add_argument("--config", metavar="NAME", help="likewise the setup, of another model than the throw")
-    parser.add_argument("--out", metavar="FILE", default="extended.toml", help="to write (default: extended.toml)")
     parser.add_argument(
-        "--plants", type=int, default=DEFAULT_PLANTS, metavar="N",
-        help=f"plants that training draws from the joint posterior; 1: the estimate alone (default: {DEFAULT_PLANTS})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--laws", type=int, default=0, metavar="N",
-        help="write the laws of the N-th best explanation outside the catalogue, which belong together, as well (default: 0, none)",
+        "--plant",
+        metavar="NAME",
+        help=(
+            "the configuration that was diagnosed (default: as it says; with a blackbox"
+            f" {DEFAULT_PLANT})"
+        ),
     )
-    parser.add_argument("--hover", type=NUMBER, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1")
-    parser.add_argument("--delay", type=NUMBER, metavar="S", help="with a blackbox: from a command to the mixer, where it is known [s]")
-    parser.add_argument("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
+    parser.add_argument(
+        "--config", metavar="NAME", help="likewise the setup, of another model than the throw"
+    )
+    parser.add_argument(
+        "--out", metavar="FILE", default="extended.toml", help="to write (default: extended.toml)"
+    )
+    parser.add_argument(
+        "--plants",
+        type=int,
+        default=DEFAULT_PLANTS,
+        metavar="N",
+        help=(
+            "plants that training draws from the joint posterior; 1: the estimate alone (default:"
+            f" {DEFAULT_PLANTS})"
+        ),
+    )
+    parser.add_argument(
+        "--laws",
+        type=int,
+        default=0,
+        metavar="N",
+        help=(
+            "write the laws of the N-th best explanation outside the catalogue, which belong"
+            " together, as well (default: 0, none)"
+        ),
+    )
+    parser.add_argument(
+        "--hover", type=NUMBER, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1"
+    )
+    parser.add_argument(
+        "--delay",
+        type=NUMBER,
+        metavar="S",
+        help="with a blackbox: from a command to the mixer, where it is known [s]",
+    )
+    parser.add_argument(
+        "--anyway", action="store_true", help="write it even if held-out flights saw no gain"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,10 +89,18 @@ def run(args: argparse.Namespace) -> int:
 
     if Path(args.diagnosis).suffix.lower() in BLACKBOX:
         if args.hover is None:
-            raise DiagnoseError("a blackbox without --hover; expected the share of throttle in hover, such as --hover 0.36")
+            raise DiagnoseError(
+                "a blackbox without --hover; expected the share of throttle in hover, such as"
+                " --hover 0.36"
+            )
         plant = args.plant or DEFAULT_PLANT
-        base, experiment = _named("train", plant), config.load(Experiment, config.find("train", plant))
-        atomic_write(args.out, patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay))
+        base, experiment = (
+            _named("train", plant),
+            config.load(Experiment, config.find("train", plant)),
+        )
+        atomic_write(
+            args.out, patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay)
+        )
         config.load(Experiment, Path(args.out))
         print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
         return 0
@@ -69,34 +112,66 @@ def run(args: argparse.Namespace) -> int:
     model = report.get("model", THROW)
     of_throw = model == THROW and not args.config
     if args.laws and (why := setup.MODELS[model].lawless if model in setup.MODELS else ""):
-        raise DiagnoseError(f"{args.diagnosis}: no law can act in the model '{model}': {why}; expected no --laws")
+        raise DiagnoseError(
+            f"{args.diagnosis}: no law can act in the model '{model}': {why}; expected no --laws"
+        )
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if of_throw:
         patch.refuse_strange(report, args.diagnosis, theta)
         theta, covariance = patch.with_scatter(theta, covariance, report)
     if not theta and not laws:
-        unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it" if report.get("laws") else ""
-        print(f"nothing was named{unused}; the {'configuration' if of_throw else 'setup'} stands as it is")
+        unused = (
+            ", but a law outside the catalogue explains the flights: --laws 1 writes it"
+            if report.get("laws")
+            else ""
+        )
+        print(
+            f"nothing was named{unused}; the {'configuration' if of_throw else 'setup'} stands as"
+            " it is"
+        )
         return 0
     _bear_out(report, args.anyway)
-    folder, option, schema = ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
+    folder, option, schema = (
+        ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
+    )
     name, said = _made_with(report, args, option, folder), origin(report, args.diagnosis)
     base = _named(folder, name)
-    diagnosed = config.load(schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ())
-    content = (patch.text(base, diagnosed, theta, covariance, args.plants, said, laws) if of_throw
-               else patch.of_setup(base, diagnosed, report, args.diagnosis, said, args.laws))  # fmt: skip
+    diagnosed = config.load(
+        schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ()
+    )
+    content = (
+        patch.text(base, diagnosed, theta, covariance, args.plants, said, laws)
+        if of_throw
+        else patch.of_setup(base, diagnosed, report, args.diagnosis, said, args.laws)
+    )
     atomic_write(args.out, content)
-    config.load(schema, Path(args.out))  # what was written is what training, or the next diagnosis, will read
-    named = [*theta, *(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})" for law in laws)]
+    config.load(
+        schema, Path(args.out)
+    )  # what was written is what training, or the next diagnosis, will read
+    named = [
+        *theta,
+        *(
+            f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})"
+            for law in laws
+        ),
+    ]
     print(f"{args.out}: {', '.join(named)} on top of {base}")
     return 0
 
 
 def _bear_out(report: dict, anyway: bool) -> None:
-    """Refuse what held-out flights deny. Raises DiagnoseError: they do, and nobody wants it all the same."""
-    doubts = harm(report) if report.get("theta") else []  # of a law alone, held-out flights have not been asked
+    """Refuse what held-out flights deny.
+
+    Raises DiagnoseError: they do, and nobody wants it all the same.
+    """
+    doubts = (
+        harm(report) if report.get("theta") else []
+    )  # of a law alone, held-out flights have not been asked
     if doubts and not anyway:
-        raise DiagnoseError(f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all the same")
+        raise DiagnoseError(
+            f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all"
+            " the same"
+        )
 
 
 def _made_with(report: dict, args: argparse.Namespace, option: str, folder: str) -> str:
@@ -107,9 +182,14 @@ def _made_with(report: dict, args: argparse.Namespace, option: str, folder: str)
     told, asked = report.get(option), getattr(args, option)
     if not (told or asked):
         model = report.get("model", "throw")
-        raise DiagnoseError(f"{args.diagnosis}: a diagnosis of the model '{model}' names no {option}; expected --{option} NAME")
+        raise DiagnoseError(
+            f"{args.diagnosis}: a diagnosis of the model '{model}' names no {option}; expected"
+            f" --{option} NAME"
+        )
     if told and asked and _named(folder, told) != _named(folder, asked):
-        raise DiagnoseError(f"{args.diagnosis}: made with --{option} {told}; its sizes do not count from {asked}")
+        raise DiagnoseError(
+            f"{args.diagnosis}: made with --{option} {told}; its sizes do not count from {asked}"
+        )
     return told or asked
 
 
@@ -121,7 +201,9 @@ def _named(folder: str, name: str) -> str:
 
 
 def harm(report: dict) -> list[str]:
-    """Reasons against a diagnosis: channels that held-out flights show worse with it, or no better."""
+    """Reasons against a diagnosis: channels that held-out flights show worse with it,
+    or no better.
+    """
     channels = (report.get("gain") or {}).get("channels", [])
     worse = [
         f"{c['channel']} {100 * (c['after'] / c['before'] - 1):+.1f} %"
@@ -129,24 +211,51 @@ def harm(report: dict) -> list[str]:
         if c.get("before") and c["after"] > (1.0 + HARM) * c["before"]
     ]
     nats = (report.get("gain") or {}).get("nats_per_sample")
-    return worse + ([f"log-likelihood {nats:+.3g} nats a sample"] if nats is not None and nats <= 0.0 else [])
+    return worse + (
+        [f"log-likelihood {nats:+.3g} nats a sample"] if nats is not None and nats <= 0.0 else []
+    )
 
 
 def origin(report: dict, path: str) -> list[str]:
     """Lines on where a diagnosis comes from."""
     made = report.get("provenance") or {}
-    lines = [f"Extended by `visthrow diagnose apply` from {path}: {report.get('overall', 'a diagnosis')}."]
-    lines += [f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows, {report.get('samples', 0)} samples."]
+    lines = [
+        f"Extended by `visthrow diagnose apply` from {path}:"
+        f" {report.get('overall', 'a diagnosis')}."
+    ]
+    lines += [
+        f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows,"
+        f" {report.get('samples', 0)} samples."
+    ]
     lines += [f"{name}: {made[name]}" for name in ("commit", "time", "command") if made.get(name)]
     for c in (report.get("gain") or {}).get("channels", []) if report.get("theta") else []:
-        lines.append(f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before, {c.get('after', 0.0):.3g} after.")
+        lines.append(
+            f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before,"
+            f" {c.get('after', 0.0):.3g} after."
+        )
     landing = (report.get("gain") or {}).get("landing")
     if landing:
         before, after = landing["before"], landing["after"]
-        lines.append(f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m after.")
-    own = [f for f in report.get("findings") or [] if f["name"] in report.get("theta", {}) and f.get("low") is not None]
+        lines.append(
+            f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m"
+            " after."
+        )
+    own = [
+        f
+        for f in report.get("findings") or []
+        if f["name"] in report.get("theta", {}) and f.get("low") is not None
+    ]
     if own:
-        lines.append("The sizes are those with which these causes alone explain the flights. With everything else below its floor:")
-        lines += [f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to {f['high']:.3g})." for f in own]
+        lines.append(
+            "The sizes are those with which these causes alone explain the flights. With everything"
+            " else below its floor:"
+        )
+        lines += [
+            f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
+            f" {f['high']:.3g})."
+            for f in own
+        ]
     drawn = [(s.get("by", "flight"), s) for s in report.get("scatter") or [] if s["found"]]
-    return lines + [f"Varies from {by} to {by}: {s['name']} {s['size']:.3g} {s['unit']}." for by, s in drawn]
+    return lines + [
+        f"Varies from {by} to {by}: {s['name']} {s['size']:.3g} {s['unit']}." for by, s in drawn
+    ]

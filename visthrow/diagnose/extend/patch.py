@@ -1,4 +1,6 @@
-"""A diagnosis put into the configuration: a TOML on top of the diagnosed one, that training and the next diagnosis read."""
+"""A diagnosis put into the configuration: a TOML on top of the diagnosed one, that training and the
+next diagnosis read.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -27,14 +29,22 @@ from visthrow.task import Experiment, plant_of
 
 
 def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
-    """The experiment whose plant and sensors have these effects. Raises ConfigError: an effect that the catalogue does not hold."""
+    """The experiment whose plant and sensors have these effects.
+
+    Raises ConfigError: an effect that the catalogue does not hold.
+    """
     base = generalised(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     found = apply(chosen(theta), base, theta)
     plant = specialised(found.plant, plant_of(experiment))
     return dataclasses.replace(
-        experiment, vehicle=plant.vehicle, rope=plant.rope, release=plant.release, air=plant.air, sensing=found.sensing,
+        experiment,
+        vehicle=plant.vehicle,
+        rope=plant.rope,
+        release=plant.release,
+        air=plant.air,
+        sensing=found.sensing,
         camera=found.camera,
-    )  # fmt: skip
+    )
 
 
 def differences(before: Any, after: Any) -> dict[str, Any]:
@@ -51,9 +61,14 @@ def differences(before: Any, after: Any) -> dict[str, Any]:
 
 
 def text(
-    base: str, experiment: Experiment, theta: Mapping[str, float], covariance: Sequence[Sequence[float]], plants: int,
-    provenance: Sequence[str], laws: Sequence[LawParams] = (),
-) -> str:  # fmt: skip
+    base: str,
+    experiment: Experiment,
+    theta: Mapping[str, float],
+    covariance: Sequence[Sequence[float]],
+    plants: int,
+    provenance: Sequence[str],
+    laws: Sequence[LawParams] = (),
+) -> str:
     """The TOML file.
 
     Args:
@@ -62,24 +77,51 @@ def text(
         plants: to draw in training from the joint posterior.
         laws: terms outside the catalogue, to stand beside those that the configuration has.
     """
-    named, covariance = [catalogue()[name] for name in theta], np.reshape(covariance, (len(theta), len(theta)))
-    # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which blocks there are
-    own = [i for i, e in enumerate(named) if e.changes and all(key.path.startswith("plant.") for key in e.changes)]
+    named, covariance = (
+        [catalogue()[name] for name in theta],
+        np.reshape(covariance, (len(theta), len(theta))),
+    )
+    # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which
+    # blocks there are
+    own = [
+        i
+        for i, e in enumerate(named)
+        if e.changes and all(key.path.startswith("plant.") for key in e.changes)
+    ]
     rows = tuple(map(tuple, covariance[np.ix_(own, own)].tolist()))
-    drawn = dataclasses.replace(experiment.diagnosed, effects=tuple(named[i].name for i in own), covariance=rows, plants=plants)
-    after = dataclasses.replace(extended(experiment, theta), diagnosed=drawn, laws=(*experiment.laws, *laws))
+    drawn = dataclasses.replace(
+        experiment.diagnosed,
+        effects=tuple(named[i].name for i in own),
+        covariance=rows,
+        plants=plants,
+    )
+    after = dataclasses.replace(
+        extended(experiment, theta), diagnosed=drawn, laws=(*experiment.laws, *laws)
+    )
     check_laws(after.laws)
     plain = config.load(Experiment, config.find("train", base))
     changed = differences(config.to_dict(plain), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
-    told = {e.name: f"{e.name} {theta[e.name]:+.4g} +- {covariance[i][i] ** 0.5:.2g} {e.unit}" for i, e in enumerate(named)}
+    told = {
+        e.name: f"{e.name} {theta[e.name]:+.4g} +- {covariance[i][i] ** 0.5:.2g} {e.unit}"
+        for i, e in enumerate(named)
+    }
     section, switched = "", [e.name for e in named if e.switch]
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
-        words = [told[e.name] for e in named for key in e.changes if key.path.removeprefix("plant.") == path]
+        words = [
+            told[e.name]
+            for e in named
+            for key in e.changes
+            if key.path.removeprefix("plant.") == path
+        ]
         if " = " in line and not words:
-            words = ["of the diagnosis above"] if section == "diagnosed" or line.startswith("laws") else switched
+            words = (
+                ["of the diagnosis above"]
+                if section == "diagnosed" or line.startswith("laws")
+                else switched
+            )
         lines.append(f"{line}  # {'; '.join(words)}" if words else line)
     return "\n".join(lines).rstrip() + "\n"
 
@@ -87,7 +129,9 @@ def text(
 def with_scatter(
     theta: Mapping[str, float], covariance: Sequence[Sequence[float]], report: Mapping[str, Any]
 ) -> tuple[dict[str, float], list[list[float]]]:
-    """Sizes and covariance with what varies from flight to flight: training draws it with the rest of the posterior."""
+    """Sizes and covariance with what varies from flight to flight: training draws it with the rest
+    of the posterior.
+    """
     drawn = variances(report.get("scatter") or [])
     names = [*theta, *[name for name in drawn if name not in theta]]
     whole = np.zeros((len(names), len(names)))
@@ -98,11 +142,20 @@ def with_scatter(
 
 
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
-    """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0. Raises DiagnoseError: it holds fewer."""
+    """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0.
+
+    Raises DiagnoseError: it holds fewer.
+    """
     if rank > len(there := _explanations(report)):
-        raise DiagnoseError(f"{path}: {len(there)} explanations by laws outside the catalogue; --laws asks for number {rank}")
+        raise DiagnoseError(
+            f"{path}: {len(there)} explanations by laws outside the catalogue; --laws asks for"
+            f" number {rank}"
+        )
     laws = there[rank - 1] if rank else []
-    return [LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"])) for x in laws]
+    return [
+        LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"]))
+        for x in laws
+    ]
 
 
 def _explanations(report: Mapping[str, Any]) -> list[list[dict[str, Any]]]:
@@ -111,20 +164,32 @@ def _explanations(report: Mapping[str, Any]) -> list[list[dict[str, Any]]]:
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
-    """Sizes and covariance from the JSON that ``explain`` wrote. Raises DiagnoseError: something is missing."""
+    """Sizes and covariance from the JSON that ``explain`` wrote.
+
+    Raises DiagnoseError: something is missing.
+    """
     try:
         theta = {str(name): float(size) for name, size in report["theta"].items()}
         covariance = [[float(x) for x in row] for row in report["covariance"]]
     except KeyError as error:
-        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: it has no {error}") from error
+        raise DiagnoseError(
+            f"{path}: no diagnosis that `visthrow diagnose explain` wrote: it has no {error}"
+        ) from error
     except (TypeError, ValueError, AttributeError) as error:
-        raise DiagnoseError(f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error}") from error
+        raise DiagnoseError(
+            f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error}"
+        ) from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
-        raise DiagnoseError(f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one each")
+        raise DiagnoseError(
+            f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one"
+            " each"
+        )
     return theta, covariance
 
 
-def with_firmware(path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None = None) -> str:
+def with_firmware(
+    path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None = None
+) -> str:
     """A configuration that flies the firmware's controller.
 
     Args:
@@ -142,17 +207,28 @@ def with_firmware(path: str | Path, base: str, experiment: Experiment, hover: fl
         controller = controller_of(plant.vehicle, settings, weight, voltage)
     except ValueError as error:
         raise DiagnoseError(f"{path}: {error}") from error
-    changed = differences(dataclasses.asdict(plant.vehicle.controller), dataclasses.asdict(controller))
-    lines = [f"# Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()} in {Path(path).name}."]
+    changed = differences(
+        dataclasses.asdict(plant.vehicle.controller), dataclasses.asdict(controller)
+    )
+    lines = [
+        f"# Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()}"
+        f" in {Path(path).name}."
+    ]
     lines += [f"# Not in the block: {words}." for words in left_out(settings)]
     vehicle = {"controller": changed} | ({} if delay is None else {"queue": {"delay": delay}})
     return "\n".join([*lines, dumps({"base": base, "vehicle": vehicle})])
 
 
 def of_setup(
-    base: str, setup: Setup, report: Mapping[str, Any], path: str, provenance: Sequence[str], rank: int = 0
+    base: str,
+    setup: Setup,
+    report: Mapping[str, Any],
+    path: str,
+    provenance: Sequence[str],
+    rank: int = 0,
 ) -> str:
-    """The TOML file of a setup of another model than the throw, extended by the sizes and laws that a diagnosis of it found.
+    """The TOML file of a setup of another model than the throw, extended by the sizes and laws that
+    a diagnosis of it found.
 
     Raises DiagnoseError: no diagnosis, one of another model, or one without such an explanation.
 
@@ -166,30 +242,50 @@ def of_setup(
     theta, covariance = read(report, path)
     if report.get("model", THROW) != setup.model:
         own = setup.model or "none"
-        raise DiagnoseError(f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base} is {own}")
+        raise DiagnoseError(
+            f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base}"
+            f" is {own}"
+        )
     effects = {e.name: e for e in effects_of(setup.model, getattr(setup, setup.model))}
     after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
     refuse_strange(report, path, after, effects, setup.model)
     laws = laws_of(report, path, rank)
-    known = [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]] if rank else []
+    known = (
+        [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]]
+        if rank
+        else []
+    )
     lines = [f"# {line}" for line in provenance]
     for rows, names in ((covariance, list(theta)), (known, [term_of(law).formula for law in laws])):
-        lines += [f"# covariance of {', '.join(names)}:"] * bool(names) + [f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in rows]
+        lines += [f"# covariance of {', '.join(names)}:"] * bool(names) + [
+            f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in rows
+        ]
     lines += dumps({"base": base}).splitlines()
     if laws:
-        lines.append(dumps({"laws": [dataclasses.asdict(law) for law in (*setup.laws, *laws)]}).strip())
+        lines.append(
+            dumps({"laws": [dataclasses.asdict(law) for law in (*setup.laws, *laws)]}).strip()
+        )
     lines += ["", "[effects]"] * bool(theta)
     for i, (name, size) in enumerate(theta.items()):
-        lines.append(f"{name} = {after[name]:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g} {effects[name].unit}")
+        lines.append(
+            f"{name} = {after[name]:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g}"
+            f" {effects[name].unit}"
+        )
     return "\n".join(lines) + "\n"
 
 
 def refuse_strange(
-    report: Mapping[str, Any], path: str, theta: Mapping[str, float], known: Mapping[str, Effect] | None = None, of: str = "throw"
+    report: Mapping[str, Any],
+    path: str,
+    theta: Mapping[str, float],
+    known: Mapping[str, Effect] | None = None,
+    of: str = "throw",
 ) -> None:
-    """Refuse effects that are none of a model's, though they may bear the same name, and sizes that it cannot have.
+    """Refuse effects that are none of a model's, though they may bear the same name, and sizes that
+    it cannot have.
 
-    Raises DiagnoseError: an effect or its unit is none of the model's; a size lies outside its bounds.
+    Raises DiagnoseError: an effect or its unit is none of the model's; a size lies outside its
+    bounds.
 
     Args:
         report: of the diagnosis. path: of its file.
@@ -200,12 +296,20 @@ def refuse_strange(
     known = catalogue() if known is None else known
     strange = [name for name in theta if name not in known]
     if strange:
-        raise DiagnoseError(f"{path}: {', '.join(strange)} are no effects of the {of}; {suggest(strange[0], known)}")
+        raise DiagnoseError(
+            f"{path}: {', '.join(strange)} are no effects of the {of}; {suggest(strange[0], known)}"
+        )
     units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
     for name, size in theta.items():
         effect = known[name]
         if units.get(name, effect.unit) != effect.unit:
-            raise DiagnoseError(f"{path}: {name} in '{units[name]}'; the {of}'s {name} is in '{effect.unit}': of another model")
+            raise DiagnoseError(
+                f"{path}: {name} in '{units[name]}'; the {of}'s {name} is in '{effect.unit}': of"
+                " another model"
+            )
         low, high = effect.bounds
         if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
-            raise DiagnoseError(f"{path}: {name} = {size:.4g} {effect.unit}; the {of} has it from {low:g} to {high:g}")
+            raise DiagnoseError(
+                f"{path}: {name} = {size:.4g} {effect.unit}; the {of} has it from {low:g} to"
+                f" {high:g}"
+            )

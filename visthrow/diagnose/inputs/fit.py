@@ -1,7 +1,8 @@
-"""First values of one's own vehicle or motor from standalone flights or tests: all chosen effects at once, with covariance.
+"""First values of one's own vehicle or motor from standalone flights or tests: all chosen effects
+at once, with covariance.
 
-Where a diagnosis asks which cause is there, a fit takes for granted that all chosen ones are: their slabs are the only prior.
-"""
+Where a diagnosis asks which cause is there, a fit takes for granted that all chosen ones are: their
+slabs are the only prior."""
 
 import dataclasses
 import hashlib
@@ -22,13 +23,25 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_FREE = {
-    "flyer": ("thrust_gain", "thrust_curve", "rotor_drag_xy", "rotor_drag_z", "cmd_delay", "frame_tilt_x", "frame_tilt_y"),
+    "flyer": (
+        "thrust_gain",
+        "thrust_curve",
+        "rotor_drag_xy",
+        "rotor_drag_z",
+        "cmd_delay",
+        "frame_tilt_x",
+        "frame_tilt_y",
+    ),
     "stand": ("thrust_gain", "thrust_linear", "load_cell_zero", "power_gain", "idle_power"),
     "trim": ("motor_fl", "motor_fr", "motor_rl", "motor_rr"),
 }
-"""Model -> effects that are fitted where none are named; what cannot be told from the logs keeps its prior."""
+"""Model -> effects that are fitted where none are named; what cannot be told from the logs keeps
+its prior.
+"""
 ROUNDS = 4
-UNKNOWN_SHARE = 0.5  # an effect whose deviation is still this share of its prior was not told by the logs
+UNKNOWN_SHARE = (
+    0.5  # an effect whose deviation is still this share of its prior was not told by the logs
+)
 
 
 @dataclass(frozen=True)
@@ -76,40 +89,76 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     posterior = np.linalg.inv(point.information[np.ix_(at, at)] + np.diag(slab**-2.0))
     floors = problem.priors.floor[at]
     sizes = point.theta[at] * floors
-    identified = tuple(bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab))
+    identified = tuple(
+        bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab)
+    )
     after = model.residuals(problem.sizes(point.theta))
     units = tuple(model.effects[i].unit for i in at)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
-    channel, seen = np.concatenate([w.channel for w in before]), ([w.residual for w in before], after)
-    rms = [{name: float(np.sqrt(np.mean(value[channel == i] ** 2))) for i, name in enumerate(model.channels) if np.any(channel == i)}
-           for value in map(np.concatenate, seen)]  # fmt: skip
-    return Fitted(tuple(free), units, sizes, covariance, identified, *rms, middle_speed=getattr(model, "middle", 0.0))
+    channel, seen = (
+        np.concatenate([w.channel for w in before]),
+        (
+            [w.residual for w in before],
+            after,
+        ),
+    )
+    rms = [
+        {
+            name: float(np.sqrt(np.mean(value[channel == i] ** 2)))
+            for i, name in enumerate(model.channels)
+            if np.any(channel == i)
+        }
+        for value in map(np.concatenate, seen)
+    ]
+    return Fitted(
+        tuple(free),
+        units,
+        sizes,
+        covariance,
+        identified,
+        *rms,
+        middle_speed=getattr(model, "middle", 0.0),
+    )
 
 
 def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParams:
     """A simulated vehicle with what was found; everything else as in ``base``.
 
-    A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest thrust follows the map.
-    ``base``: vehicle that lends all other numbers. Raises DiagnoseError: the setup's model is of no vehicle.
-    """
+    A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest
+    thrust follows the map. ``base``: vehicle that lends all other numbers. Raises DiagnoseError:
+    the setup's model is of no vehicle."""
     size = defaultdict(float, zip(found.names, map(float, found.theta)))
     if setup.flyer is not None:
         return _of_flyer(setup.flyer, size, base)
     if setup.stand is not None:
         return _of_stand(setup.stand, size, found.middle_speed, base)
-    raise DiagnoseError(f"'{setup.about}' is no vehicle and no motor; a vehicle is fitted by a setup with [flyer] or [stand]")
+    raise DiagnoseError(
+        f"'{setup.about}' is no vehicle and no motor; a vehicle is fitted by a setup with [flyer]"
+        " or [stand]"
+    )
 
 
 def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
     gain, curve = 1.0 + size["thrust_gain"], size["thrust_curve"]
     mass = p.mass + size["mass_quad"]
-    motor = dataclasses.replace(base.motor, kind="first_order", time_constant=max(p.motor_time_constant + size["motor_tau"], 1e-3))
+    motor = dataclasses.replace(
+        base.motor,
+        kind="first_order",
+        time_constant=max(p.motor_time_constant + size["motor_tau"], 1e-3),
+    )
     aero = dataclasses.replace(
-        base.aero, kind="rotor_drag", drag_x=p.drag_xy + size["rotor_drag_xy"], drag_y=p.drag_xy + size["rotor_drag_xy"],
-        drag_z=p.drag_z + size["rotor_drag_z"], parasitic=max(size["parasitic"], 0.0), translational_lift=size["translational_lift"],
-    )  # fmt: skip
+        base.aero,
+        kind="rotor_drag",
+        drag_x=p.drag_xy + size["rotor_drag_xy"],
+        drag_y=p.drag_xy + size["rotor_drag_xy"],
+        drag_z=p.drag_z + size["rotor_drag_z"],
+        parasitic=max(size["parasitic"], 0.0),
+        translational_lift=size["translational_lift"],
+    )
     battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
-    thrust = dataclasses.replace(base.thrust, voltage_coefficient=p.voltage_coefficient + size["battery_sag"])
+    thrust = dataclasses.replace(
+        base.thrust, voltage_coefficient=p.voltage_coefficient + size["battery_sag"]
+    )
     controller = base.controller
     hover = mass * p.gravity / 4.0
     if p.input == "motor_speed":
@@ -122,21 +171,39 @@ def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> Vehicle
     else:
         thrust = dataclasses.replace(thrust, gain=tuple(gain * own for own in thrust.gain))
     return dataclasses.replace(
-        base, body=dataclasses.replace(base.body, mass=mass), motor=motor, aero=aero, battery=battery, thrust=thrust,
-        controller=controller, queue=dataclasses.replace(base.queue, delay=max(p.command_delay + size["cmd_delay"], 0.0)),
-    )  # fmt: skip
+        base,
+        body=dataclasses.replace(base.body, mass=mass),
+        motor=motor,
+        aero=aero,
+        battery=battery,
+        thrust=thrust,
+        controller=controller,
+        queue=dataclasses.replace(base.queue, delay=max(p.command_delay + size["cmd_delay"], 0.0)),
+    )
 
 
-def _of_stand(p: Any, size: Mapping[str, float], middle: float, base: VehicleParams) -> VehicleParams:
+def _of_stand(
+    p: Any, size: Mapping[str, float], middle: float, base: VehicleParams
+) -> VehicleParams:
     k_f = p.k_f * (1.0 + size["thrust_gain"])
     k_1 = p.k_f * size["thrust_linear"] * middle
-    thrust = dataclasses.replace(base.thrust, k_f=k_f, k_1=k_1, voltage_coefficient=size["thrust_voltage"])
+    thrust = dataclasses.replace(
+        base.thrust, k_f=k_f, k_1=k_1, voltage_coefficient=size["thrust_voltage"]
+    )
     battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
     return dataclasses.replace(base, thrust=thrust, battery=battery)
 
 
-def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequence[FlightLog], base: VehicleParams) -> list[Path]:
-    """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance and provenance.
+def write(
+    folder: str | Path,
+    name: str,
+    setup: Setup,
+    found: Fitted,
+    logs: Sequence[FlightLog],
+    base: VehicleParams,
+) -> list[Path]:
+    """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance
+    and provenance.
 
     Returns their paths. Raises StorageError: the folder cannot be written.
     """
@@ -145,10 +212,16 @@ def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequ
     folder = Path(folder)
     sources = {str(log.meta.get("source", "")): _digest(log) for log in logs}
     record = {
-        "setup": name, "effects": list(found.names), "units": list(found.units), "theta": found.theta.tolist(),
-        "covariance": found.covariance.tolist(), "told_by_logs": list(found.identified), "rms_before": dict(found.rms_before),
-        "rms_after": dict(found.rms_after), "logs": sources,
-    }  # fmt: skip
+        "setup": name,
+        "effects": list(found.names),
+        "units": list(found.units),
+        "theta": found.theta.tolist(),
+        "covariance": found.covariance.tolist(),
+        "told_by_logs": list(found.identified),
+        "rms_before": dict(found.rms_before),
+        "rms_after": dict(found.rms_after),
+        "logs": sources,
+    }
     write_json(folder / "fit.json", record)
     if setup.flyer is None and setup.stand is None:
         return [folder / "fit.json"]
@@ -158,12 +231,20 @@ def write(folder: str | Path, name: str, setup: Setup, found: Fitted, logs: Sequ
 
 
 def _head(name: str, found: Fitted, sources: Mapping[str, str]) -> str:
-    lines = [f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance also in fit.json."]
+    lines = [
+        f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance"
+        " also in fit.json."
+    ]
     for i, (effect, unit) in enumerate(zip(found.names, found.units)):
         low, high = found.interval(i)
         note = "" if found.identified[i] else " (the prior: these logs do not tell)"
-        lines.append(f"# {effect} = {found.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}")
-    lines.append(f"# covariance, row by row: {json.dumps([[float(f'{x:.4g}') for x in row] for row in found.covariance])}")
+        lines.append(
+            f"# {effect} = {found.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}"
+        )
+    lines.append(
+        "# covariance, row by row:"
+        f" {json.dumps([[float(f'{x:.4g}') for x in row] for row in found.covariance])}"
+    )
     lines += [f"# log {Path(source).name}: {digest}" for source, digest in sources.items()]
     return "\n".join(lines) + "\n\n"
 
@@ -173,5 +254,7 @@ def _digest(log: FlightLog) -> str:
     digest = hashlib.sha256()
     for name in sorted(log.channels):
         channel = log[name]
-        digest.update(name.encode() + channel.time.tobytes() + np.ascontiguousarray(channel.values).tobytes())
+        digest.update(
+            name.encode() + channel.time.tobytes() + np.ascontiguousarray(channel.values).tobytes()
+        )
     return digest.hexdigest()[:16]

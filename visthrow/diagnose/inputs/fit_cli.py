@@ -1,4 +1,6 @@
-"""``visthrow diagnose fit``: the first configuration of one's own vehicle or motor, from standalone flights or tests."""
+"""``visthrow diagnose fit``: the first configuration of one's own vehicle or motor, from standalone
+flights or tests.
+"""
 
 import argparse
 
@@ -8,17 +10,35 @@ from visthrow.common.arguments import add_out
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow diagnose fit hover.csv circle.csv --config mine.toml --out runs/fit     a vehicle without payload\n"
-        "  visthrow diagnose fit stand.csv:a1_* --config motor_stand                          a motor with one propeller\n"
-        "  visthrow config vehicle runs/fit/vehicle.toml                                    what came of it\n"
+        "examples:\n  visthrow diagnose fit hover.csv circle.csv --config mine.toml --out runs/fit "
+        "    a vehicle without payload\n  visthrow diagnose fit stand.csv:a1_* --config motor_stand"
+        "                          a motor with one propeller\n  visthrow config vehicle"
+        " runs/fit/vehicle.toml                                    what came of it\n"
     )
     parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
-    parser.add_argument("--config", required=True, metavar="NAME", help="of configs/diagnose, or a file; with a model in it")
-    parser.add_argument("--free", nargs="+", default=[], metavar="EFFECT", help="what is fitted (default: by the model)")
-    parser.add_argument("--vehicle", default="paper", metavar="NAME", help="lends all that is not fitted (default: paper)")
+    parser.add_argument(
+        "--config",
+        required=True,
+        metavar="NAME",
+        help="of configs/diagnose, or a file; with a model in it",
+    )
+    parser.add_argument(
+        "--free",
+        nargs="+",
+        default=[],
+        metavar="EFFECT",
+        help="what is fitted (default: by the model)",
+    )
+    parser.add_argument(
+        "--vehicle",
+        default="paper",
+        metavar="NAME",
+        help="lends all that is not fitted (default: paper)",
+    )
     add_out(parser, "out/fit", "for vehicle.toml and fit.json")
-    parser.add_argument("--json", metavar="FILE", help="write the printed figures to this file as well")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the printed figures to this file as well"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
             if row.verdict == "bad":
                 print(f"{checked.name}: {row.topic} {row.channel}: {row.text}")
     model = setups.model_of(setup, logs)
-    free = args.free or [n for n in fitting.DEFAULT_FREE.get(setup.model, ()) if n in {e.name for e in model.effects}]
+    free = args.free or [
+        n for n in fitting.DEFAULT_FREE.get(setup.model, ()) if n in {e.name for e in model.effects}
+    ]
     found = fitting.fit(model, free)
     for i, name in enumerate(found.names):
         low, high = found.interval(i)
@@ -49,5 +71,8 @@ def run(args: argparse.Namespace) -> int:
     for path in fitting.write(args.out, args.config, setup, found, logs, base):
         print(path)
     if args.json:
-        write_json(args.json, {"effects": list(found.names), "theta": found.theta, "covariance": found.covariance})
+        write_json(
+            args.json,
+            {"effects": list(found.names), "theta": found.theta, "covariance": found.covariance},
+        )
     return 0

@@ -1,4 +1,6 @@
-"""``visthrow diagnose map``: a proposed mapping of a foreign table's columns, as TOML, with what it could not know as questions."""
+"""``visthrow diagnose map``: a proposed mapping of a foreign table's columns, as TOML, with what it
+could not know as questions.
+"""
 
 import argparse
 import json
@@ -11,13 +13,17 @@ from visthrow.common.errors import LogError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
     parser.epilog = (
-        "examples:\n"
-        "  visthrow diagnose map flight.csv                    print the proposal\n"
-        "  visthrow diagnose map flight.csv --out mine.toml    write it; answer its questions, then\n"
-        "  visthrow diagnose check flight.csv --config mine.toml\n"
+        "examples:\n  visthrow diagnose map flight.csv                    print the proposal\n "
+        " visthrow diagnose map flight.csv --out mine.toml    write it; answer its questions,"
+        " then\n  visthrow diagnose check flight.csv --config mine.toml\n"
     )
     parser.add_argument("file", metavar="FILE", help="a table, or a recording of another tool")
-    parser.add_argument("--mass", metavar="KG", type=ABOVE_ZERO, help="of the vehicle alone, from a scale, in kilograms")
+    parser.add_argument(
+        "--mass",
+        metavar="KG",
+        type=ABOVE_ZERO,
+        help="of the vehicle alone, from a scale, in kilograms",
+    )
     parser.add_argument("--out", metavar="FILE", help="write the mapping to this file")
 
 
@@ -46,17 +52,30 @@ def toml_of(found, name: str) -> str:
         return "\n".join(lines) + "\n"
     for title, clock in [("time", found.mapping.time), *(found.mapping.clocks or {}).items()]:
         lines += ["", f"[table.{title}]" if title == "time" else f'[table.clocks."{title}"]']
-        lines += [f'column = "{clock.column}"' if clock.column else f"row_period = {clock.row_period}"]
+        lines += [
+            f'column = "{clock.column}"' if clock.column else f"row_period = {clock.row_period}"
+        ]
         lines += [f'unit = "{clock.unit}"'] if clock.column and clock.unit != "s" else []
     for entry in found.mapping.channels:
         listed = ", ".join(f'"{column}"' for column in entry.columns)
         lines += ["", "[[table.channels]]", f'name = "{entry.name}"  # {found.why[entry.name]}']
         lines += [f"columns = [{listed}]", f'unit = "{entry.unit}"']
         lines += [f'kind = "{entry.kind}"'] if entry.kind != "vector" else []
-        lines += [f'{key} = "{value}"' for key in ("axes", "body_axes", "frame", "clock") if (value := getattr(entry, key))]
+        lines += [
+            f'{key} = "{value}"'
+            for key in ("axes", "body_axes", "frame", "clock")
+            if (value := getattr(entry, key))
+        ]
         lines += ['order = "wxyz"'] if entry.order != "xyzw" else []
         lines += ["held = true"] if entry.held else []
-    for title, table in (("flyer", found.flyer or {}), ("flyer.cable", (found.flyer or {}).get("cable", {}))):
+    for title, table in (
+        ("flyer", found.flyer or {}),
+        ("flyer.cable", (found.flyer or {}).get("cable", {})),
+    ):
         lines += ["", f"[{title}]"] if table else []
-        lines += [f"{key} = {json.dumps(value)}" for key, value in table.items() if not isinstance(value, dict)]
+        lines += [
+            f"{key} = {json.dumps(value)}"
+            for key, value in table.items()
+            if not isinstance(value, dict)
+        ]
     return "\n".join(lines) + "\n"

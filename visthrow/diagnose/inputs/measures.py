@@ -1,4 +1,6 @@
-"""What a scale, a tape or a barometer settles that no flight does: measured values narrow the catalogue."""
+"""What a scale, a tape or a barometer settles that no flight does: measured values narrow the
+catalogue.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +24,9 @@ class Measurement:
 
 
 MEASUREMENTS = (
-    Measurement("weigh the vehicle", "mass_quad", 3e-4, 60.0),  # kitchen scale of 0.1 g, read thrice
+    Measurement(
+        "weigh the vehicle", "mass_quad", 3e-4, 60.0
+    ),  # kitchen scale of 0.1 g, read thrice
     Measurement("weigh the payload", "mass_payload", 2e-4, 60.0),  # the same
     Measurement("weigh the rope", "rope_mass", 1e-4, 120.0),  # the same, taken off its mount
     Measurement("tape the rope", "rope_length", 1e-3, 60.0),  # steel tape, to the payload's centre
@@ -35,16 +39,25 @@ MEASUREMENTS = (
 def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:
     """The catalogue where some configured values were measured.
 
-    ``measured``: effect -> deviation of the measurement that the configuration's value comes from, in its unit.
+    ``measured``: effect -> deviation of the measurement that the configuration's value comes from,
+    in its unit.
     Raises DiagnoseError: no effect of that name, or a deviation that is not above 0.
     """
-    expect_known(measured, [e.name for e in effects], "no effect '{}' that could have been measured", DiagnoseError)
+    expect_known(
+        measured,
+        [e.name for e in effects],
+        "no effect '{}' that could have been measured",
+        DiagnoseError,
+    )
     for name, sd in measured.items():
         if not sd > 0.0:
             raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected one above 0")
     own = [(e, measured.get(e.name, np.inf)) for e in effects]
     within = [(max(e.bounds[0], -WITHIN * sd), min(e.bounds[1], WITHIN * sd)) for e, sd in own]
-    return tuple(replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd)) for (e, sd), bounds in zip(own, within))
+    return tuple(
+        replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd))
+        for (e, sd), bounds in zip(own, within)
+    )
 
 
 def parsed(items: Sequence[str]) -> dict[str, float]:
@@ -55,5 +68,7 @@ def parsed(items: Sequence[str]) -> dict[str, float]:
         try:
             out[name.strip()] = float(sd)
         except ValueError as error:
-            raise DiagnoseError(f"--measured {item}; expected NAME=DEVIATION, such as mass_quad=0.0003") from error
+            raise DiagnoseError(
+                f"--measured {item}; expected NAME=DEVIATION, such as mass_quad=0.0003"
+            ) from error
     return out

@@ -18,26 +18,50 @@ THROW = "throw"  # name of the model that is no setup's own: the whole throw
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that explain, plan and blind share."""
     parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
-    parser.add_argument("--config", metavar="NAME", help="of configs/diagnose, or a file: how tables are read, and which model")
     parser.add_argument(
-        "--plant", metavar="NAME", default=DEFAULT_PLANT,
-        help=f"of configs/train, or a file: vehicle, rope and release of the model that is diagnosed (default: {DEFAULT_PLANT})",
-    )  # fmt: skip
-    parser.add_argument("--only", metavar="NAMES", help="consider these effects alone, separated by commas")
+        "--config",
+        metavar="NAME",
+        help="of configs/diagnose, or a file: how tables are read, and which model",
+    )
     parser.add_argument(
-        "--measured", metavar="NAME=SD", action="append", default=[],
-        help="the configured value behind this effect was measured with this deviation, such as mass_quad=0.0003 from a scale",
-    )  # fmt: skip
-    parser.add_argument("--without", metavar="FLIGHTS", default="", help="numbers of flights to leave out, from 0, by commas")
-    parser.add_argument("--seed", type=WHOLE, default=0, help="of the null worlds and bootstraps (default: 0)")
+        "--plant",
+        metavar="NAME",
+        default=DEFAULT_PLANT,
+        help=(
+            "of configs/train, or a file: vehicle, rope and release of the model that is diagnosed"
+            f" (default: {DEFAULT_PLANT})"
+        ),
+    )
+    parser.add_argument(
+        "--only", metavar="NAMES", help="consider these effects alone, separated by commas"
+    )
+    parser.add_argument(
+        "--measured",
+        metavar="NAME=SD",
+        action="append",
+        default=[],
+        help=(
+            "the configured value behind this effect was measured with this deviation, such as"
+            " mass_quad=0.0003 from a scale"
+        ),
+    )
+    parser.add_argument(
+        "--without",
+        metavar="FLIGHTS",
+        default="",
+        help="numbers of flights to leave out, from 0, by commas",
+    )
+    parser.add_argument(
+        "--seed", type=WHOLE, default=0, help="of the null worlds and bootstraps (default: 0)"
+    )
     add_common(parser)
 
 
 def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     """Read the logs and build the model.
 
-    Raises ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's own model.
-    """
+    Raises ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's
+    own model."""
     from visthrow.diagnose.inputs import measures, setup
 
     logs = setup.read_logs(args.logs, args.config)
@@ -45,7 +69,10 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     if chosen is None or not chosen.model:
         model, logs = throw_model(args, logs)
     elif args.overrides:
-        raise ConfigError(f"--set changes the throw's plant; the setup '{args.config}' has the model {chosen.model}")
+        raise ConfigError(
+            f"--set changes the throw's plant; the setup '{args.config}' has the model"
+            f" {chosen.model}"
+        )
     else:
         model = setup.model_of(chosen, logs)
         if args.only is not None:
@@ -53,21 +80,35 @@ def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     if args.measured:
         model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
     # day of each flight, from 0: what its log says, else those of one folder are of one
-    names = [str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs]
+    names = [
+        str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs
+    ]
     model.days = tuple(map(list(dict.fromkeys(names)).index, names))
     return model, logs
 
 
 def made_with(args: argparse.Namespace) -> dict[str, Any]:
-    """Entries of a diagnosis' JSON that say what was diagnosed: ``apply`` builds on nothing else."""
+    """Entries of a diagnosis' JSON that say what was diagnosed:
+
+    ``apply`` builds on nothing else.
+    """
     from visthrow.diagnose.inputs import setup
 
     own = setup.load(args.config).model if args.config else ""
-    return {"model": own or THROW, "plant": args.plant, "config": args.config, "overrides": args.overrides}
+    return {
+        "model": own or THROW,
+        "plant": args.plant,
+        "config": args.config,
+        "overrides": args.overrides,
+    }
 
 
-def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Model, list[FlightLog]]:
-    """The whole throw, with the plant of an experiment, and its logs with their commands put right."""
+def throw_model(
+    args: argparse.Namespace, logs: Sequence[FlightLog]
+) -> tuple[Model, list[FlightLog]]:
+    """The whole throw, with the plant of an experiment, and its logs with their
+    commands put right.
+    """
     from visthrow import config
     from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.search import put_right
@@ -78,18 +119,29 @@ def throw_model(args: argparse.Namespace, logs: Sequence[FlightLog]) -> tuple[Mo
     threads.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only is not None else None
-    known = {"sensing": experiment.sensing, "camera": experiment.camera, "device": resolve(args.device)}
+    known = {
+        "sensing": experiment.sensing,
+        "camera": experiment.camera,
+        "device": resolve(args.device),
+    }
     known |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)
-    return put_right([log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **known))
+    return put_right(
+        [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **known)
+    )
 
 
 def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:
-    """Flights named on the command line. Raises DiagnoseError: no numbers between commas, no such flight, or all of them."""
+    """Flights named on the command line.
+
+    Raises DiagnoseError: no numbers between commas, no such flight, or all of them.
+    """
     try:
         found = tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:
-        raise DiagnoseError(f"--without {text}; expected numbers of flights between commas, such as 0,3") from error
+        raise DiagnoseError(
+            f"--without {text}; expected numbers of flights between commas, such as 0,3"
+        ) from error
     listed = ", ".join(f"{i} ({label(log, i)})" for i, log in enumerate(logs))
     for number in found:
         if not 0 <= number < len(logs):

@@ -12,7 +12,17 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.view.parts import png_of
 
 MOST = 10  # channels in a picture
-_FIRST = ("pos_w", "vel_w", "quat_wb", "rate_b", "acc_b", "payload_pos_w", "command", "motor_command", "battery_voltage")
+_FIRST = (
+    "pos_w",
+    "vel_w",
+    "quat_wb",
+    "rate_b",
+    "acc_b",
+    "payload_pos_w",
+    "command",
+    "motor_command",
+    "battery_voltage",
+)
 _POINTS = 4000
 _SHADE = {"ok": style.COLOURS[2], "warn": style.COLOURS[4], "bad": style.COLOURS[1]}
 
@@ -22,13 +32,25 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     style.use()
     import matplotlib.pyplot as plt
 
-    names = [name for name in _FIRST if name in log] + [name for name in log.channels if name not in _FIRST]
+    names = [name for name in _FIRST if name in log] + [
+        name for name in log.channels if name not in _FIRST
+    ]
     names = [name for name in names if len(log[name].time) > 1][:MOST]
-    figure, axes = plt.subplots(max(len(names), 1), 1, figsize=(9, 1.1 + 1.25 * max(len(names), 1)), sharex=True, squeeze=False)
+    figure, axes = plt.subplots(
+        max(len(names), 1),
+        1,
+        figsize=(9, 1.1 + 1.25 * max(len(names), 1)),
+        sharex=True,
+        squeeze=False,
+    )
     for axis, name in zip(axes[:, 0], names):
         _channel(axis, log, name)
-        verdict = worst([row for row in checked.rows if name in row.channel.replace(",", " ").split()])
-        axis.set_ylabel(f"{name}\n[{log[name].unit}]", rotation=0, ha="right", va="center", fontsize=8)
+        verdict = worst(
+            [row for row in checked.rows if name in row.channel.replace(",", " ").split()]
+        )
+        axis.set_ylabel(
+            f"{name}\n[{log[name].unit}]", rotation=0, ha="right", va="center", fontsize=8
+        )
         axis.spines["left"].set_color(_SHADE[verdict])
         axis.spines["left"].set_linewidth(4)
     axes[-1, 0].set_xlabel("time [s]")

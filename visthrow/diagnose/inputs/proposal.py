@@ -1,9 +1,10 @@
-"""Proposal of a mapping: what the columns of a foreign table are, by their names, their values and physics.
+"""Proposal of a mapping: what the columns of a foreign table are, by their names, their values and
+physics.
 
-Names say which columns belong together and hint at what they are; values say the units (a quaternion has length 1, a resting
-accelerometer 9.81 m/s^2 or 1 g); physics decides: a velocity is the derivative of a position, rates are those of the attitude, a
-payload keeps its distance. What none of them tells becomes a question.
-"""
+Names say which columns belong together and hint at what they are; values say the units (a
+quaternion has length 1, a resting accelerometer 9.81 m/s^2 or 1 g); physics decides: a velocity is
+the derivative of a position, rates are those of the attitude, a payload keeps its distance. What
+none of them tells becomes a question."""
 
 import re
 from dataclasses import dataclass, field, replace
@@ -21,21 +22,39 @@ from visthrow.logs.units import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
 _TIME = re.compile(
-    r"(^|[._/: ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)", re.IGNORECASE
+    r"(^|[._/: ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)",
+    re.IGNORECASE,
 )
 _SUFFIX = {
-    **{unit: unit for unit in ("s", "ms", "us", "ns", "mm", "cm", "m", "deg", "rad", "g", "gf", "rpm")},
-    "sec": "s", "mv": "mV", "v": "V", "n": "N", "dps": "deg/s", "a": "A", "ma": "mA",
-}  # fmt: skip
-_TARGET = re.compile(r"target|setpoint|(^|[._])sp[._]|desired|des([._]|$)|ref|cmd|rpyd|omegar|goal|^sp_|residual", re.IGNORECASE)
+    **{
+        unit: unit
+        for unit in ("s", "ms", "us", "ns", "mm", "cm", "m", "deg", "rad", "g", "gf", "rpm")
+    },
+    "sec": "s",
+    "mv": "mV",
+    "v": "V",
+    "n": "N",
+    "dps": "deg/s",
+    "a": "A",
+    "ma": "mA",
+}
+_TARGET = re.compile(
+    r"target|setpoint|(^|[._])sp[._]|desired|des([._]|$)|ref|cmd|rpyd|omegar|goal|^sp_|residual",
+    re.IGNORECASE,
+)
 _NOT_VEHICLE = re.compile(r"payload|load|ball|(^|[._])l_|cam|object|tag|marker", re.IGNORECASE)
 _ESTIMATE = re.compile(r"est|ekf|kalman", re.IGNORECASE)
 _CAPTURE = re.compile(r"loc|mocap|vicon|opti|qualisys", re.IGNORECASE)
 _HINTS = (
-    ("acc_b", r"acc|imu.*a[xyz]?$"), ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$"),
-    ("velocity", r"vel|(^|[._])v$|speed"), ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
-    ("position", r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$"),
-)  # fmt: skip
+    ("acc_b", r"acc|imu.*a[xyz]?$"),
+    ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$"),
+    ("velocity", r"vel|(^|[._])v$|speed"),
+    ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
+    (
+        "position",
+        r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$",
+    ),
+)
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
 _TURN = 7.0  # above a full turn in radians: degrees
 
@@ -55,7 +74,10 @@ class Proposal:
     """A mapping, why, and what is left to ask."""
 
     mapping: TableMap | None
-    flyer: dict | None = None  # parameters of the flying model as far as the log tells them, None where it cannot fly one
+    flyer: dict | None = (
+        # parameters of the flying model as far as the log tells them, None where it cannot fly one
+        None
+    )
     why: dict[str, str] = field(default_factory=dict)  # by channel
     questions: list[str] = field(default_factory=list)
 
@@ -66,7 +88,9 @@ def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
     ``source``: what messages call it; ``mass``: of the vehicle alone [kg], where it was weighed.
     Raises LogError: no column holds numbers that change.
     """
-    numbers = {name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"}
+    numbers = {
+        name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"
+    }
     numbers = {name: np.where(np.isfinite(cells), cells, np.nan) for name, cells in numbers.items()}
     if not any(_moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
@@ -75,21 +99,34 @@ def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
         if len(next(iter(part.values()))) < 50:
             continue
         clock, time = _clock(part, found)
-        columns = {name: cells for name, cells in part.items() if name != clock.column and len(cells) == len(time)}
+        columns = {
+            name: cells
+            for name, cells in part.items()
+            if name != clock.column and len(cells) == len(time)
+        }
         mine = _Chooser(time, _groups(columns), found).channels()
         for entry in mine:
             if entry.name in channels:
-                found.questions.append(f"'{entry.name}' is also {', '.join(entry.columns)}: which one?")
+                found.questions.append(
+                    f"'{entry.name}' is also {', '.join(entry.columns)}: which one?"
+                )
             else:
                 channels[entry.name] = replace(entry, clock=topic)
         if mine:
             clocks[topic] = clock
     if not channels:
-        found.questions.append("no column looks like a position, an attitude, rates, forces or motors: which columns are they?")
+        found.questions.append(
+            "no column looks like a position, an attitude, rates, forces or motors: which columns"
+            " are they?"
+        )
         return found
     first, *others = clocks
-    entries = tuple(replace(c, clock="" if c.clock == first else c.clock) for c in channels.values())
-    found.mapping = TableMap(clocks[first], entries, {name: clocks[name] for name in others} or None)
+    entries = tuple(
+        replace(c, clock="" if c.clock == first else c.clock) for c in channels.values()
+    )
+    found.mapping = TableMap(
+        clocks[first], entries, {name: clocks[name] for name in others} or None
+    )
     _corrected(table, source, found, mass)
     return found
 
@@ -109,7 +146,10 @@ def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
     name = next(iter(named or rising), None)
     if name is None:
         count = max(map(len, numbers.values()))
-        found.questions.append("no column rises as a clock does: how far are the rows apart? row_period = 0.01 [s] is a guess")
+        found.questions.append(
+            "no column rises as a clock does: how far are the rows apart? row_period = 0.01 [s] is"
+            " a guess"
+        )
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
     step = float(np.nanmedian(np.diff(numbers[name])))
     suffix = _SUFFIX.get(_words(name)[-1], "")
@@ -119,7 +159,10 @@ def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
     fitting = [unit for unit in ("s", "ms", "us", "ns") if 2e-4 <= step * UNITS[unit][1] <= 0.25]
     unit = suffix if suffix in UNITS and UNITS[suffix][0] == "s" else fitting[0] if fitting else "s"
     if not suffix and len(fitting) != 1:
-        found.questions.append(f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'}; '{unit}' is a guess")
+        found.questions.append(
+            f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'};"
+            f" '{unit}' is a guess"
+        )
     if not named:
         found.questions.append(f"is '{name}', the first column that rises, the time?")
     found.why["time"] = f"rises by {step:g} a row, {1.0 / (step * UNITS[unit][1]):.4g} Hz"
@@ -139,21 +182,41 @@ def _rises(cells: np.ndarray) -> bool:
 
 def _words(name: str) -> list[str]:
     last = re.split(r"[^A-Za-z0-9]+", name.rstrip(")]} "))[-1].lower()
-    return [last] if last in _SUFFIX else [word.lower() for word in _SPLIT.split(name) if word] or [last]
+    return (
+        [last]
+        if last in _SUFFIX
+        else [word.lower() for word in _SPLIT.split(name) if word] or [last]
+    )
 
 
-_ENDINGS = {**{letter: letter for letter in "xyzw"}, "north": "x", "east": "y", "down": "z", "roll": "x", "pitch": "y", "yaw": "z",
-            "0": "x", "1": "y", "2": "z", "3": "w"}  # fmt: skip
+_ENDINGS = {
+    **{letter: letter for letter in "xyzw"},
+    "north": "x",
+    "east": "y",
+    "down": "z",
+    "roll": "x",
+    "pitch": "y",
+    "yaw": "z",
+    "0": "x",
+    "1": "y",
+    "2": "z",
+    "3": "w",
+}
 _COMPONENT = re.compile(
     r"^(.*?)[._\[ (]*(roll|pitch|yaw|north|east|down|[xyzw]|[0-3])[\])]?"
     r"(?:[._ \[(]+(mm|cm|m|deg|rad|dps|g|mg|mps|body|world|vicon|mocap|si)[\])]?)?$",
     re.IGNORECASE,
 )
-_MOTOR = re.compile(r"^(.*?)(?:motor|pwm|rotor|rpm|m|esc|erpm|output|servo)[._\[]?(\d)\]?([._][a-z]+)?$", re.IGNORECASE)
+_MOTOR = re.compile(
+    r"^(.*?)(?:motor|pwm|rotor|rpm|m|esc|erpm|output|servo)[._\[]?(\d)\]?([._][a-z]+)?$",
+    re.IGNORECASE,
+)
 
 
 def _groups(numbers: Table) -> list[Group]:
-    """Columns in threes (x, y, z or roll, pitch, yaw) and fours (a quaternion's, motors'), then single ones."""
+    """Columns in threes (x, y, z or roll, pitch, yaw) and fours (a quaternion's, motors'), then
+    single ones.
+    """
     parts: dict[tuple[str, str], dict[str, str]] = {}
     motors: dict[str, list[str]] = {}
     for name in numbers:
@@ -162,21 +225,35 @@ def _groups(numbers: Table) -> list[Group]:
             motors.setdefault(motor[1] + (motor[3] or ""), []).append(name)
         if match:
             angle = "rpy" if match[2].lower() in ("roll", "pitch", "yaw") else ""
-            parts.setdefault((match[1] + angle, (match[3] or "").lower()), {}).setdefault(_ENDINGS[match[2].lower()], name)
+            parts.setdefault((match[1] + angle, (match[3] or "").lower()), {}).setdefault(
+                _ENDINGS[match[2].lower()], name
+            )
     groups, used = [], set()
     for names in motors.values():
         if len(names) == 4:
-            groups.append(Group("motor", tuple(names), np.column_stack([numbers[n] for n in names])))
+            groups.append(
+                Group("motor", tuple(names), np.column_stack([numbers[n] for n in names]))
+            )
             used |= set(names)
     for (stem, unit), of in parts.items():
         for letters in ("xyzw", "xyz"):
             columns = tuple(of[letter] for letter in letters if letter in of)
             if len(columns) == len(letters) and not used & set(columns):
-                groups.append(Group(stem, columns, np.column_stack([numbers[n] for n in columns]), _SUFFIX.get(unit, "")))
+                groups.append(
+                    Group(
+                        stem,
+                        columns,
+                        np.column_stack([numbers[n] for n in columns]),
+                        _SUFFIX.get(unit, ""),
+                    )
+                )
                 used |= set(columns)
                 break
     singles = [name for name in numbers if name not in used]
-    return groups + [Group(name, (name,), numbers[name][:, None], _SUFFIX.get(_words(name)[-1], "")) for name in singles]
+    return groups + [
+        Group(name, (name,), numbers[name][:, None], _SUFFIX.get(_words(name)[-1], ""))
+        for name in singles
+    ]
 
 
 class _Chooser:
@@ -186,9 +263,13 @@ class _Chooser:
         self.time, self.found = time, found
         self.groups = [g for g in groups if _moves(g.values)]
         self.taken: set[int] = set()
-        self.attitudes: dict[str, Channel] = {}  # the vehicle's, by the units that its angles may be in
+        self.attitudes: dict[
+            str, Channel
+        ] = {}  # the vehicle's, by the units that its angles may be in
         self.made: dict[str, tuple[ChannelMap, Channel]] = {}
-        self.by: dict[tuple[str, ...], str] = {}  # what says the unit of a path that no name says, by its columns
+        self.by: dict[
+            tuple[str, ...], str
+        ] = {}  # what says the unit of a path that no name says, by its columns
 
     def channels(self) -> list[ChannelMap]:
         """All that are recognised, the vehicle's path first."""
@@ -203,24 +284,43 @@ class _Chooser:
         self._rates()
         self._forces()
         self._inputs()
-        if "pos_w" in self.made and not self.made.keys() & {"quat_wb", "rate_b", "acc_b", "motor_command", "vel_w"}:
-            self.found.questions.append("nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w")
+        if "pos_w" in self.made and not self.made.keys() & {
+            "quat_wb",
+            "rate_b",
+            "acc_b",
+            "motor_command",
+            "vel_w",
+        }:
+            self.found.questions.append(
+                "nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w"
+            )
         for group in self._open(1):
             values = np.unique(group.values[np.isfinite(group.values)])
             whole = 1 < len(values) <= 64 and np.all(values == np.round(values))
             if whole and re.search(r"ball|track|body|id$|test|run|flight", group.stem):
                 ask = f'[table.split] column = "{group.stem}"'
-                self.found.questions.append(f"'{group.stem}' has {len(values)} values: one log for each? {ask}")
+                self.found.questions.append(
+                    f"'{group.stem}' has {len(values)} values: one log for each? {ask}"
+                )
         return [entry for entry, _ in self.made.values()]
 
     def _open(self, size: int) -> list[Group]:
-        return [g for g in self.groups if id(g) not in self.taken and g.values.shape[1] == size and not _TARGET.search(g.stem)]
+        return [
+            g
+            for g in self.groups
+            if id(g) not in self.taken and g.values.shape[1] == size and not _TARGET.search(g.stem)
+        ]
 
     def _take(self, name: str, group: Group, unit: str, why: str, **more: Any) -> None:
-        """Make a channel of a group, unless its units contradict what the name stands for; ``more``: of its :class:`ChannelMap`."""
+        """Make a channel of a group, unless its units contradict what the name stands for;
+        ``more``: of its :class:`ChannelMap`.
+        """
         entry, values = ChannelMap(name, group.columns, unit, **more), group.values
         if np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5:
-            entry, why = replace(entry, held=True), why + "; its values are held between measurements"
+            entry, why = (
+                replace(entry, held=True),
+                why + "; its values are held between measurements",
+            )
         try:
             channel, _ = make_channel(self.time, values, entry, "table")
         except (ConfigError, LogError):
@@ -236,35 +336,85 @@ class _Chooser:
 
     def _quaternions(self) -> None:
         for group in self._open(4):
-            if group.stem == "motor" or not 0.95 < np.nanmedian(np.linalg.norm(group.values, axis=1)) < 1.05:
+            if (
+                group.stem == "motor"
+                or not 0.95 < np.nanmedian(np.linalg.norm(group.values, axis=1)) < 1.05
+            ):
                 continue
             other = _NOT_VEHICLE.search(group.stem)
-            name = ("payload_quat_wb" if "cam" not in group.stem.lower() else "marker_quat_c") if other else "quat_wb"
+            name = (
+                ("payload_quat_wb" if "cam" not in group.stem.lower() else "marker_quat_c")
+                if other
+                else "quat_wb"
+            )
             if name in self.made:
                 name = "est_quat_wb" if name == "quat_wb" and "est" in group.stem.lower() else ""
             if not name:
                 continue
-            order = "xyzw" if group.columns[0] == sorted(group.columns)[1] or group.columns[-1].lower().find("w") >= 0 else "wxyz"
+            order = (
+                "xyzw"
+                if group.columns[0] == sorted(group.columns)[1]
+                or group.columns[-1].lower().find("w") >= 0
+                else "wxyz"
+            )
             frame = "" if name == "quat_wb" else "camera" if name == "marker_quat_c" else "world"
-            self._take(name, group, "1", "four columns of length 1", kind="quaternion", order=order, frame=frame)
+            self._take(
+                name,
+                group,
+                "1",
+                "four columns of length 1",
+                kind="quaternion",
+                order=order,
+                frame=frame,
+            )
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g)]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
         moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
-        groups = [g for g in groups if all(other is g or self._relation(other, g, _FIRMLY) is None for other in moving)]  # no derivatives
+        groups = [
+            g
+            for g in groups
+            if all(other is g or self._relation(other, g, _FIRMLY) is None for other in moving)
+        ]  # no derivatives
         for group in [g for g in groups if "cam" in g.stem.lower()]:
             unit = self._length_unit(group)
             if unit and "marker_pos_c" not in self.made:
-                self._take("marker_pos_c", group, unit, "three columns that move smoothly; their name speaks of a camera", frame="camera")
-        units = {g.columns: self._length_unit(g) for g in sorted(groups, key=lambda g: not g.unit) if "cam" not in g.stem.lower()}
+                self._take(
+                    "marker_pos_c",
+                    group,
+                    unit,
+                    "three columns that move smoothly; their name speaks of a camera",
+                    frame="camera",
+                )
+        units = {
+            g.columns: self._length_unit(g)
+            for g in sorted(groups, key=lambda g: not g.unit)
+            if "cam" not in g.stem.lower()
+        }
         paths = [(g, units[g.columns]) for g in groups if units.get(g.columns)]
         pay = self._payload(paths)
         vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[0]]
         for group, unit in vehicles:
-            usual = "est_pos_w" if _ESTIMATE.search(group.stem) else "mocap_pos_w" if _CAPTURE.search(group.stem) else "pos_w"
-            name = next((n for n in (["pos_w", usual] if len(vehicles) == 1 or usual == "pos_w" or group is vehicles[0][0] else [usual])
-                         if n not in self.made), "")  # fmt: skip
+            usual = (
+                "est_pos_w"
+                if _ESTIMATE.search(group.stem)
+                else "mocap_pos_w"
+                if _CAPTURE.search(group.stem)
+                else "pos_w"
+            )
+            name = next(
+                (
+                    n
+                    for n in (
+                        ["pos_w", usual]
+                        if len(vehicles) == 1 or usual == "pos_w" or group is vehicles[0][0]
+                        else [usual]
+                    )
+                    if n not in self.made
+                ),
+                "",
+            )
             if name:
                 wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
                 why = f"three columns that move smoothly, by {wide:.3g} {unit} (sd)"
@@ -272,29 +422,55 @@ class _Chooser:
                 self._take(name, group, unit, why, frame="" if name == "pos_w" else "world")
         if len(vehicles) > 1:
             listed = "; ".join(", ".join(g.columns) for g, _ in vehicles)
-            self.found.questions.append(f"several positions ({listed}): which is the vehicle's, and by which sensor? The first is taken")
+            self.found.questions.append(
+                f"several positions ({listed}): which is the vehicle's, and by which sensor? The"
+                " first is taken"
+            )
         if pay is not None:
             group, unit, why = pay
-            self._take("payload_pos_w", group, unit, why + (f"; {self.by[group.columns]}" if group.columns in self.by else ""))
+            self._take(
+                "payload_pos_w",
+                group,
+                unit,
+                why + (f"; {self.by[group.columns]}" if group.columns in self.by else ""),
+            )
 
     def _length_unit(self, group: Group) -> str:
-        """Unit of a position: as named, else by physics, else that in which it stays in a hall; "" where it does not move."""
+        """Unit of a position: as named, else by physics, else that in which it stays in a hall; ""
+        where it does not move.
+        """
         named = group.unit if group.unit in unit_evidence.LENGTHS else ""
-        if not np.nanmax(np.ptp(group.values[np.all(np.isfinite(group.values), axis=1)], axis=0), initial=0.0) > 0.0:
+        if (
+            not np.nanmax(
+                np.ptp(group.values[np.all(np.isfinite(group.values), axis=1)], axis=0), initial=0.0
+            )
+            > 0.0
+        ):
             return named
         fit, far = unit_evidence.by_hall(group.values)
-        leans = unit_evidence.by_lean(self.time, group.values, self.attitudes, [named] if named else unit_evidence.LENGTHS)
+        leans = unit_evidence.by_lean(
+            self.time, group.values, self.attitudes, [named] if named else unit_evidence.LENGTHS
+        )
         if len(leans) > 1:
             leans = [lean for lean in leans if lean[0] in fit] or leans
         if len(leans) > 1:
-            leans = [lean for lean in leans if unit_evidence.USUAL[0] < lean[2] < unit_evidence.USUAL[1]] or leans
+            leans = [
+                lean for lean in leans if unit_evidence.USUAL[0] < lean[2] < unit_evidence.USUAL[1]
+            ] or leans
         if len(leans) == 1:
             angle = leans[0][1]
-            self._settle_angles(angle, f"{angle} by gravity: {group.columns[0]} and its neighbours accelerate as they lean")
+            self._settle_angles(
+                angle,
+                f"{angle} by gravity: {group.columns[0]} and its neighbours accelerate as they"
+                " lean",
+            )
         if named:
             return named
         if len(leans) == 1:
-            self.by[group.columns] = f"{leans[0][0]} by gravity: it accelerates by {leans[0][2]:.2g} times what its lean makes"
+            self.by[group.columns] = (
+                f"{leans[0][0]} by gravity: it accelerates by {leans[0][2]:.2g} times what its lean"
+                " makes"
+            )
             return leans[0][0]
         if unit := unit_evidence.by_fall(self.time, group.values):
             self.by[group.columns] = f"{unit} by gravity: a part of it falls freely"
@@ -305,20 +481,30 @@ class _Chooser:
         self.by[group.columns] = f"{unit} by the size of a hall: {far:.3g} from the origin"
         if len(fit) != 1:
             others = f"{' and '.join(fit[1:])} fit a hall too" if fit else "no unit fits a hall"
-            self.found.questions.append(f"{', '.join(group.columns)} reach {far:.3g} from the origin: '{unit}' is a guess; {others}")
+            self.found.questions.append(
+                f"{', '.join(group.columns)} reach {far:.3g} from the origin: '{unit}' is a guess;"
+                f" {others}"
+            )
         return unit
 
     def _guess_pair(self, path: Group, leans: list[unit_evidence.Lean]) -> str:
-        """Ask which units of a path and of the angles go together, where gravity allows several. Returns the path's of the likeliest."""
+        """Ask which units of a path and of the angles go together, where gravity allows several.
+
+        Returns the path's of the likeliest.
+        """
         unit, angle, ratio = min(leans, key=lambda lean: abs(np.log(lean[2])))
         listed, angles = ", ".join(path.columns), ", ".join(self.made["quat_wb"][0].columns)
-        pairs = " or ".join(f"{of} and {leaning} ({times:.2g} times)" for of, leaning, times in leans)
+        pairs = " or ".join(
+            f"{of} and {leaning} ({times:.2g} times)" for of, leaning, times in leans
+        )
         self.found.questions.append(
-            f"{listed} and the angles {angles}: are they in {pairs}? So many times what its lean makes it accelerates, and all of these "
-            f"may be; '{unit}' and '{angle}' are a guess"
+            f"{listed} and the angles {angles}: are they in {pairs}? So many times what its lean"
+            f" makes it accelerates, and all of these may be; '{unit}' and '{angle}' are a guess"
         )
         self._settle_angles(angle, f"{angle} is a guess")
-        self.by[path.columns] = f"{unit} is a guess: it accelerates by {ratio:.2g} times what its lean makes"
+        self.by[path.columns] = (
+            f"{unit} is a guess: it accelerates by {ratio:.2g} times what its lean makes"
+        )
         return unit
 
     def _settle_angles(self, unit: str, why: str) -> None:
@@ -333,7 +519,10 @@ class _Chooser:
         if len(self.attitudes) > 1:
             entry = self.made["quat_wb"][0]
             listed = ", ".join(entry.columns)
-            self.found.questions.append(f"angles {listed}: {entry.unit} is taken; are they in {' or '.join(self.attitudes)}?")
+            self.found.questions.append(
+                f"angles {listed}: {entry.unit} is taken; are they in"
+                f" {' or '.join(self.attitudes)}?"
+            )
 
     def _payload(self, paths: list[tuple[Group, str]]) -> tuple[Group, str, str] | None:
         """The path below another one that keeps its distance from it."""
@@ -345,7 +534,11 @@ class _Chooser:
                 gap = lower.values * UNITS[b][1] - upper.values * UNITS[a][1]
                 length = np.linalg.norm(gap, axis=1)
                 middle, spread = np.nanmedian(length), np.nanstd(length)
-                if 0.05 < middle < 20.0 and spread < 0.1 * middle and np.nanmedian(gap[:, 2]) < -0.3 * middle:
+                if (
+                    0.05 < middle < 20.0
+                    and spread < 0.1 * middle
+                    and np.nanmedian(gap[:, 2]) < -0.3 * middle
+                ):
                     found.append((spread / middle, lower, b, middle))
         best = min(found, key=lambda of: of[0], default=None)
         if best is None and len(paths) == 1 and _NOT_VEHICLE.search(" ".join(paths[0][0].columns)):
@@ -365,7 +558,11 @@ class _Chooser:
             return None
         at, derived = relations.derivative(time, both[:, : path.values.shape[1]], 0.1)
         found = relations.relate(at, derived, time, both[:, path.values.shape[1] :], reach=0.2)
-        return found if found is not None and found.correlation > least and abs(found.delay) < 0.15 else None
+        return (
+            found
+            if found is not None and found.correlation > least and abs(found.delay) < 0.15
+            else None
+        )
 
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
@@ -373,30 +570,49 @@ class _Chooser:
                 continue
             entry = self.made[name][0]
             path = next(g for g in self.groups if g.columns == entry.columns)
-            found = [(r.correlation, g, r) for g in self._open(3) if (r := self._relation(path, g, _BELONGS)) is not None]
+            found = [
+                (r.correlation, g, r)
+                for g in self._open(3)
+                if (r := self._relation(path, g, _BELONGS)) is not None
+            ]
             if not found:
                 continue
             _, group, relation = max(found, key=lambda of: of[0])
             size = UNITS[entry.unit][1] / relation.scale
             unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
             own = name.replace("pos", "vel")
-            why = f"the derivative of {name}, correlation {relation.correlation:.2f}, {relation.scale:.3g} of its unit a second"
+            why = (
+                f"the derivative of {name}, correlation {relation.correlation:.2f},"
+                f" {relation.scale:.3g} of its unit a second"
+            )
             self._take(own, group, unit, why, frame="world" if own == "est_vel_w" else "")
 
     def _angles(self) -> None:
         for group in self._open(3):
-            if "quat_wb" in self.made or not self._hinted(group, "euler") or not self._smooth(group):
+            if (
+                "quat_wb" in self.made
+                or not self._hinted(group, "euler")
+                or not self._smooth(group)
+            ):
                 continue
             largest = float(np.nanpercentile(np.abs(group.values), 99))
-            unit = group.unit if group.unit in ("deg", "rad") else "deg" if largest > _TURN else "rad"
-            self._take("quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler")
+            unit = (
+                group.unit if group.unit in ("deg", "rad") else "deg" if largest > _TURN else "rad"
+            )
+            self._take(
+                "quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler"
+            )
             if "quat_wb" in self.made and largest <= _TURN and not group.unit:
                 entry, radians = self.made["quat_wb"]
-                degrees, _ = make_channel(self.time, group.values, replace(entry, unit="deg"), "table")
+                degrees, _ = make_channel(
+                    self.time, group.values, replace(entry, unit="deg"), "table"
+                )
                 self.attitudes = {unit: radians, "deg": degrees}
                 tilt = physics.median_tilt(radians)
                 if tilt > physics.STEEPEST:
-                    self._settle_angles("deg", f"deg: in rad half of the time tilted by more than {tilt:.0f} deg")
+                    self._settle_angles(
+                        "deg", f"deg: in rad half of the time tilted by more than {tilt:.0f} deg"
+                    )
 
     def _rates(self) -> None:
         attitude = self.made.get("quat_wb", (None, None))[1]
@@ -406,8 +622,15 @@ class _Chooser:
             if attitude is not None and len(attitude.time) > 100:
                 at, derived = relations.rates_of(*attitude.samples())
                 good = np.all(np.isfinite(group.values), axis=1)
-                found = relations.relate(at, derived, self.time[good], group.values[good], reach=0.2)
-                times = float(np.sqrt(np.mean(np.var(group.values[good], axis=0)) / max(np.mean(np.var(derived, axis=0)), 1e-12)))
+                found = relations.relate(
+                    at, derived, self.time[good], group.values[good], reach=0.2
+                )
+                times = float(
+                    np.sqrt(
+                        np.mean(np.var(group.values[good], axis=0))
+                        / max(np.mean(np.var(derived, axis=0)), 1e-12)
+                    )
+                )
             ranked.append((found.axes_correlation if found is not None else 0.0, group, times))
         if not ranked:
             return
@@ -423,29 +646,64 @@ class _Chooser:
     def _forces(self) -> None:
         for group in self._open(3):
             size = float(np.nanmedian(np.linalg.norm(group.values, axis=1)))
-            unit = next((u for u in ("m/s^2", "g", "mg") if 0.8 < size * UNITS[u][1] / physics.GRAVITY < 1.25), "")
+            unit = next(
+                (
+                    u
+                    for u in ("m/s^2", "g", "mg")
+                    if 0.8 < size * UNITS[u][1] / physics.GRAVITY < 1.25
+                ),
+                "",
+            )
             if unit and self._hinted(group, "acc_b") and "acc_b" not in self.made:
-                self._take("acc_b", group, unit, f"a middle size of {size:.3g}: gravity in {unit}", frame="body")
+                self._take(
+                    "acc_b",
+                    group,
+                    unit,
+                    f"a middle size of {size:.3g}: gravity in {unit}",
+                    frame="body",
+                )
 
     def _inputs(self) -> None:
         for group in self._open(4):
             if group.stem == "motor" and "motor_command" not in self.made:
                 high = float(np.nanpercentile(group.values, 99))
-                unit = "1/65535" if high > 5000.0 else "1/1000" if high > 150.0 else "%" if high > 2.0 else "1"
+                unit = (
+                    "1/65535"
+                    if high > 5000.0
+                    else "1/1000"
+                    if high > 150.0
+                    else "%"
+                    if high > 2.0
+                    else "1"
+                )
                 self._take("motor_command", group, unit, f"four motors up to {high:.5g}")
                 self.found.questions.append(
-                    f"motors {', '.join(group.columns)}: order them front left, front right, rear left, rear right "
-                    "(Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are they commands, or speeds?"
+                    f"motors {', '.join(group.columns)}: order them front left, front right, rear"
+                    " left, rear right (Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1,"
+                    " 2, 4). Are they commands, or speeds?"
                 )
         for group in self._open(1):
             stem = group.stem.lower()
             middle = float(np.nanmedian(group.values))
-            if re.search(r"vbat|volt|batt", stem) and "battery_voltage" not in self.made and middle > 0.0:
+            if (
+                re.search(r"vbat|volt|batt", stem)
+                and "battery_voltage" not in self.made
+                and middle > 0.0
+            ):
                 units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
                 unit = next((u for u in units if 2.5 < middle * UNITS[u][1] < 60.0), "")
                 if unit:
-                    self._take("battery_voltage", group, unit, f"a middle of {middle:.4g}: a pack in {unit}")
-            elif re.search(r"theta|angle", stem) and "angle" not in self.made and not self.made.keys() & {"quat_wb"}:
+                    self._take(
+                        "battery_voltage",
+                        group,
+                        unit,
+                        f"a middle of {middle:.4g}: a pack in {unit}",
+                    )
+            elif (
+                re.search(r"theta|angle", stem)
+                and "angle" not in self.made
+                and not self.made.keys() & {"quat_wb"}
+            ):
                 unit = group.unit if group.unit in ("deg", "rad") else "rad"
                 self._take("angle", group, unit, f"an angle, by its name; a middle of {middle:.3g}")
             elif re.search(r"thrust", stem) and "thrust_command" not in self.made:
@@ -454,16 +712,25 @@ class _Chooser:
 
 
 def _corrected(table: Table, source: str, found: Proposal, weighed: float | None) -> None:
-    """Read the table by the proposal, hold it against physics, and turn axes that another set explains; mirrors are asked about."""
+    """Read the table by the proposal, hold it against physics, and turn axes that another set
+    explains; mirrors are asked about.
+    """
     for _ in range(3):
         log = logs_of(table, found.mapping, source)[0]
         full = FlightLog({n: c for n, c in log.channels.items() if np.sum(c.valid) >= 50}, log.meta)
         wrong = [row for row in physics.look(full) if row.verdict == "bad"]
-        turns = [row for row in wrong if row.topic == "frames" and "axes" in row.figures and row.channel.endswith("rate_b")]
+        turns = [
+            row
+            for row in wrong
+            if row.topic == "frames" and "axes" in row.figures and row.channel.endswith("rate_b")
+        ]
         if not turns or "a mirror image" in turns[0].text:
             break
         row = turns[0]
-        entries = [replace(c, axes=row.figures["axes"]) if c.name == "rate_b" else c for c in found.mapping.channels]
+        entries = [
+            replace(c, axes=row.figures["axes"]) if c.name == "rate_b" else c
+            for c in found.mapping.channels
+        ]
         if entries == list(found.mapping.channels):
             break
         found.mapping = replace(found.mapping, channels=tuple(entries))
@@ -472,11 +739,16 @@ def _corrected(table: Table, source: str, found: Proposal, weighed: float | None
     full = _weighed(full, found, weighed)
     found.flyer = _flyer(full, found, weighed)
     if weighed is not None and found.flyer is None:
-        found.questions.append("--mass is not used: a flying model needs a thrust or motors, an attitude and a position; not all are found")
+        found.questions.append(
+            "--mass is not used: a flying model needs a thrust or motors, an attitude and a"
+            " position; not all are found"
+        )
 
 
 def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLog:
-    """Hold the thrust against the mass. Returns the log with its thrust in the unit in which it carries what was weighed.
+    """Hold the thrust against the mass.
+
+    Returns the log with its thrust in the unit in which it carries what was weighed.
 
     Raises LogError: in grams it fits, in kilograms it does not.
     """
@@ -484,7 +756,10 @@ def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLo
     carried = _carried(log)
     if entry is None or carried is None:
         if weighed is not None and weighed >= 1e3 * unit_evidence.LIGHTEST:
-            text = f"the vehicle weighs {weighed:g} kg? Nothing in the log is in newtons, to compare; for grams write {weighed / 1e3:g}"
+            text = (
+                f"the vehicle weighs {weighed:g} kg? Nothing in the log is in newtons, to compare;"
+                f" for grams write {weighed / 1e3:g}"
+            )
             found.questions.append(text)
         return log
     named = _SUFFIX.get(_words(entry.columns[0])[-1]) == entry.unit
@@ -493,34 +768,50 @@ def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLo
     if weighed is None:
         if not named:
             each = ", ".join(f"{one * UNITS[unit][1]:.3g} kg in {unit}" for unit in units)
-            found.questions.append(f"thrust '{entry.columns[0]}': newtons of all motors together, as taken? It carries {each}")
+            found.questions.append(
+                f"thrust '{entry.columns[0]}': newtons of all motors together, as taken? It carries"
+                f" {each}"
+            )
         return log
     unit = unit_evidence.by_mass(one, weighed, units)
-    in_grams = unit_evidence.by_mass(one, 1e-3 * weighed, units) if weighed >= 1e3 * unit_evidence.LIGHTEST else ""
+    in_grams = (
+        unit_evidence.by_mass(one, 1e-3 * weighed, units)
+        if weighed >= 1e3 * unit_evidence.LIGHTEST
+        else ""
+    )
     if not unit and in_grams:
         raise LogError(
-            f"--mass {weighed:g} is {weighed:g} kg, but the thrust '{entry.columns[0]}' carries {one * UNITS[in_grams][1]:.3g} kg "
-            f"in {in_grams}: grams? Expected kilograms: --mass {weighed / 1e3:g}"
+            f"--mass {weighed:g} is {weighed:g} kg, but the thrust '{entry.columns[0]}' carries"
+            f" {one * UNITS[in_grams][1]:.3g} kg in {in_grams}: grams? Expected kilograms: --mass"
+            f" {weighed / 1e3:g}"
         )
     if not unit:
         found.questions.append(
-            f"thrust '{entry.columns[0]}' carries {carried:.3g} kg in {entry.unit}, and the vehicle weighs {weighed:g} kg: no unit "
-            "explains that; is it of one motor, of another vehicle, or no force?"
+            f"thrust '{entry.columns[0]}' carries {carried:.3g} kg in {entry.unit}, and the vehicle"
+            f" weighs {weighed:g} kg: no unit explains that; is it of one motor, of another"
+            " vehicle, or no force?"
         )
         return log
     found.why[entry.name] += f"; {unit} by the mass: it carries {one * UNITS[unit][1]:.4g} kg"
     if in_grams:
-        found.questions.append(f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or {weighed:g} g and {in_grams}?")
+        found.questions.append(
+            f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or"
+            f" {weighed:g} g and {in_grams}?"
+        )
     if unit == entry.unit:
         return log
     mine = [replace(c, unit=unit) if c is entry else c for c in found.mapping.channels]
     found.mapping = replace(found.mapping, channels=tuple(mine))
     channel, times = log[entry.name], UNITS[unit][1] / UNITS[entry.unit][1]
-    return FlightLog({**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta)
+    return FlightLog(
+        {**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta
+    )
 
 
 def _carried(log: FlightLog) -> float | None:
-    """What a thrust in newtons carries, by the accelerometer or at the usual thrust of the flight [kg]; None without one."""
+    """What a thrust in newtons carries, by the accelerometer or at the usual thrust of the flight
+    [kg]; None without one.
+    """
     if (mass := thrust.mass_of(log)) is not None or "thrust_command" not in log:
         return mass
     total = log["thrust_command"].samples()[1]
@@ -534,9 +825,16 @@ def _usual(total: np.ndarray) -> float:
 
 
 def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | None:
-    """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a small quadrotor at rest air."""
+    """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
+    small quadrotor at rest air.
+    """
     applied = thrust.thrust_of(log)
-    if applied is None or "quat_wb" not in log or "pos_w" not in log or np.median(applied[2]) <= 0.0:
+    if (
+        applied is None
+        or "quat_wb" not in log
+        or "pos_w" not in log
+        or np.median(applied[2]) <= 0.0
+    ):
         return None
     mass, gap = thrust.mass_of(log), None
     if "payload_pos_w" in log:
@@ -549,17 +847,43 @@ def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | Non
     whole = weighed / share if weighed else mass or 1.0
     first = 1.0 if mass else whole * physics.GRAVITY / motors / hover
     if weighed is None:
-        why = "is what its thrust carries" if mass else "stands for any, and the thrust is scaled to it"
-        found.questions.append(f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG")
+        why = (
+            "is what its thrust carries"
+            if mass
+            else "stands for any, and the thrust is scaled to it"
+        )
+        found.questions.append(
+            f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG"
+        )
     if gap:
-        found.questions.append(f"what does the payload weigh? {(1.0 - share) * whole:.3g} kg is a guess")
+        found.questions.append(
+            f"what does the payload weigh? {(1.0 - share) * whole:.3g} kg is a guess"
+        )
     power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
     period = float(np.median(np.diff(log["pos_w"].time)))
     table = {
-        "input": name, "position": "pos_w", "attitude": "quat_wb", "mass": round(whole * share, 5), "gravity": 9.81,
-        "thrust_map": [float(f"{x:.4g}") for x in power], "motor_time_constant": 0.03, "command_delay": 0.0,
-        "reference_voltage": float(np.round(np.median(log["battery_voltage"].values), 2)) if "battery_voltage" in log else 1.0,
-        "voltage_coefficient": 0.0, "drag_xy": 0.0, "drag_z": 0.0, "lowest": 0.3, "window": 1.0, "step": 0.02,
-        "every": max(1, round(0.03 / period)), "most_windows": 24,
-    }  # fmt: skip
-    return table | ({"cable": {"length": round(gap, 4), "mass": round((1.0 - share) * whole, 5)}} if gap else {})
+        "input": name,
+        "position": "pos_w",
+        "attitude": "quat_wb",
+        "mass": round(whole * share, 5),
+        "gravity": 9.81,
+        "thrust_map": [float(f"{x:.4g}") for x in power],
+        "motor_time_constant": 0.03,
+        "command_delay": 0.0,
+        "reference_voltage": (
+            float(np.round(np.median(log["battery_voltage"].values), 2))
+            if "battery_voltage" in log
+            else 1.0
+        ),
+        "voltage_coefficient": 0.0,
+        "drag_xy": 0.0,
+        "drag_z": 0.0,
+        "lowest": 0.3,
+        "window": 1.0,
+        "step": 0.02,
+        "every": max(1, round(0.03 / period)),
+        "most_windows": 24,
+    }
+    return table | (
+        {"cable": {"length": round(gap, 4), "mass": round((1.0 - share) * whole, 5)}} if gap else {}
+    )

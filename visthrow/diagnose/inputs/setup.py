@@ -1,4 +1,6 @@
-"""A diagnosis setup: how logs are read, which simulation they are held against, and its parameters."""
+"""A diagnosis setup: how logs are read, which simulation they are held against, and its
+parameters.
+"""
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
@@ -21,24 +23,36 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
 MODELS = {
-    "ball": BallModel, "pendulum": PendulumModel, "stand": StandModel, "gimbal": GimbalModel, "flyer": FlyerModel, "trim": TrimModel,
-}  # fmt: skip
+    "ball": BallModel,
+    "pendulum": PendulumModel,
+    "stand": StandModel,
+    "gimbal": GimbalModel,
+    "flyer": FlyerModel,
+    "trim": TrimModel,
+}
 """Table of a setup -> the model that it parametrises."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """File of ``configs/diagnose``; at most one of the models. Raises ConfigError: more than one model, or a law of no grammar."""
+    """File of ``configs/diagnose``; at most one of the models.
+
+    Raises ConfigError: more than one model, or a law of no grammar.
+    """
 
     about: str  # whose logs these are
-    table: TableMap | None = None  # of tables' columns; None: the logs say themselves what they hold
+    table: TableMap | None = (
+        None  # of tables' columns; None: the logs say themselves what they hold
+    )
     ball: BallParams | None = None
     pendulum: PendulumParams | None = None
     stand: StandParams | None = None
     gimbal: GimbalParams | None = None
     flyer: FlyerParams | None = None
     trim: TrimParams | None = None
-    effects: dict[str, float] = field(default_factory=dict)  # sizes that a diagnosis found, written by apply
+    effects: dict[str, float] = field(
+        default_factory=dict
+    )  # sizes that a diagnosis found, written by apply
     laws: tuple[LawParams, ...] = ()  # likewise
 
     def __post_init__(self) -> None:
@@ -57,24 +71,31 @@ class Setup:
 def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
     """Make the model that a setup holds logs against.
 
-    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an effect or law is none of the model's.
-    """
+    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an
+    effect or law is none of the model's."""
     if not setup.model:
-        raise ConfigError(f"the setup '{setup.about}' has no model; expected a table of one of: {', '.join(MODELS)}")
+        raise ConfigError(
+            f"the setup '{setup.about}' has no model; expected a table of one of:"
+            f" {', '.join(MODELS)}"
+        )
     model = MODELS[setup.model](logs, getattr(setup, setup.model))
     model.extend(setup.effects, setup.laws)
     return model
 
 
 def load(name: str | Path) -> Setup:
-    """Load a setup by its name in ``configs/diagnose``, or a file. Raises ConfigError: there is none, or it does not fill the schema."""
+    """Load a setup by its name in ``configs/diagnose``, or a file.
+
+    Raises ConfigError: there is none, or it does not fill the schema.
+    """
     return config.load(Setup, config.find("diagnose", str(name)))
 
 
 def known(name: str | Path | None, plant: str | None = None) -> Known:
     """Return what a setup, or the plant of an experiment, says of the vehicle.
 
-    ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the setup has no flying model.
+    ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the
+    setup has no flying model.
     Raises ConfigError: as :func:`load`.
     """
     flyer = load(name).flyer if name is not None else None
@@ -87,20 +108,31 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
 
     trained = plant_of(config.load(Experiment, config.find("train", plant)))
     rope = trained.rope
-    return Known(rope.length + rope.payload_offset, trained.vehicle.body.mass + rope.rope_mass + rope.payload_mass)
+    return Known(
+        rope.length + rope.payload_offset,
+        trained.vehicle.body.mass + rope.rope_mass + rope.payload_mass,
+    )
 
 
-def read_logs(paths: Sequence[str | Path], name: str | Path | None = None, models: Container[str] = MODELS) -> list[FlightLog]:
+def read_logs(
+    paths: Sequence[str | Path], name: str | Path | None = None, models: Container[str] = MODELS
+) -> list[FlightLog]:
     """Read logs, tables by the mapping of the setup ``name``.
 
     ``models``: those that make a setup of use for logs that are no tables.
-    Raises LogError, ConfigError: as the readers and :func:`load`; ConfigError: no log is a table, and the setup is for tables alone.
-    """
+    Raises LogError, ConfigError: as the readers and :func:`load`; ConfigError: no log is a table,
+    and the setup is for tables alone."""
     chosen = load(name) if name is not None else None
     logs = read_all(paths, chosen.table if chosen is not None else None)
-    if chosen is not None and chosen.table is not None and chosen.model not in models and not any(map(takes_mapping, paths)):
+    if (
+        chosen is not None
+        and chosen.table is not None
+        and chosen.model not in models
+        and not any(map(takes_mapping, paths))
+    ):
         raise ConfigError(
-            f"the setup '{name}' is not used: it says how the columns of a table are read, and {', '.join(map(str, paths))} says itself "
-            "what it holds; expected a table, or no --config"
+            f"the setup '{name}' is not used: it says how the columns of a table are read, and"
+            f" {', '.join(map(str, paths))} says itself what it holds; expected a table, or no"
+            " --config"
         )
     return logs

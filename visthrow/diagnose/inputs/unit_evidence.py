@@ -1,4 +1,6 @@
-"""Units that no name says, by physics: what a path does against gravity, what a hall holds, what a thrust carries."""
+"""Units that no name says, by physics: what a path does against gravity, what a hall holds, what a
+thrust carries.
+"""
 
 from collections.abc import Iterable, Mapping
 
@@ -15,16 +17,22 @@ LENGTHS = ("m", "mm", "cm")
 THRUSTS = ("N", "gf", "mN", "kgf")
 """Units of a thrust, the usual ones first."""
 LIGHTEST = 0.01
-"""Of what is tracked and flies by four rotors [kg]: from 10 up a number of kilograms may be one of grams."""
+"""Of what is tracked and flies by four rotors [kg]: from 10 up a number of kilograms may be one of
+grams.
+"""
 
 USUAL = (0.7, 1.4)
 """What vehicles of 13 recorded flights accelerate by, over what their lean makes."""
 
-_SPAN = 0.2  # over which a path is differentiated: noise of motion capture of 1 mm makes 0.05 m/s^2, a lean of 0.3 deg [s]
+# over which a path is differentiated: noise of motion capture of 1 mm makes 0.05 m/s^2, a lean of
+# 0.3 deg [s]
+_SPAN = 0.2
 _DECADES = 0.5  # half of the least step between two lengths
 _LEANS = 0.02  # least acceleration of a lean that says something: 0.1 deg [m/s^2]
 _FALLS = 0.15  # of gravity, that a fall may be off by: drag of a light ball
-_SHARE = 0.1  # of a path, that falls where things are thrown: 0.18 and 0.21 of two recorded ones, at most 0.05 of 13 flights in any unit
+# of a path, that falls where things are thrown: 0.18 and 0.21 of two recorded ones, at most 0.05 of
+# 13 flights in any unit
+_SHARE = 0.1
 _HALL = (0.1, 60.0)  # what a path in a hall reaches from the origin of the capture [m]
 
 
@@ -32,8 +40,14 @@ Lean = tuple[str, str, float]
 """Unit of length, unit of the angles, and path over lean in them."""
 
 
-def by_lean(time: np.ndarray, path: np.ndarray, attitudes: Mapping[str, Channel], units: Iterable[str] = LENGTHS) -> list[Lean]:
-    """Find the units in which a path does what its vehicle's lean makes of gravity: level, a rotor's lean accelerates by g tan(tilt).
+def by_lean(
+    time: np.ndarray,
+    path: np.ndarray,
+    attitudes: Mapping[str, Channel],
+    units: Iterable[str] = LENGTHS,
+) -> list[Lean]:
+    """Find the units in which a path does what its vehicle's lean makes of gravity: level, a
+    rotor's lean accelerates by g tan(tilt).
 
     Args:
         time: Stamps of the path [s], shape (T,).
@@ -57,24 +71,35 @@ def by_lean(time: np.ndarray, path: np.ndarray, attitudes: Mapping[str, Channel]
         if size < _LEANS or does <= 0.0:
             continue
         ratios = {unit: does * UNITS[unit][1] / size for unit in units}
-        found += [(unit, angle, ratio) for unit, ratio in ratios.items() if abs(np.log10(ratio)) < _DECADES]
+        found += [
+            (unit, angle, ratio)
+            for unit, ratio in ratios.items()
+            if abs(np.log10(ratio)) < _DECADES
+        ]
     return found
 
 
 def by_fall(time: np.ndarray, path: np.ndarray) -> str:
-    """Find the unit in which a part of a path falls freely: gravity along one axis and nothing level; "" where none does."""
+    """Find the unit in which a part of a path falls freely: gravity along one axis and nothing
+    level; "" where none does.
+    """
     acc = physics.accelerations(*rising(time, path), "m")[1]
     if not len(acc):
         return ""
     down = GRAVITY * np.vstack([np.eye(3), -np.eye(3)])
     off = {unit: np.linalg.norm(acc[:, None] * UNITS[unit][1] - down, axis=2) for unit in LENGTHS}
-    shares = {unit: float(np.max(np.mean(of < _FALLS * GRAVITY, axis=0))) for unit, of in off.items()}
+    shares = {
+        unit: float(np.max(np.mean(of < _FALLS * GRAVITY, axis=0))) for unit, of in off.items()
+    }
     best = max(shares, key=shares.__getitem__)
     return best if shares[best] > _SHARE else ""
 
 
 def by_hall(path: np.ndarray) -> tuple[list[str], float]:
-    """Find the units in which a path stays in a hall. Returns them and how far it reaches from the origin, in its own unit."""
+    """Find the units in which a path stays in a hall.
+
+    Returns them and how far it reaches from the origin, in its own unit.
+    """
     far = float(np.nanmax(np.abs(path)))
     return [unit for unit in LENGTHS if _HALL[0] <= far * UNITS[unit][1] <= _HALL[1]], far
 
@@ -84,7 +109,8 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
 
     Args:
         carried: What it carries if it is in newtons [kg].
-        weighed: Mass of the vehicle [kg]; a payload and the charge of the battery may add to it or take from it, by less than e.
+        weighed: Mass of the vehicle [kg]; a payload and the charge of the battery may add to it or
+            take from it, by less than e.
         units: Units that are tried.
 
     Returns:

@@ -1,1 +1,3 @@
-"""Marginal likelihood of flights: statistics of windows, noise levels, evidence of sets of effects."""
+"""Marginal likelihood of flights: statistics of windows, noise levels, evidence of sets
+of effects.
+"""

@@ -1,14 +1,17 @@
-"""Measurement noise that is correlated: what filters and a tracker's own dynamics leave between neighbouring samples.
+"""Measurement noise that is correlated: what filters and a tracker's own dynamics leave between
+neighbouring samples.
 
-The noise of a channel's component is white for a part, and for a share w it follows a filter of first or second order (Matern 1/2
-and 3/2):
+The noise of a channel's component is white for a part, and for a share w it follows a filter of
+first or second order (Matern 1/2 and 3/2):
 
     c(t) = (1 - w) [t = 0] + w k(t / tau),   k_1(x) = exp(-x),   k_2(x) = (1 + x) exp(-x)
 
-Every window gets the Cholesky factors of these correlations at its own stamps; the inner products of
-:mod:`visthrow.diagnose.likelihood.marginal` are those of whitened columns, so that evidence, thresholds and intervals know of them.
-Noise of samples that neighbour each other says nothing about the noise at low frequencies, where causes lie: time, share and order
-are the likeliest of whole windows, with initial states, latent forces and every effect integrated out, so that no cause is taken for noise.
+Every window gets the Cholesky factors of these correlations at its own stamps; the inner products
+of :mod:`visthrow.diagnose.likelihood.marginal` are those of whitened columns, so that evidence,
+thresholds and intervals know of them. Noise of samples that neighbour each other says nothing about
+the noise at low frequencies, where causes lie: time, share and order are the likeliest of whole
+windows, with initial states, latent forces and every effect integrated out, so that no cause is
+taken for noise.
 
 Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal likelihood).
 """
@@ -28,18 +31,28 @@ from visthrow.diagnose.models.interface import Window
 T = TypeVar("T")
 
 SUSPECT = 0.1
-"""Correlation of neighbouring samples from which a channel is looked at: of ten thousand white ones it has a deviation of 0.01."""
+"""Correlation of neighbouring samples from which a channel is looked at: of ten thousand white ones
+it has a deviation of 0.01.
+"""
 
 PERIODS = 2.0 ** np.arange(0.0, 5.25, 0.25)
-"""Correlation times that are tried, in the samples' period: at low frequencies, noise of second order goes with the time's fourth power."""
+"""Correlation times that are tried, in the samples' period: at low frequencies, noise of second
+order goes with the time's fourth power.
+"""
 LONGEST = 0.15
-"""Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something that the model lacks."""
+"""Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something
+that the model lacks.
+"""
 STRIDES = (4, 2, 1)  # steps among them, one after the other
 
 SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
-"""Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within what doubles hold."""
+"""Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within
+what doubles hold.
+"""
 
-LOOKED_AT = 8  # windows that the estimate is made of, and that tell whether a question is worth asking all
+LOOKED_AT = (
+    8  # windows that the estimate is made of, and that tell whether a question is worth asking all
+)
 
 
 @dataclass(frozen=True)
@@ -54,11 +67,15 @@ class Correlation:
     def at(self, lag: np.ndarray) -> np.ndarray:
         """Correlation of samples ``lag`` [s] apart."""
         x = np.abs(lag) / self.time
-        return self.share * np.exp(-x) * (1.0 + x if self.order == 2 else 1.0) + (1.0 - self.share) * (lag == 0.0)
+        return self.share * np.exp(-x) * (1.0 + x if self.order == 2 else 1.0) + (
+            1.0 - self.share
+        ) * (lag == 0.0)
 
 
 def components(window: Window, channel: int) -> np.ndarray | None:
-    """Rows of a channel's samples, shape (stamps, components), in the order of time; None where stamps differ by component."""
+    """Rows of a channel's samples, shape (stamps, components), in the order of time; None where
+    stamps differ by component.
+    """
     rows = np.flatnonzero(window.channel == channel)
     stamps, counts = np.unique(window.time[rows], return_counts=True)
     if len(stamps) < 4 or np.any(counts != counts[0]):
@@ -67,7 +84,9 @@ def components(window: Window, channel: int) -> np.ndarray | None:
 
 
 def with_correlations(windows: Sequence[Window], known: Mapping[int, Correlation]) -> list[Window]:
-    """Tell windows of the correlations of their channels' noise; ``windows``: of white noise; ``known``: of channels, by number."""
+    """Tell windows of the correlations of their channels' noise; ``windows``: of white noise;
+    ``known``: of channels, by number.
+    """
     return each(lambda window: _told(window, known), windows) if known else list(windows)
 
 
@@ -82,16 +101,19 @@ def _told(window: Window, known: Mapping[int, Correlation]) -> Window:
     return replace(window, sigma=sigma, correlated=tuple(factors))
 
 
-def correlations(windows: Sequence[Window], slabs: np.ndarray, channels: int) -> dict[int, Correlation]:
+def correlations(
+    windows: Sequence[Window], slabs: np.ndarray, channels: int
+) -> dict[int, Correlation]:
     """Estimate which channels' noise is correlated, and how.
 
-    ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the model's channels.
-    Returns channel -> its noise, where that is surely not white.
-    """
+    ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the
+    model's channels. Returns channel -> its noise, where that is surely not white."""
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = each(lambda window: hidden_gram(window, channels), free)
     left = each(lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu")))
-    suspects = {c: scale for c in range(channels) if (scale := _suspected(free, left, c)) is not None}
+    suspects = {
+        c: scale for c in range(channels) if (scale := _suspected(free, left, c)) is not None
+    }
     known: dict[int, Correlation] = {}
     for channel, scale in suspects.items():
         best, ahead = _climbed(free, channels, known, channel, scale)
@@ -108,15 +130,30 @@ def few_of(items: Sequence[T]) -> list[T]:
 def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:
     """A window in which every effect may have a size of its own."""
     states = np.hstack((window.nuisance, window.effects))
-    return replace(window, nuisance=states, nuisance_sd=np.append(window.nuisance_sd, slabs), effects=window.effects[:, :0])
+    return replace(
+        window,
+        nuisance=states,
+        nuisance_sd=np.append(window.nuisance_sd, slabs),
+        effects=window.effects[:, :0],
+    )
 
 
 def _suspected(windows: Sequence[Window], left: Sequence[np.ndarray], channel: int) -> float | None:
-    """Deviation of what is left of a channel, in that which is stated; None where its neighbours are hardly correlated."""
-    parts = [r[rows] / w.sigma[rows] for w, r in zip(windows, left) if (rows := components(w, channel)) is not None]
+    """Deviation of what is left of a channel, in that which is stated; None where its neighbours
+    are hardly correlated.
+    """
+    parts = [
+        r[rows] / w.sigma[rows]
+        for w, r in zip(windows, left)
+        if (rows := components(w, channel)) is not None
+    ]
     if not parts:
         return None
-    far = noise.HUBER * noise.MAD_TO_SIGMA * np.median(np.abs(np.concatenate([p.ravel() for p in parts])))
+    far = (
+        noise.HUBER
+        * noise.MAD_TO_SIGMA
+        * np.median(np.abs(np.concatenate([p.ravel() for p in parts])))
+    )
     parts = [np.clip(p, -far, far) for p in parts]
     square = sum(float((p**2).sum()) for p in parts)
     if sum(float((p[1:] * p[:-1]).sum()) for p in parts) < SUSPECT * square:
@@ -125,9 +162,15 @@ def _suspected(windows: Sequence[Window], left: Sequence[np.ndarray], channel: i
 
 
 def _climbed(
-    windows: Sequence[Window], channels: int, known: Mapping[int, Correlation], channel: int, scale: float
+    windows: Sequence[Window],
+    channels: int,
+    known: Mapping[int, Correlation],
+    channel: int,
+    scale: float,
 ) -> tuple[Correlation, float]:
-    """The likeliest correlation of a channel beside those known, uphill over a grid, and its nats above white noise."""
+    """The likeliest correlation of a channel beside those known, uphill over a grid, and its nats
+    above white noise.
+    """
     stamps = [np.unique(w.time[w.channel == channel]) for w in windows]
     period = float(np.median(np.concatenate([np.diff(own) for own in stamps])))
     found: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
@@ -144,20 +187,32 @@ def _climbed(
             found[place] = value, replace(own, scale=own.scale * levels.scale[channel])
         return found[place][0]
 
-    best = max(((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried)
+    best = max(
+        ((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried
+    )
     for stride in STRIDES:
-        while tried(better := max(_near(best, stride, times), key=tried, default=best)) > tried(best):
+        while tried(better := max(_near(best, stride, times), key=tried, default=best)) > tried(
+            best
+        ):
             best = better
     if best[0] == times - 1:  # it would last for still longer
         return found[best][1], 0.0
-    white = max(_likelihood([replace(w, sigma=w.sigma * np.where(w.channel == channel, s, 1.0)) for w in windows], channels, known)[0]
-                for s in (1.0, scale))  # fmt: skip
+    white = max(
+        _likelihood(
+            [replace(w, sigma=w.sigma * np.where(w.channel == channel, s, 1.0)) for w in windows],
+            channels,
+            known,
+        )[0]
+        for s in (1.0, scale)
+    )
     value, own = found[best]
     return own, value - white
 
 
 def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
-    """Places beside one: others of so many times, and while these are far apart, other shares and the other order."""
+    """Places beside one: others of so many times, and while these are far apart, other shares and
+    the other order.
+    """
     time, share, order = place
     near = [(time + step, share, order) for step in (-stride, stride)]
     if stride == STRIDES[0]:
@@ -166,9 +221,14 @@ def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[in
 
 
 def _likelihood(
-    windows: Sequence[Window], channels: int, known: Mapping[int, Correlation], start: noise.Noise | None = None
+    windows: Sequence[Window],
+    channels: int,
+    known: Mapping[int, Correlation],
+    start: noise.Noise | None = None,
 ) -> tuple[float, noise.Noise]:
-    """Log marginal likelihood of windows, and their levels; ``start``: where these are searched from."""
+    """Log marginal likelihood of windows, and their levels; ``start``: where these are searched
+    from.
+    """
     told = with_correlations(windows, known)
     grams = each(lambda window: hidden_gram(window, channels), told)
     shaped = designs.correlated_of(grams, told, noise.CORRELATION_TIMES[1], "cpu")

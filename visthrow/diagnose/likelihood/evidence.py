@@ -1,12 +1,14 @@
-"""Evidence for sets of effects, with floors: whatever is not named may still be there below its floor.
+"""Evidence for sets of effects, with floors: whatever is not named may still be there below its
+floor.
 
-In floors, an effect that is not named has the prior N(0, SPIKE^2), so that a floor is two deviations; a named one has N(0, prior^2)
-within its bounds (the slab):
+In floors, an effect that is not named has the prior N(0, SPIKE^2), so that a floor is two
+deviations; a named one has N(0, prior^2) within its bounds (the slab):
 
-    log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and posterior's mass within the bounds
+    log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and
+    posterior's mass within the bounds
 
-All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K) for n draws at once.
-"""
+All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K)
+for n draws at once."""
 
 from dataclasses import dataclass
 
@@ -19,21 +21,31 @@ from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models.interface import Effect
 
 SPIKE = 0.5
-"""Deviation of an effect that is not named, in its floor: the floor is the limit of what may go unnamed, not its usual size."""
+"""Deviation of an effect that is not named, in its floor: the floor is the limit of what may go
+unnamed, not its usual size.
+"""
 
 OWN_FLOOR = 0.1
-"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor. With it 95 % intervals held 94 %
-of 85 sizes that were hidden in plants of other code than the simulator's."""
+"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor.
+
+With it 95 % intervals held 94 % of 85 sizes that were hidden in plants of other code than the
+simulator's.
+"""
 
 NORMAL_95 = 1.96
 
 STRONG, VERY_STRONG = 3.0, 5.0
-"""Nats: Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995). What is less than strongly behind counts as
-possible; any cause must be very strong, however few are in question."""
+"""Nats:
+
+Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995). What is less than
+strongly behind counts as possible; any cause must be very strong, however few are in question.
+"""
 
 INEXACT = 0.3
-"""Part by which the form of anything may be off: of an effect from flight to flight, of another kind of block, of a force against the
-thrust, of the misfit of a window that begins in a motion that nobody knows, of a size that derivatives of elsewhere give."""
+"""Part by which the form of anything may be off: of an effect from flight to flight, of another
+kind of block, of a force against the thrust, of the misfit of a window that begins in a motion that
+nobody knows, of a size that derivatives of elsewhere give.
+"""
 
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995
@@ -50,17 +62,25 @@ class Priors:
     visible: np.ndarray  # bool: all its channels are there
 
     @staticmethod
-    def of(effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]) -> "Priors":
-        """Read them off the catalogue. Raises DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0."""
+    def of(
+        effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]
+    ) -> "Priors":
+        """Read them off the catalogue.
+
+        Raises DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0.
+        """
         for e in effects:
             if not (e.floor > 0.0 and e.prior_sd > 0.0 and e.bounds[0] <= 0.0 <= e.bounds[1]):
                 raise DiagnoseError(
-                    f"effect '{e.name}' has floor {e.floor}, prior_sd {e.prior_sd}, bounds {e.bounds}; expected both above 0, "
-                    "and bounds about 0"
+                    f"effect '{e.name}' has floor {e.floor}, prior_sd {e.prior_sd}, bounds"
+                    f" {e.bounds}; expected both above 0, and bounds about 0"
                 )
         names = [e.name for e in effects]
         if len(set(names)) < len(names):
-            raise DiagnoseError(f"two effects share a name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+            raise DiagnoseError(
+                "two effects share a name:"
+                f" {', '.join(sorted({n for n in names if names.count(n) > 1}))}"
+            )
         floor = np.array([e.floor for e in effects], dtype=float)
         bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2) / floor[:, None]
         slab = np.array([e.prior_sd for e in effects], dtype=float) / floor
@@ -90,16 +110,26 @@ def covariance(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
 
 
 def _factor(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal. Raises DiagnoseError: not positive definite, not finite."""
+    """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal.
+
+    Raises DiagnoseError: not positive definite, not finite.
+    """
     scaled = information * np.outer(deviation, deviation)
     scaled.flat[:: len(scaled) + 1] += 1.0
     factor, failed = lapack.dpotrf(scaled, lower=1, clean=0)
-    if failed or not np.isfinite(np.trace(factor)):  # LAPACK goes on with NaN, which reaches the last row
-        raise DiagnoseError("the flights' information on the effects is not finite or not positive; the derivatives are broken")
+    if failed or not np.isfinite(
+        np.trace(factor)
+    ):  # LAPACK goes on with NaN, which reaches the last row
+        raise DiagnoseError(
+            "the flights' information on the effects is not finite or not positive; the derivatives"
+            " are broken"
+        )
     return factor
 
 
-def log_evidence(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> float:
+def log_evidence(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+) -> float:
     """log Z of one set of named effects."""
     deviation = priors.deviation(active)
     factor, half = _factor(information, deviation), score * deviation
@@ -110,50 +140,75 @@ def log_evidence(information: np.ndarray, score: np.ndarray, priors: Priors, act
         spread = lapack.dpotrs(factor, np.eye(len(factor))[:, at], lower=1)[0][at].diagonal()
         mean, spread = mean[at] * deviation[at], np.sqrt(spread) * deviation[at]
         low, high = priors.low[at], priors.high[at]
-        value += (_log_mass(mean, spread, low, high) - _log_mass(np.zeros(len(at)), deviation[at], low, high)).sum()
+        value += (
+            _log_mass(mean, spread, low, high)
+            - _log_mass(np.zeros(len(at)), deviation[at], low, high)
+        ).sum()
     return float(value)
 
 
-def additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
-    """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not visible.
+def additions(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+) -> np.ndarray:
+    """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not
+    visible.
 
-    A change of one prior is a rank-one update, so all candidates and all draws cost one factorisation.
-    ``information``: shape (K, K); ``score``: shape (K,) or (n, K).
-    Returns nats, of the score's shape.
-    """
+    A change of one prior is a rank-one update, so all candidates and all draws cost one
+    factorisation. ``information``: shape (K, K); ``score``: shape (K,) or (n, K). Returns nats, of
+    the score's shape."""
     return _naming(information, score, priors, active, np.arange(len(priors.floor))[:, None])
 
 
-def pair_additions(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
-    """The same for each two effects, a change of two priors: of two that hide each other, neither shows alone.
+def pair_additions(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+) -> np.ndarray:
+    """The same for each two effects, a change of two priors: of two that hide each other, neither
+    shows alone.
 
-    Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the diagonal.
-    """
+    Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the
+    diagonal."""
     size = len(score)
     pairs = np.stack(np.divmod(np.arange(size * size), size), axis=1)
     gain = _naming(information, score, priors, active, pairs)
     return np.where(pairs[:, 0] == pairs[:, 1], -np.inf, gain).reshape(size, size)
 
 
-def _naming(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...], at: np.ndarray) -> np.ndarray:
-    """Gain of log Z by naming several effects more, for P sets of them; ``at``: their numbers, shape (P, m)."""
+def _naming(
+    information: np.ndarray,
+    score: np.ndarray,
+    priors: Priors,
+    active: list[int] | tuple[int, ...],
+    at: np.ndarray,
+) -> np.ndarray:
+    """Gain of log Z by naming several effects more, for P sets of them; ``at``: their numbers,
+    shape (P, m).
+    """
     sigma = covariance(information, priors.deviation(active))
     mean, change = (score @ sigma)[..., at], (priors.slab**-2.0 - SPIKE**-2.0)[at]
     own, unit = sigma[at[:, :, None], at[:, None]], np.eye(at.shape[1])
     taken = np.linalg.inv(own + unit / change[:, None])
     wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", own, taken, mean, optimize=True)
     wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
-    gain = -np.log(priors.slab / SPIKE)[at].sum(1) - 0.5 * np.linalg.slogdet(unit + change[..., None] * own)[1]
+    gain = (
+        -np.log(priors.slab / SPIKE)[at].sum(1)
+        - 0.5 * np.linalg.slogdet(unit + change[..., None] * own)[1]
+    )
     gain = gain - 0.5 * np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
     low, high, slab = priors.low[at], priors.high[at], priors.slab[at]
-    gain = gain + (_log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)).sum(-1)
+    gain = gain + (
+        _log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)
+    ).sum(-1)
     out = ~priors.visible
     out[list(active)] = True
     return np.where(out[at].any(1), -np.inf, gain)
 
 
-def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
-    """Most probable sizes of the named effects within their bounds, all others at 0; in floors, shape (K,)."""
+def estimate(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+) -> np.ndarray:
+    """Most probable sizes of the named effects within their bounds, all others at 0; in floors,
+    shape (K,).
+    """
     from scipy.optimize import lsq_linear
 
     theta = np.zeros(len(score))
@@ -166,8 +221,11 @@ def estimate(information: np.ndarray, score: np.ndarray, priors: Priors, active:
     return theta
 
 
-def certainty(information: np.ndarray, theta: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]) -> np.ndarray:
-    """Sizes of named effects in the half widths of 95 % intervals to which half a floor is added, in the order of ``active``.
+def certainty(
+    information: np.ndarray, theta: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+) -> np.ndarray:
+    """Sizes of named effects in the half widths of 95 % intervals to which half a floor is added,
+    in the order of ``active``.
 
     Above 1 it is more than what may go unnamed.
     """
@@ -177,18 +235,23 @@ def certainty(information: np.ndarray, theta: np.ndarray, priors: Priors, active
 
 
 def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
-    """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from its spike, shape (draws, K)."""
+    """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from
+    its spike, shape (draws, K).
+    """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     unnamed = SPIKE * rng.standard_normal((draws, len(information)))
     return rng.standard_normal((draws, len(information))) @ root.T + unnamed @ information
 
 
-def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator, draws: int = CALIBRATION_DRAWS) -> float:
-    """Nats that the best of all effects exceeds in half a per cent of null worlds, at least the log of their number, or 5.
+def threshold(
+    statistics: Statistics, priors: Priors, rng: np.random.Generator, draws: int = CALIBRATION_DRAWS
+) -> float:
+    """Nats that the best of all effects exceeds in half a per cent of null worlds, at least the log
+    of their number, or 5.
 
-    The null worlds have these flights' information, noise as fitted, and of every effect what may go unnamed.
-    """
+    The null worlds have these flights' information, noise as fitted, and of every effect what may
+    go unnamed."""
     information = statistics.information.sum(0)
     candidates = int(priors.visible.sum())
     if not candidates:

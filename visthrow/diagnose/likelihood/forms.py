@@ -1,8 +1,8 @@
 """Prediction errors: what is left ahead of the beginnings of windows.
 
-Within a window the initial state is fitted to the first HEAD seconds; what follows is predicted and compared at rising horizons.
-A window without an initial state (means, a motor's stand, a camera's view) has nothing to fit, and is predicted whole.
-"""
+Within a window the initial state is fitted to the first HEAD seconds; what follows is predicted and
+compared at rising horizons. A window without an initial state (means, a motor's stand, a camera's
+view) has nothing to fit, and is predicted whole."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +15,22 @@ from visthrow.logs.flightlog import STANDARD_CHANNELS
 
 HEAD = 0.4  # share of a window, at most HEAD_SECONDS, in which the initial state is fitted
 HEAD_SECONDS = 0.4
-HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0)  # upper ends of the horizons [s]; what lies beyond the last belongs to it
+HORIZONS = (
+    0.02,
+    0.05,
+    0.1,
+    0.2,
+    0.3,
+    0.45,
+    0.6,
+    1.0,
+)  # upper ends of the horizons [s]; what lies beyond the last belongs to it
 
 
 UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marker_pos_c": "m"}
-"""Of residuals: an attitude's are rotation vectors, and the small models have channels of their own."""
+"""Of residuals: an attitude's are rotation vectors, and the small models have channels of their
+own.
+"""
 
 
 READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
@@ -34,14 +45,24 @@ def unit_of(channel: str) -> str:
 
 @dataclass(frozen=True)
 class Errors:
-    """Sums over the samples ahead, for groups of windows (flights), channels and horizons, shape (F, C, H) each."""
+    """Sums over the samples ahead, for groups of windows (flights), channels and horizons, shape
+    (F, C, H) each.
+    """
 
     square: np.ndarray  # of what is left, in sigmas
     count: np.ndarray  # of samples
-    floor: np.ndarray  # squares expected of sensor noise and of the initial state's uncertainty alone
+    floor: (
+        np.ndarray
+    )  # squares expected of sensor noise and of the initial state's uncertainty alone
 
 
-def errors(windows: Sequence[Window], groups: Sequence[int], noise: Noise, residuals: Sequence[np.ndarray], channels: int) -> Errors:
+def errors(
+    windows: Sequence[Window],
+    groups: Sequence[int],
+    noise: Noise,
+    residuals: Sequence[np.ndarray],
+    channels: int,
+) -> Errors:
     """Predict each window's end from its head and add up what is left.
 
     Args:
@@ -60,11 +81,14 @@ def errors(windows: Sequence[Window], groups: Sequence[int], noise: Noise, resid
     return Errors(*sums)
 
 
-def predicted(window: Window, noise: Noise, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def predicted(
+    window: Window, noise: Noise, residual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Predict the end of a window from its head.
 
-    Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the square that noise is expected to leave
-    there, shape (N,), and the horizon's index (-1 in the head), shape (N,).
+    Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the
+    square that noise is expected to leave there, shape (N,), and the horizon's index (-1 in the
+    head), shape (N,).
 
     Args:
         window: of N samples.
@@ -84,7 +108,9 @@ def predicted(window: Window, noise: Noise, residual: np.ndarray) -> tuple[np.nd
     left = off - states @ (spread @ (weighted @ off[head]))
     if window.correlated:
         root = _root(window, scale)
-        expected = ((root - states @ (spread @ (weighted @ root[head]))) ** 2).sum(1) + ((states @ spread) ** 2).sum(1)
+        expected = ((root - states @ (spread @ (weighted @ root[head]))) ** 2).sum(1) + (
+            (states @ spread) ** 2
+        ).sum(1)
     else:  # what that is where noise is white
         expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)
     horizon = np.where(head, -1, np.minimum(np.searchsorted(HORIZONS, ahead), len(HORIZONS) - 1))

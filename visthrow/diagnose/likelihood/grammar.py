@@ -1,4 +1,6 @@
-"""Terms of laws (:mod:`visthrow.diagnose.models.laws`) as coefficients of latent forces, which are hats at the knots."""
+"""Terms of laws (:mod:`visthrow.diagnose.models.laws`) as coefficients of latent forces, which are
+hats at the knots.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,18 +19,19 @@ FINE = 8  # points between two knots at which a curve is looked at
 def joined(knots: Sequence[Known], names: Sequence[str]) -> Known:
     """The knots of several windows after one another, of quantities that all of them have.
 
-    What follows from them follows at each knot by itself, but for the thrust's slope, which is taken within windows.
-    """
+    What follows from them follows at each knot by itself, but for the thrust's slope, which is
+    taken within windows."""
     taken = [*names, "slope"] if {"thrust", "time"} <= set(names) else names
     return Known({name: np.concatenate([known[name] for known in knots]) for name in taken})
 
 
 @lru_cache(maxsize=64)
 def between(count: int) -> np.ndarray:
-    """Coefficients of hats at the knots that come nearest to the smooth curve through values at the knots, shape (k, k).
+    """Coefficients of hats at the knots that come nearest to the smooth curve through values at the
+    knots, shape (k, k).
 
-    A hat each of the values themselves cuts the curve's corners: of a force that swings at 2 Hz an eighth were lost.
-    """
+    A hat each of the values themselves cuts the curve's corners: of a force that swings at 2 Hz an
+    eighth were lost."""
     if count < 3:
         return np.eye(count)
     fine = (np.arange(FINE * (count - 1)) + 0.5) / FINE
@@ -47,7 +50,10 @@ def through_latents(window: Window, known: Known, block: str) -> np.ndarray:
         return _hats(window, known["time"], block)
     units = np.eye(size).reshape(-1, 3, size)
     shares = loads(block, known, units)
-    return sum(_hats(window, known["time"], name) @ values.reshape(size, size) for name, values in shares.items())
+    return sum(
+        _hats(window, known["time"], name) @ values.reshape(size, size)
+        for name, values in shares.items()
+    )
 
 
 def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:
@@ -68,7 +74,9 @@ class TermEffect(Effect):
 
 
 def forces(window: Window, terms_: Sequence[TermEffect]) -> np.ndarray:
-    """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L, T)."""
+    """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
+    T).
+    """
     out, known = np.zeros((len(window.latent_block), len(terms_))), Known(window.knots)
     for i, effect in enumerate(terms_):
         if carries(window.latent_block, effect.term.block):

@@ -1,16 +1,19 @@
-"""From windows of residuals to what they say about the effects: information and score of every flight.
+"""From windows of residuals to what they say about the effects: information and score of every
+flight.
 
-Initial states b and latent forces a are integrated out. With U = [X, G], prior covariance P of (b, a) and sensor noise W^-1,
+Initial states b and latent forces a are integrated out. With U = [X, G], prior covariance P of (b,
+a) and sensor noise W^-1,
 
     V = W^-1 + U P U',   V^-1 = W - W U (P^-1 + U'W U)^-1 U'W   (Woodbury)
 
-so a window of thousands of samples becomes a few inner products (:class:`Gram`), and a change of noise levels costs one small
-factorisation. Where noise is correlated (:mod:`visthrow.diagnose.likelihood.correlation`), they are those of whitened columns. The
-latent forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is multiplied into G once,
-after which P is diagonal.
+so a window of thousands of samples becomes a few inner products (:class:`Gram`), and a change of
+noise levels costs one small factorisation. Where noise is correlated
+(:mod:`visthrow.diagnose.likelihood.correlation`), they are those of whitened columns. The latent
+forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is
+multiplied into G once, after which P is diagonal.
 
-Effects are measured in floors throughout: theta = 1 is the size below which an effect does not matter.
-"""
+Effects are measured in floors throughout: theta = 1 is the size below which an effect does not
+matter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +27,10 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 
 TAIL = 6.0
-"""Degrees of freedom of the latent forces' scale mixture: from window to window their deviation varies by some 30 %, and a window
-in which something happened may have ten times as much at the price of 11 nats."""
+"""Degrees of freedom of the latent forces' scale mixture: from window to window their deviation
+varies by some 30 %, and a window in which something happened may have ten times as much at the
+price of 11 nats.
+"""
 
 
 class There(NamedTuple):
@@ -37,10 +42,11 @@ class There(NamedTuple):
 
 @dataclass(frozen=True)
 class Gram:
-    """Weighted inner products of one window's columns, by channel; D nuisances, L latents, K effects, P = D + L + K.
+    """Weighted inner products of one window's columns, by channel; D nuisances, L latents, K
+    effects, P = D + L + K.
 
-    The columns stand in the order nuisances (times their prior deviation), latents, effects (times their floors).
-    """
+    The columns stand in the order nuisances (times their prior deviation), latents, effects (times
+    their floors)."""
 
     flight: int
     phase: str
@@ -50,8 +56,12 @@ class Gram:
     square: np.ndarray  # r' r / sigma^2, shape (C,)
     nuisances: int
     latent_block: np.ndarray  # shape (L,)
-    factor: np.ndarray  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
-    shown: Mapping[int, float]  # latent block -> median inner product of its columns with themselves
+    factor: (
+        np.ndarray
+    )  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    shown: Mapping[
+        int, float
+    ]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
     there: There | None = None  # of an ``inner``, which may have been replaced since
 
@@ -79,24 +89,32 @@ class Noise:
     scale: np.ndarray  # of each channel's sigma, shape (C,)
     latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
     correlation_time: float  # of the latent forces [s]
-    share: np.ndarray  # latent deviation of each window and block in its phase's, shape (windows, 3)
+    share: (
+        np.ndarray
+    )  # latent deviation of each window and block in its phase's, shape (windows, 3)
 
     def deviation(self, gram: Gram, window: int) -> np.ndarray:
         """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
-        shared = np.array([self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))])
+        shared = np.array(
+            [self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))]
+        )
         by_block = shared * self.share[window]
         return np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
 
     @property
     def log_prior(self) -> float:
-        """Of the windows' shares: their squares follow an inverse gamma distribution; 0 where all are 1."""
+        """Of the windows' shares: their squares follow an inverse gamma distribution; 0 where all
+        are 1.
+        """
         square = self.share**2
         return float(-0.5 * TAIL * (np.log(square) + 1.0 / square - 1.0).sum())
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Everything that F flights say about K effects, in floors, about the linearisation point ``theta``."""
+    """Everything that F flights say about K effects, in floors, about the linearisation point
+    ``theta``.
+    """
 
     flights: np.ndarray  # their numbers, shape (F,)
     information: np.ndarray  # S' V^-1 S, shape (F, K, K)
@@ -113,12 +131,22 @@ class Statistics:
     @cached_property
     def absolute_square(self) -> np.ndarray:
         """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
-        return self.square + 2.0 * self.score @ self.theta + (self.information @ self.theta) @ self.theta
+        return (
+            self.square
+            + 2.0 * self.score @ self.theta
+            + (self.information @ self.theta) @ self.theta
+        )
 
     def only(self, keep: np.ndarray) -> "Statistics":
         """The same of some flights; ``keep`` is a mask or indices into ``flights``."""
-        return replace(self, flights=self.flights[keep], information=self.information[keep], score=self.score[keep],
-                       square=self.square[keep], samples=self.samples[keep])  # fmt: skip
+        return replace(
+            self,
+            flights=self.flights[keep],
+            information=self.information[keep],
+            score=self.score[keep],
+            square=self.square[keep],
+            samples=self.samples[keep],
+        )
 
 
 def columns(window: Window, floors: np.ndarray) -> np.ndarray:
@@ -130,15 +158,18 @@ def columns(window: Window, floors: np.ndarray) -> np.ndarray:
 def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
     """Reduce a window to its inner products.
 
-    ``window``: with finite residuals and derivatives; ``floors``: of the effects, shape (K,); ``channels``: number C of the model's
-    channels. Raises DiagnoseError: the window's arrays do not fit together, or hold NaN or infinity.
-    """
+    ``window``: with finite residuals and derivatives; ``floors``: of the effects, shape (K,);
+    ``channels``: number C of the model's channels. Raises DiagnoseError: the window's arrays do not
+    fit together, or hold NaN or infinity."""
     check(window, len(floors), channels)
     return _inner_products(window, columns(window, floors), channels)
 
 
 def hidden_gram(window: Window, channels: int) -> Gram:
-    """The same of a window whose effects are not asked for. Raises DiagnoseError: as :func:`gram_of`."""
+    """The same of a window whose effects are not asked for.
+
+    Raises DiagnoseError: as :func:`gram_of`.
+    """
     return gram_of(replace(window, effects=window.effects[:, :0]), np.zeros(0), channels)
 
 
@@ -172,12 +203,27 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
 
 
 def gram_with(window: Window, inner: np.ndarray, cross: np.ndarray, square: np.ndarray) -> Gram:
-    """The gram of a window whose inner products are known, see :class:`Gram`; its latents are at the knots."""
+    """The gram of a window whose inner products are known, see :class:`Gram`; its latents are at
+    the knots.
+    """
     count = np.bincount(window.channel, minlength=len(square)).astype(float)
     blocks, states = np.asarray(window.latent_block, dtype=int), window.nuisance.shape[1]
-    turned = sum(rows.shape[1] * float(np.log(np.diag(factor)).sum()) for rows, factor in window.correlated)
-    return Gram(window.flight, window.phase, count, inner, cross, square, states, blocks, np.eye(len(blocks)),
-                _shown(inner, states, blocks), float(np.log(window.sigma).sum()) + turned)  # fmt: skip
+    turned = sum(
+        rows.shape[1] * float(np.log(np.diag(factor)).sum()) for rows, factor in window.correlated
+    )
+    return Gram(
+        window.flight,
+        window.phase,
+        count,
+        inner,
+        cross,
+        square,
+        states,
+        blocks,
+        np.eye(len(blocks)),
+        _shown(inner, states, blocks),
+        float(np.log(window.sigma).sum()) + turned,
+    )
 
 
 def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
@@ -187,43 +233,63 @@ def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float
 
 
 def check(window: Window, effects: int, channels: int) -> None:
-    """Refuse a window whose arrays do not fit together. Raises DiagnoseError: they do not, or hold NaN or infinity."""
+    """Refuse a window whose arrays do not fit together.
+
+    Raises DiagnoseError: they do not, or hold NaN or infinity.
+    """
     n = len(window.residual)
     where = f"window of flight {window.flight}, phase {window.phase}"
-    shapes = {"time": window.time.shape[:1], "channel": window.channel.shape, "sigma": window.sigma.shape,
-              "effects": window.effects.shape[:1], "nuisance": window.nuisance.shape[:1]}  # fmt: skip
+    shapes = {
+        "time": window.time.shape[:1],
+        "channel": window.channel.shape,
+        "sigma": window.sigma.shape,
+        "effects": window.effects.shape[:1],
+        "nuisance": window.nuisance.shape[:1],
+    }
     wrong = {name: shape for name, shape in shapes.items() if shape != (n,)}
     if wrong or window.effects.shape[1] != effects:
-        raise DiagnoseError(f"{where}: {n} residuals and {effects} effects, but {wrong or window.effects.shape}")
+        raise DiagnoseError(
+            f"{where}: {n} residuals and {effects} effects, but {wrong or window.effects.shape}"
+        )
     if n and (window.channel.max() >= channels or not np.all(window.sigma > 0.0)):
-        raise DiagnoseError(f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0")
+        raise DiagnoseError(
+            f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0"
+        )
     if not finite(window):
         raise DiagnoseError(f"{where}: a residual or a derivative is not finite")
 
 
 def finite(window: Window) -> bool:
     """Whether a window was simulated."""
-    return all(np.all(np.isfinite(a)) for a in (window.residual, window.effects, window.nuisance, window.latent))
+    return all(
+        np.all(np.isfinite(a))
+        for a in (window.residual, window.effects, window.nuisance, window.latent)
+    )
 
 
 def correlated(gram: Gram, window: Window, time: float) -> Gram:
-    """Multiply the Cholesky factor of Ornstein-Uhlenbeck latents into a Gram whose factor is still the identity.
+    """Multiply the Cholesky factor of Ornstein-Uhlenbeck latents into a Gram whose factor is still
+    the identity.
 
-    ``window``: for the knots; ``time``: correlation time [s]; latent forces at knots dt apart correlate by exp(-dt/time).
-    """
+    ``window``: for the knots; ``time``: correlation time [s]; latent forces at knots dt apart
+    correlate by exp(-dt/time)."""
     if not gram.latents:
         return gram
     own = knot_factor(window, time)
     knots, groups = len(own), gram.latents // len(own)
     part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
     inner = gram.inner.copy()
-    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(channels, -1, size)
+    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
+        channels, -1, size
+    )
     inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ own).reshape(channels, size, -1)
     return correlated_with(gram, inner, own)
 
 
 def knot_factor(window: Window, time: float) -> np.ndarray:
-    """Cholesky factor of the latents of one group of a window, which is that of all others; see :func:`correlated`."""
+    """Cholesky factor of the latents of one group of a window, which is that of all others; see
+    :func:`correlated`.
+    """
     group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
     knots = _knots(group, window.latent_time)
     lag = np.abs(window.latent_time[:knots, None] - window.latent_time[:knots])
@@ -231,19 +297,28 @@ def knot_factor(window: Window, time: float) -> np.ndarray:
     return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
 
 
-def correlated_with(gram: Gram, inner: np.ndarray, own: np.ndarray, there: There | None = None) -> Gram:
-    """The gram into which a factor of each group's knots was multiplied, with the inner products that came of it."""
+def correlated_with(
+    gram: Gram, inner: np.ndarray, own: np.ndarray, there: There | None = None
+) -> Gram:
+    """The gram into which a factor of each group's knots was multiplied, with the inner products
+    that came of it.
+    """
     part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.copy()
     cross[:, part] = (cross[:, part].reshape(-1, len(own)) @ own).reshape(len(cross), -1)
     groups = gram.latents // len(own)
     factor, every = np.zeros((groups, len(own), groups, len(own))), range(groups)
     factor[every, :, every] = own  # of each group, the same
-    factor, shown = factor.reshape(gram.latents, gram.latents), _shown(inner, gram.nuisances, gram.latent_block)
+    factor, shown = (
+        factor.reshape(gram.latents, gram.latents),
+        _shown(inner, gram.nuisances, gram.latent_block),
+    )
     return replace(gram, inner=inner, cross=cross, factor=factor, shown=shown, there=there)
 
 
 def _knots(group: np.ndarray, time: np.ndarray) -> int:
-    """Knots of groups that follow one another with the same ones each; where they do not, all latents are one."""
+    """Knots of groups that follow one another with the same ones each; where they do not, all
+    latents are one.
+    """
     count = int(np.count_nonzero(group == group[0]))
     if len(group) % count:
         return len(group)
@@ -257,7 +332,11 @@ def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.n
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
     weighted[np.arange(len(residual)), window.channel] = _back(window, white) / window.sigma
     by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
-    by_latent = (window.latent.T @ weighted).T @ gram.factor if gram.latents else np.zeros((len(gram.count), 0))
+    by_latent = (
+        (window.latent.T @ weighted).T @ gram.factor
+        if gram.latents
+        else np.zeros((len(gram.count), 0))
+    )
     by_effect = (window.effects.T @ weighted).T * floors
     square = np.bincount(window.channel, white**2, len(gram.count))
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
@@ -272,14 +351,18 @@ def _back(window: Window, white: np.ndarray) -> np.ndarray:
 
 
 def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
-    """What an initial state in prior deviations and latents at the knots, shape (D + L,), leave of the residual, shape (N,)."""
+    """What an initial state in prior deviations and latents at the knots, shape (D + L,), leave of
+    the residual, shape (N,).
+    """
     states = window.nuisance.shape[1]
     left = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
     return left - window.latent @ fit[states:] if len(fit) > states else left
 
 
 def with_products(gram: Gram, cross: np.ndarray, square: np.ndarray) -> Gram:
-    """The same derivatives with other residuals, whose inner products with columns at the knots, and with themselves, are known."""
+    """The same derivatives with other residuals, whose inner products with columns at the knots,
+    and with themselves, are known.
+    """
     part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), cross.copy()
     cross[:, part] = cross[:, part] @ gram.factor
     return replace(gram, cross=cross, square=square)
@@ -306,11 +389,13 @@ class WindowStatistics(Share):
 def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
     """Add up windows by flight.
 
-    ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out negative beyond rounding.
-    """
+    ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out
+    negative beyond rounding."""
     flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
     size, count = len(theta), len(flights)
-    information, score, square, samples = (np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ()))
+    information, score, square, samples = (
+        np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ())
+    )
     for i, gram, part in zip(row, grams, parts):
         information[i] += part.information
         score[i] += part.score
@@ -319,13 +404,22 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
     lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
     if lowest < -1e-5:
-        raise DiagnoseError(f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives are broken")
-    if lowest < 0.0:  # rounding, which wide priors of several named effects would turn into evidence
-        information -= 2.0 * lowest * information * np.eye(size)  # what says nothing of an effect stays silent
+        raise DiagnoseError(
+            f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives"
+            " are broken"
+        )
+    if (
+        lowest < 0.0
+    ):  # rounding, which wide priors of several named effects would turn into evidence
+        information -= (
+            2.0 * lowest * information * np.eye(size)
+        )  # what says nothing of an effect stays silent
     return Statistics(flights, information, score, square, samples, np.array(theta, dtype=float))
 
 
-def rescored(known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
+def rescored(
+    known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray
+) -> Statistics:
     """What windows say with other residuals: their information stays.
 
     ``known``: of the same windows; ``theta``: linearisation point in floors, shape (K,).

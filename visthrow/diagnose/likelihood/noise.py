@@ -1,9 +1,10 @@
-"""Noise levels: sensor noise from differences of neighbours, latent forces from the likelihood of all windows.
+"""Noise levels: sensor noise from differences of neighbours, latent forces from the likelihood of
+all windows.
 
-A pure fit of everything by maximum likelihood is pulled away by one bad window; hence three guards, each tested by a planted
-fault: single samples far outside lose weight (Huber), a window's latent forces may be stronger or weaker than its phase's (their
-variance has an inverse gamma prior about it, so that the forces have Student's heavy tails), and every level is bounded.
-"""
+A pure fit of everything by maximum likelihood is pulled away by one bad window; hence three guards,
+each tested by a planted fault: single samples far outside lose weight (Huber), a window's latent
+forces may be stronger or weaker than its phase's (their variance has an inverse gamma prior about
+it, so that the forces have Student's heavy tails), and every level is bounded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,37 +26,51 @@ CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
 SCALE_BOUNDS = (0.3, 10.0)  # of a channel's sigma against what the model said
 
 LEVEL_LOW, LEVEL_HIGH = 1e-2, 1e4
-"""Latent deviations, in the level at which they become visible. A hundredth of it is as good as none: thousands of knots
-together do not show it, and far below it slopes are lost in rounding."""
+"""Latent deviations, in the level at which they become visible.
+
+A hundredth of it is as good as none: thousands of knots together do not show it, and far below it
+slopes are lost in rounding.
+"""
 
 HUBER = 6.0  # sigmas from which a sample loses weight
-HUBER_SHARE = 0.02  # more samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible
+# more samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible
+HUBER_SHARE = 0.02
 SHARE_BOUNDS = (0.1, 1e3)  # latent deviation of a window, in its phase's
 
 PRIOR_CURVATURE = (0.05, 2.0)
-"""Limits of the prior's curvature by the logarithm of a window's share, in that at 1: it falls where windows stand far out."""
+"""Limits of the prior's curvature by the logarithm of a window's share, in that at 1: it falls
+where windows stand far out.
+"""
 
 CLEANINGS = 4  # rounds in which outliers lose weight
-WIDE = 30.0  # latent forces while outliers are looked for, in the level at which they become visible
+WIDE = (
+    30.0  # latent forces while outliers are looked for, in the level at which they become visible
+)
 
 ITERATIONS = 40
 ENOUGH_NATS, ROUGHLY_NATS = 0.2, 1.0
-"""A step that promises less is the last in the search for the levels, and leaves some twentieth of it; while correlation times are
-compared."""
-LONGEST_FALL = 1.0  # of the logarithm of a level in one step: its variance may be predicted to fall below 0
+"""A step that promises less is the last in the search for the levels, and leaves some twentieth of
+it; while correlation times are compared.
+"""
+LONGEST_FALL = (
+    1.0  # of the logarithm of a level in one step: its variance may be predicted to fall below 0
+)
 HALVINGS = 8
 STALLED = 1e-9  # of the step: limits and levels count as met within this
 
 
 def fit(
-    windows: Sequence[Window], grams: Sequence[Gram], start: Noise | None = None, device: str = "cpu"
+    windows: Sequence[Window],
+    grams: Sequence[Gram],
+    start: Noise | None = None,
+    device: str = "cpu",
 ) -> tuple[Noise, list[Gram]]:
     """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
 
-    ``windows``: for the knots of the latent forces; ``grams``: of the windows, with ``factor`` the identity; ``start``: an earlier
-    estimate: its correlation time is kept, its levels are where the search starts. Returns the levels, and the grams with correlated latent
-    forces that belong to them.
-    """
+    ``windows``: for the knots of the latent forces; ``grams``: of the windows, with ``factor`` the
+    identity; ``start``: an earlier estimate: its correlation time is kept, its levels are where the
+    search starts. Returns the levels, and the grams with correlated latent forces that belong to
+    them."""
     noise, time = start, CORRELATION_TIMES[0] if start is None else start.correlation_time
     if start is None and any(gram.latents for gram in grams):
         noise = _likeliest(windows, grams, device)
@@ -66,7 +81,9 @@ def fit(
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) -> Noise:
-    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood has one maximum over it."""
+    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
+    has one maximum over it.
+    """
     bare, found = [without_effects(gram) for gram in grams], {}
 
     def likely(i: int, noise: Noise | None) -> float:
@@ -79,7 +96,10 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
     best = len(CORRELATION_TIMES) // 2
     likely(best, None)
     for way in (-1, 1):
-        while 0 <= best + way < len(CORRELATION_TIMES) and likely(best + way, found[best][0]) > found[best][1]:
+        while (
+            0 <= best + way < len(CORRELATION_TIMES)
+            and likely(best + way, found[best][0]) > found[best][1]
+        ):
             best += way
     return found[best][0]
 
@@ -91,10 +111,17 @@ def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
 
 
 def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, float]:
-    """Rough levels of grams with correlated latents, and their log-likelihood; ``start``: levels of like grams, to search from."""
+    """Rough levels of grams with correlated latents, and their log-likelihood; ``start``: levels of
+    like grams, to search from.
+    """
     guess = _first_guess(grams)
     if start is not None:
-        guess = replace(start, latent_sd={key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()})
+        guess = replace(
+            start,
+            latent_sd={
+                key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()
+            },
+        )
     return maximised(grams, guess, "cpu", ROUGHLY_NATS)
 
 
@@ -106,77 +133,125 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
         for block, seen in gram.shown.items():
             if seen > 0.0:  # else these forces show nowhere in the window
                 visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(seen))
-    return Noise(scale, {key: float(np.median(v)) for key, v in visible.items()}, CORRELATION_TIMES[0],
-                 np.ones((len(grams), len(LATENT_BLOCKS))))  # fmt: skip
+    return Noise(
+        scale,
+        {key: float(np.median(v)) for key, v in visible.items()},
+        CORRELATION_TIMES[0],
+        np.ones((len(grams), len(LATENT_BLOCKS))),
+    )
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where each level stands among the parameters of the search: phases' levels, windows' shares of them, sensor scales."""
+    """Where each level stands among the parameters of the search: phases' levels, windows' shares
+    of them, sensor scales.
+    """
 
     keys: tuple[tuple[int, str], ...]  # (block, phase)
     pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
     phases: np.ndarray  # of each share, the number of its phase's level, shape (S,)
     seen: np.ndarray  # channels with samples
-    slopes: np.ndarray  # of each entry of the windows' own gradients that counts: its place there, and its parameter, shape (2, E)
+    # of each entry of the windows' own gradients that counts: its place there, and its parameter,
+    # shape (2, E)
+    slopes: np.ndarray
     curvatures: np.ndarray  # the same of their own curvatures, and pairs of parameters
 
     @staticmethod
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
         """Number the parameters: of the same windows, once."""
         count, phases = sum(gram.count for gram in grams), tuple(gram.phase for gram in grams)
-        latents, seen = designs.Same([gram.latent_block for gram in grams]), tuple(np.flatnonzero(count > 0).tolist())
+        latents, seen = (
+            designs.Same([gram.latent_block for gram in grams]),
+            tuple(np.flatnonzero(count > 0).tolist()),
+        )
         return _Layout._numbered(latents, phases, tuple(sorted(noise.latent_sd)), seen, len(count))
 
     @staticmethod
     @lru_cache(maxsize=8)
-    def _numbered(latents: designs.Same, names: tuple, keys: tuple, channels: tuple[int, ...], count: int) -> "_Layout":
-        """``latents``, ``names``: blocks of each window's latents, and its phase; ``channels``: those with samples, of so many."""
-        index, blocks, seen = {key: i for i, key in enumerate(keys)}, len(LATENT_BLOCKS), np.array(channels, dtype=int)
-        present = [[b for b in range(blocks) if (b, name) in index and np.any(own == b)] for own, name in zip(latents, names)]
-        pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(-1, 2)
-        phases = np.array([index[b, name] for name, own in zip(names, present) for b in own], dtype=int)
+    def _numbered(
+        latents: designs.Same, names: tuple, keys: tuple, channels: tuple[int, ...], count: int
+    ) -> "_Layout":
+        """``latents``, ``names``: blocks of each window's latents, and its phase; ``channels``:
+        those with samples, of so many.
+        """
+        index, blocks, seen = (
+            {key: i for i, key in enumerate(keys)},
+            len(LATENT_BLOCKS),
+            np.array(channels, dtype=int),
+        )
+        present = [
+            [b for b in range(blocks) if (b, name) in index and np.any(own == b)]
+            for own, name in zip(latents, names)
+        ]
+        pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(
+            -1, 2
+        )
+        phases = np.array(
+            [index[b, name] for name, own in zip(names, present) for b in own], dtype=int
+        )
         first = len(keys) + len(pairs)
         size, width, at = first + len(seen), blocks + count, len(keys)
         slopes, curvatures = [], []
         for w, (name, own) in enumerate(zip(names, present)):
             shared = [index[b, name] for b in own]
             to = np.array([*shared, *range(at, at + len(own)), *range(first, size)], dtype=int)
-            part = np.array([*own, *own, *(blocks + seen)], dtype=int)  # levels and shares of the blocks, scales
+            part = np.array(
+                [*own, *own, *(blocks + seen)], dtype=int
+            )  # levels and shares of the blocks, scales
             slopes.append((w * width + part, to))
-            curvatures.append([(w * width * width + np.add.outer(width * part, part)).ravel(), np.add.outer(size * to, to).ravel()])
+            curvatures.append(
+                [
+                    (w * width * width + np.add.outer(width * part, part)).ravel(),
+                    np.add.outer(size * to, to).ravel(),
+                ]
+            )
             at += len(own)
         return _Layout(keys, pairs, phases, seen, np.hstack(slopes), np.hstack(curvatures))
 
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
         shared = [noise.latent_sd[key] for key in self.keys]
-        return np.log(np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.seen])))
+        return np.log(
+            np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.seen]))
+        )
 
     def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
         """The levels; ``noise`` tells all others."""
         first, last = len(self.keys), len(self.keys) + len(self.pairs)
         share, scale = noise.share.copy(), noise.scale.copy()
         share[tuple(self.pairs.T)], scale[self.seen] = np.exp(x[first:last]), np.exp(x[last:])
-        return replace(noise, scale=scale, share=share, latent_sd=dict(zip(self.keys, np.exp(x[:first]).tolist())))
+        return replace(
+            noise,
+            scale=scale,
+            share=share,
+            latent_sd=dict(zip(self.keys, np.exp(x[:first]).tolist())),
+        )
 
     def limits(self, grams: Sequence[Gram]) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest values of the parameters."""
         guess = _first_guess(grams).latent_sd
         visible = np.log([guess[key] for key in self.keys])
         sizes = len(self.pairs), len(self.seen)
-        bounds = ((np.log(low) + visible, np.full(sizes[0], np.log(share)), np.full(sizes[1], np.log(scale)))
-                  for low, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS))  # fmt: skip
+        bounds = (
+            (
+                np.log(low) + visible,
+                np.full(sizes[0], np.log(share)),
+                np.full(sizes[1], np.log(scale)),
+            )
+            for low, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS)
+        )
         low, high = map(np.concatenate, bounds)
         return low, high
 
 
-def maximised(grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS) -> tuple[Noise, float]:
+def maximised(
+    grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS
+) -> tuple[Noise, float]:
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
-    By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at all windows suffice.
-    ``noise``: where the search starts; ``enough``: nats; a step that promises less is the last.
-    """
+    By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at
+    all windows suffice. ``noise``: where the search starts; ``enough``: nats; a step that promises
+    less is the last."""
     layout, stack = _Layout.of(grams, noise), Stack(grams, device)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
@@ -201,15 +276,25 @@ def maximised(grams: Sequence[Gram], noise: Noise, device: str, enough: float = 
 
 
 def _scoring_step(
-    layout: _Layout, x: np.ndarray, slope: np.ndarray, curvature: np.ndarray, low: np.ndarray, high: np.ndarray
+    layout: _Layout,
+    x: np.ndarray,
+    slope: np.ndarray,
+    curvature: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
 ) -> tuple[np.ndarray, float]:
-    """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that it promises.
+    """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that
+    it promises.
 
-    What a limit holds back stays there, and the others move without it. A variance far too small shows in no likelihood's
-    logarithm, but its own step is finite. A window's variance takes the steps of its phase's level and of its share together.
-    """
+    What a limit holds back stays there, and the others move without it. A variance far too small
+    shows in no likelihood's logarithm, but its own step is finite. A window's variance takes the
+    steps of its phase's level and of its share together."""
     known = np.diag(curvature)
-    free = (known > 0.0) & ~((x <= low + STALLED) & (slope < 0.0)) & ~((x >= high - STALLED) & (slope > 0.0))
+    free = (
+        (known > 0.0)
+        & ~((x <= low + STALLED) & (slope < 0.0))
+        & ~((x >= high - STALLED) & (slope > 0.0))
+    )
     step = np.zeros_like(x)
     if not np.any(free):
         return step, 0.0
@@ -221,7 +306,10 @@ def _scoring_step(
     _, found, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
     step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else found) / size
     promised = float(slope @ step)
-    shares, turned = slice(len(layout.keys), len(layout.keys) + len(layout.pairs)), _logarithms(step)
+    shares, turned = (
+        slice(len(layout.keys), len(layout.keys) + len(layout.pairs)),
+        _logarithms(step),
+    )
     turned[shares] = _logarithms(step[shares] + step[layout.phases]) - turned[layout.phases]
     return np.clip(x + turned, low, high) - x, promised
 
@@ -231,8 +319,12 @@ def _logarithms(step: np.ndarray) -> np.ndarray:
     return 0.5 * np.log1p(np.maximum(2.0 * step, np.expm1(-2.0 * LONGEST_FALL)))
 
 
-def _likelihood(stack: Stack, noise: Noise, layout: _Layout, first: bool = False) -> tuple[float, np.ndarray, np.ndarray]:
-    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its expected curvature."""
+def _likelihood(
+    stack: Stack, noise: Noise, layout: _Layout, first: bool = False
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its
+    expected curvature.
+    """
     size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
     value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
     own = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
@@ -246,17 +338,26 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout, first: bool = False
     return value + float(values.sum()), slope, curvature
 
 
-def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: np.ndarray, device: str = "cpu") -> list[Window]:
-    """Give single samples far outside a sigma that puts them at HUBER; windows with none are returned as they are.
+def without_outliers(
+    windows: Sequence[Window], grams: Sequence[Gram], floors: np.ndarray, device: str = "cpu"
+) -> list[Window]:
+    """Give single samples far outside a sigma that puts them at HUBER; windows with none are
+    returned as they are.
 
-    Latent forces have a wide prior here, so that a missing effect is followed and only what no force can do stands out.
-    ``grams``: of the windows, with ``factor`` the identity; ``floors``: of the effects, shape (K,).
-    """
+    Latent forces have a wide prior here, so that a missing effect is followed and only what no
+    force can do stands out. ``grams``: of the windows, with ``factor`` the identity; ``floors``: of
+    the effects, shape (K,)."""
     sigmas = [window.sigma for window in windows]
-    left, given, bare = list(range(len(windows))), list(windows), [without_effects(gram) for gram in grams]
+    left, given, bare = (
+        list(range(len(windows))),
+        list(windows),
+        [without_effects(gram) for gram in grams],
+    )
     for again in range(CLEANINGS):
         where = "cpu" if again else device  # few are looked at once more
-        residuals = designs.left_by(given, floors, len(grams[0].count), widely_fitted(given, bare, where), where)
+        residuals = designs.left_by(
+            given, floors, len(grams[0].count), widely_fitted(given, bare, where), where
+        )
         far = {w: _far(windows[w], residual) for w, residual in zip(left, residuals)}
         left = [w for w in left if np.any(far[w] > 1.0)]
         if not left:
@@ -269,7 +370,9 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram], floors: n
 
 
 def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
-    """Initial states in prior deviations and latents at the knots that explain most, with wide priors of the latents."""
+    """Initial states in prior deviations and latents at the knots that explain most, with wide
+    priors of the latents.
+    """
     time = CORRELATION_TIMES[0]
     shaped = designs.correlated_of(bare, windows, time, device)
     share = np.zeros((len(bare), len(LATENT_BLOCKS)))
@@ -291,4 +394,8 @@ def _far(window: Window, left: np.ndarray) -> np.ndarray:
 
 def _mended(window: Window, sigma: np.ndarray) -> Window:
     """The window with other sigmas, where these differ in a few samples."""
-    return replace(window, sigma=sigma) if 0.0 < (sigma > window.sigma).mean() <= HUBER_SHARE else window
+    return (
+        replace(window, sigma=sigma)
+        if 0.0 < (sigma > window.sigma).mean() <= HUBER_SHARE
+        else window
+    )

@@ -1,8 +1,8 @@
-"""Windows side by side: what noise levels are worth in all of them at once, on the CPU's cores or where the simulation runs.
+"""Windows side by side: what noise levels are worth in all of them at once, on the CPU's cores or
+where the simulation runs.
 
-The same algebra as :mod:`visthrow.diagnose.likelihood.marginal`, for grams that are padded to one size: on a GPU in one batch, on a CPU in
-batches that fit its cache.
-"""
+The same algebra as :mod:`visthrow.diagnose.likelihood.marginal`, for grams that are padded to one
+size: on a GPU in one batch, on a CPU in batches that fit its cache."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,32 +16,49 @@ from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.designs import Same, padded
-from visthrow.diagnose.likelihood.marginal import Gram, Noise, Share, Statistics, There, WindowStatistics
+from visthrow.diagnose.likelihood.marginal import (
+    Gram,
+    Noise,
+    Share,
+    Statistics,
+    There,
+    WindowStatistics,
+)
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.likelihood.transfer import all_to_host
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 
 T = TypeVar("T")
 
-ROUNDING = 1e-10  # relative growth of the normal equations' diagonal where they are positive definite but for rounding
+# relative growth of the normal equations' diagonal where they are positive definite but for
+# rounding
+ROUNDING = 1e-10
 
 BATCH = 8  # windows of a batch on the CPU
-BEGUN = 4  # noise levels that are kept: a round's, and those that its candidates come to while sizes and levels are estimated in turn
+# noise levels that are kept: a round's, and those that its candidates come to while sizes and
+# levels are estimated in turn
+BEGUN = 4
 BLOCKS = len(LATENT_BLOCKS)
 
 
 class _Columns:
-    """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded columns are 0."""
+    """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded
+    columns are 0.
+    """
 
     def __init__(self, inner: Sequence[There | np.ndarray], sizes: Sequence[int], device: str):
-        """Keep them; ``inner``: of each window, shape (C, P, P); ``sizes``: of each window, its hidden columns."""
+        """Keep them; ``inner``: of each window, shape (C, P, P); ``sizes``: of each window, its
+        hidden columns.
+        """
         self._inner, self._sizes, self._device = inner, sizes, device
         whole = inner[0].of if isinstance(inner[0], There) else inner[0]
         self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
         self._begun, self._lock = {}, Lock()
 
     def begun(self, noise: tuple, shaped: Callable[[], T]) -> T:
-        """What belongs to noise levels at which several searches begin, calculated by the first of them."""
+        """What belongs to noise levels at which several searches begin, calculated by the first of
+        them.
+        """
         with self._lock:
             found = self._begun.pop(noise, None) or shaped()
             self._begun = dict([*self._begun.items(), (noise, found)][-BEGUN:])
@@ -56,19 +73,29 @@ class _Columns:
     @cached_property
     def beside(self) -> torch.Tensor:
         """Hidden columns with effects, shape (W, C, n, K)."""
-        return self._moved(max(self._sizes), self._effects, lambda inner, w: inner[:, : self._sizes[w], self._sizes[w] :])
+        return self._moved(
+            max(self._sizes),
+            self._effects,
+            lambda inner, w: inner[:, : self._sizes[w], self._sizes[w] :],
+        )
 
     @cached_property
     def own(self) -> torch.Tensor:
         """Shape (W, C, K, K)."""
-        return self._moved(self._effects, self._effects, lambda inner, w: inner[:, self._sizes[w] :, self._sizes[w] :])
+        return self._moved(
+            self._effects,
+            self._effects,
+            lambda inner, w: inner[:, self._sizes[w] :, self._sizes[w] :],
+        )
 
     def _moved(self, height: int, width: int, part: Callable[[T, int], T]) -> torch.Tensor:
         return padded(self._inner, part, (self._channels, height, width), self._device)
 
 
 _ON_GPU, _ON_CPU = (lru_cache(maxsize=most)(_Columns) for most in (2, 32))
-"""Columns that are laid side by side already: residuals and noise levels change far more often than derivatives do."""
+"""Columns that are laid side by side already: residuals and noise levels change far more often than
+derivatives do.
+"""
 
 
 @dataclass(frozen=True)
@@ -111,34 +138,46 @@ def integrals(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> "Inte
 
 
 def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list[WindowStatistics]:
-    """What windows say of their effects, and of their latent forces at the knots as if they were effects."""
+    """What windows say of their effects, and of their latent forces at the knots as if they were
+    effects.
+    """
     whole = Stack(grams, device).integrals(noise, latents=True)
     return each(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
 
 
 def _of_latents(share: Share, gram: Gram) -> WindowStatistics:
     latents, whole = gram.latents, share.information
-    back = lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor  # from unit latents to knots
+    back = (
+        lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor
+    )  # from unit latents to knots
     return WindowStatistics(
-        whole[latents:, latents:], share.score[latents:], share.square,
-        back.T @ whole[:latents, :latents] @ back, back.T @ share.score[:latents], back.T @ whole[:latents, latents:],
-    )  # fmt: skip
+        whole[latents:, latents:],
+        share.score[latents:],
+        share.square,
+        back.T @ whole[:latents, :latents] @ back,
+        back.T @ share.score[:latents],
+        back.T @ whole[:latents, latents:],
+    )
 
 
 class Stack:
     """Some windows' inner products of initial states and latent forces."""
 
-    def __init__(self, grams: Sequence[Gram], device: str = "cpu", windows: Sequence[int] | None = None):
+    def __init__(
+        self, grams: Sequence[Gram], device: str = "cpu", windows: Sequence[int] | None = None
+    ):
         """Pad and move.
 
-        ``grams``: of the windows, with or without effects; ``windows``: of each gram, the row of the noise's shares; default: their order.
-        """
+        ``grams``: of the windows, with or without effects; ``windows``: of each gram, the row of
+        the noise's shares; default: their order."""
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
         self.device, size = device, BATCH if device == "cpu" else max(len(grams), 1)
         self._sizes = [gram.nuisances + gram.latents for gram in grams]
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
         self._order = [order[first : first + size] for first in range(0, len(order), size)]
-        self._batches = each(lambda own: self._padded([grams[w] for w in own], rows[own]), self._order)
+        self._batches = each(
+            lambda own: self._padded([grams[w] for w in own], rows[own]), self._order
+        )
         self._count = len(grams)
 
     def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
@@ -150,47 +189,72 @@ class Stack:
             cross[w, :, :size] = gram.cross[:, :size]
             member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
             known[w, : gram.nuisances] = 1.0
-        square, counts = (np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count"))
+        square, counts = (
+            np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count")
+        )
         log_sigma = np.array([gram.log_sigma for gram in grams])
-        arrays = [torch.from_numpy(a).to(self.device) for a in (cross, square, counts, log_sigma, member, known)]
+        arrays = [
+            torch.from_numpy(a).to(self.device)
+            for a in (cross, square, counts, log_sigma, member, known)
+        ]
         inner = [gram.placed for gram in grams]
-        columns = (_ON_CPU if self.device == "cpu" else _ON_GPU)(Same(inner), tuple(sizes), self.device)
+        columns = (_ON_CPU if self.device == "cpu" else _ON_GPU)(
+            Same(inner), tuple(sizes), self.device
+        )
         phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
         return _Batch(windows, (phases.tolist(), phase), list(grams), columns, *arrays)
 
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
 
-        Raises DiagnoseError: the normal equations are not positive definite, which only broken derivatives can cause.
-        """
-        return self._in_order([part for (part,) in self._each(lambda batch: (_solved(_shape(batch, noise), batch).value,))])
+        Raises DiagnoseError: the normal equations are not positive definite, which only broken
+        derivatives can cause."""
+        return self._in_order(
+            [
+                part
+                for (part,) in self._each(
+                    lambda batch: (_solved(_shape(batch, noise), batch).value,)
+                )
+            ]
+        )
 
     def fitted(self, noise: Noise) -> list[np.ndarray]:
-        """Most probable initial state and unit latent forces of each window, shape (D + L,). Raises DiagnoseError: as :meth:`values`."""
+        """Most probable initial state and unit latent forces of each window, shape (D + L,).
+
+        Raises DiagnoseError: as :meth:`values`.
+        """
 
         def found(batch: _Batch) -> tuple[torch.Tensor]:
             at = _shape(batch, noise)
             return (at.level * _solved(at, batch).mean,)
 
-        by_window = {w: row for own, (rows,) in zip(self._order, self._each(found)) for w, row in zip(own, rows)}
+        by_window = {
+            w: row
+            for own, (rows,) in zip(self._order, self._each(found))
+            for w, row in zip(own, rows)
+        }
         return [by_window[w][:size] for w, size in enumerate(self._sizes)]
 
     def look(self, noise: Noise, first: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own levels.
+        """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own
+        levels.
 
-        ``first``: whether others may look at these levels as well, with other residuals. Raises DiagnoseError: as :meth:`values`.
-        Returns values (W,); gradients (W, B + C) by the B blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What
-        the scales share with the fitted columns is given to the channels by their part in them.
-        """
+        ``first``: whether others may look at these levels as well, with other residuals. Raises
+        DiagnoseError: as :meth:`values`. Returns values (W,); gradients (W, B + C) by the B blocks'
+        deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales share
+        with the fitted columns is given to the channels by their part in them."""
         found = self._each(lambda batch: _looked(batch, noise, first))
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
 
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
-        """What is left of the effects' columns of each window, or of those of latent forces and effects.
+        """What is left of the effects' columns of each window, or of those of latent forces and
+        effects.
 
         Raises DiagnoseError: as :meth:`values`.
         """
-        return Integrals(self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches))
+        return Integrals(
+            self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches)
+        )
 
     def _each(self, function) -> list[tuple[np.ndarray, ...]]:
         return each(lambda batch: tuple(all_to_host(function(batch))), self._batches)
@@ -205,7 +269,9 @@ class Stack:
 def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
     """Deviation of each window's latent forces by block, shape (W, B)."""
     phases, phase = batch.phases
-    shared = np.array([[noise.latent_sd.get((b, name), 0.0) for b in range(BLOCKS)] for name in phases])
+    shared = np.array(
+        [[noise.latent_sd.get((b, name), 0.0) for b in range(BLOCKS)] for name in phases]
+    )
     return shared[phase] * noise.share[batch.windows]
 
 
@@ -220,14 +286,17 @@ def _shape(batch: _Batch, noise: Noise) -> _Shape:
     normal.diagonal(dim1=1, dim2=2).add_(1.0)
     factor, failed = torch.linalg.cholesky_ex(normal)
     if torch.any(failed):
-        # Levels of many orders of magnitude, as a search for them may try, leave the identity below rounding.
+        # Levels of many orders of magnitude, as a search for them may try, leave the identity below
+        # rounding.
         normal.diagonal(dim1=1, dim2=2).mul_(1.0 + ROUNDING * (failed[:, None] > 0))
         factor, failed = torch.linalg.cholesky_ex(normal)
         if torch.any(failed):
             w = int(torch.nonzero(failed)[0, 0])
             where = f"window of flight {batch.grams[w].flight}, phase {batch.grams[w].phase}"
             raise DiagnoseError(f"{where}: the normal equations are singular")
-    log_det = 2.0 * (factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log())
+    log_det = 2.0 * (
+        factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log()
+    )
     return _Shape(weight, level, factor, log_det)
 
 
@@ -236,14 +305,22 @@ def _solved(at: _Shape, batch: _Batch) -> _Solved:
     right = (at.level * (at.weight @ batch.cross))[:, :, None]
     along = torch.linalg.solve_triangular(at.factor, right, upper=False)
     mean = torch.linalg.solve_triangular(at.factor.mT, along, upper=True)[..., 0]
-    return _Solved(mean, -0.5 * (batch.square @ at.weight - along.square().sum((1, 2)) + at.log_det))
+    return _Solved(
+        mean, -0.5 * (batch.square @ at.weight - along.square().sum((1, 2)) + at.log_det)
+    )
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
-    """Inverse of matrices whose lower Cholesky factors these are; a GPU's own goes through them one by one."""
+    """Inverse of matrices whose lower Cholesky factors these are; a GPU's own goes through them one
+    by one.
+    """
     if not factor.is_cuda:
-        return torch.cholesky_inverse(factor).mT  # it comes by columns, beside all else by rows; it is symmetric
-    back = torch.linalg.solve_triangular(factor, torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device), upper=False)
+        return torch.cholesky_inverse(
+            factor
+        ).mT  # it comes by columns, beside all else by rows; it is symmetric
+    back = torch.linalg.solve_triangular(
+        factor, torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device), upper=False
+    )
     return back.mT @ back
 
 
@@ -254,27 +331,40 @@ def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
 
 
 def _curved(at: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Posterior variances of [b, a] (W, n), what these leave of each channel's squares (W, C), and curvature by [blocks, scales]."""
+    """Posterior variances of [b, a] (W, n), what these leave of each channel's squares (W, C), and
+    curvature by [blocks, scales].
+    """
     covariance = _inverse(at.factor)
     variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2).clone(), batch.count.shape
     in_blocks = batch.member.mT
     scaled = covariance * at.level[:, :, None] * at.level[:, None]
-    spread = (batch.columns.hidden * scaled[:, None]).sum((2, 3))  # as products of matrices they take ten times as long on a GPU
-    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is kept from taking others.
+    spread = (batch.columns.hidden * scaled[:, None]).sum(
+        (2, 3)
+    )  # as products of matrices they take ten times as long on a GPU
+    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
+    # kept from taking others.
     taken = torch.minimum(torch.clamp(at.weight * spread, min=0.0), batch.count)
     squared = covariance.square_()
     shared = (in_blocks @ (variance - squared.sum(-1))[:, :, None])[..., 0]
     squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
     curvature = at.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
     curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
-    mixed = 2.0 * shared[:, :, None] * (taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300))[:, None]
+    mixed = (
+        2.0
+        * shared[:, :, None]
+        * (taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300))[:, None]
+    )
     curvature[:, :BLOCKS, BLOCKS:] = mixed
     curvature[:, BLOCKS:, :BLOCKS] = mixed.mT
-    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * torch.clamp(batch.count - taken, min=0.0))
+    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(
+        2.0 * torch.clamp(batch.count - taken, min=0.0)
+    )
     return variance, spread, curvature
 
 
-def _looked(batch: _Batch, noise: Noise, first: bool) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _looked(
+    batch: _Batch, noise: Noise, first: bool
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Value, gradient and curvature by [blocks, scales]."""
 
     def shaped() -> tuple[_Shape, tuple[torch.Tensor, ...]]:
@@ -297,7 +387,9 @@ class _Integrated:
 
     left: list[np.ndarray]  # which of the J columns are a window's own
     at: _Shape
-    half: torch.Tensor  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
+    half: (
+        torch.Tensor
+    )  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
     information: list[np.ndarray]  # of each window
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
@@ -309,16 +401,22 @@ class _Integrated:
             hidden[w, :size], beside[w, left] = cross[:size], cross[len(cross) - len(left) :]
         right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
         along = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
-        told = (self.half.transpose(1, 2) @ along)[..., 0], self.at.log_det - along.square().sum((1, 2))
+        told = (
+            (self.half.transpose(1, 2) @ along)[..., 0],
+            self.at.log_det - along.square().sum((1, 2)),
+        )
         explained, taken = all_to_host(told)
         return [
             Share(information, score[left], float(weight @ gram.square + own))
-            for gram, left, information, score, own in zip(grams, self.left, self.information, beside - explained, taken)
+            for gram, left, information, score, own in zip(
+                grams, self.left, self.information, beside - explained, taken
+            )
         ]
 
 
 class Integrals:
-    """What windows say of their effects, whatever their residuals are; it stays where it was calculated.
+    """What windows say of their effects, whatever their residuals are; it stays where it was
+    calculated.
 
     Attributes:
         gathered: by flights with some residuals, once it was asked for.
@@ -336,8 +434,15 @@ class Integrals:
         return self._by_window([part.at.log_det.tolist() for part in self._parts])
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
-        """With the residuals of grams of the same derivatives; ``noise`` is what they were integrated with."""
-        return self._by_window([part.shares([grams[w] for w in own], noise) for own, part in zip(self._order, self._parts)])
+        """With the residuals of grams of the same derivatives; ``noise`` is what they were
+        integrated with.
+        """
+        return self._by_window(
+            [
+                part.shares([grams[w] for w in own], noise)
+                for own, part in zip(self._order, self._parts)
+            ]
+        )
 
     def _by_window(self, parts: Sequence[Sequence[T]]) -> list[T]:
         found = {w: value for own, part in zip(self._order, parts) for w, value in zip(own, part)}
@@ -350,12 +455,17 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     n = right.shape[1]
     if latents:
         hidden = _weighed(at.weight, columns.hidden)
-        own = torch.cat((torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), own), 2)), 1)
+        own = torch.cat(
+            (torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), own), 2)), 1
+        )
         right = own[:, :n]
     half = torch.linalg.solve_triangular(at.factor, at.level[:, :, None] * right, upper=False)
     reduced = own - half.transpose(1, 2) @ half
     whole = (0.5 * (reduced + reduced.transpose(1, 2))).cpu().numpy()
-    sizes, width = [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams], whole.shape[1]
+    sizes, width = (
+        [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams],
+        whole.shape[1],
+    )
     left = [np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes]
     information = [own[np.ix_(columns, columns)] for own, columns in zip(whole, left)]
     return _Integrated(left, at, half, information)

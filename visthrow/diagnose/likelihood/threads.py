@@ -1,7 +1,8 @@
-"""Threads and memory of the linear algebra: its matrices are of some hundred rows, on which several threads a product wait for each other.
+"""Threads and memory of the linear algebra: its matrices are of some hundred rows, on which several
+threads a product wait for each other.
 
-So each product has one thread, and windows are spread over the cores. Thousands of arrays of a few hundred kilobytes are taken and freed.
-"""
+So each product has one thread, and windows are spread over the cores. Thousands of arrays of a few
+hundred kilobytes are taken and freed."""
 
 import ctypes
 import gc
@@ -19,23 +20,30 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
-MOST_ASIDE = 2  # the same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a fifth
+# the same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a
+# fifth
+MOST_ASIDE = 2
 PIECES = 4  # of what is to be done, for each thread
-BESIDE = 3  # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth longer
+# tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth
+# longer
+BESIDE = 3
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # numbers of glibc's ``malloc.h``
 KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
-MAPPED = 2**30  # bytes from which an array has a mapping of its own, which goes back when it is freed
+MAPPED = (
+    2**30
+)  # bytes from which an array has a mapping of its own, which goes back when it is freed
 
 _aside = Event()
 
 
 @cache
 def keep() -> None:
-    """Let this process keep what it frees for what it takes next, and look for garbage among new objects alone.
+    """Let this process keep what it frees for what it takes next, and look for garbage among new
+    objects alone.
 
-    By default glibc gives large arrays' pages back to the system and faults them in anew: of looks at noise levels, one after the
-    other, half the time was the kernel's. A third of a million objects of the modules are never garbage.
-    """
+    By default glibc gives large arrays' pages back to the system and faults them in anew: of looks
+    at noise levels, one after the other, half the time was the kernel's. A third of a million
+    objects of the modules are never garbage."""
     gc.freeze()
     try:
         mallopt = ctypes.CDLL(None).mallopt
@@ -51,7 +59,9 @@ def aside() -> None:
 
 
 def single() -> None:
-    """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this process has loaded."""
+    """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this
+    process has loaded.
+    """
     import scipy.linalg  # noqa: F401
 
     threadpool_limits(1)
@@ -67,8 +77,12 @@ def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     items, threads = list(items), min(cores(), MOST_ASIDE if _aside.is_set() else MOST)
     if min(threads, len(items)) < 2:
         return [function(item) for item in items]
-    pieces = min(PIECES * threads, len(items))  # each item by itself would cost as much as the small ones take
-    parts = _pool("algebra", threads).map(lambda first: [function(item) for item in items[first::pieces]], range(pieces))
+    pieces = min(
+        PIECES * threads, len(items)
+    )  # each item by itself would cost as much as the small ones take
+    parts = _pool("algebra", threads).map(
+        lambda first: [function(item) for item in items[first::pieces]], range(pieces)
+    )
     found: list[R] = [None] * len(items)
     for first, part in enumerate(parts):
         found[first::pieces] = part

@@ -1,4 +1,6 @@
-"""Between the host and a GPU, by way of locked pages that torch keeps: fresh ones cost as much time as the copy."""
+"""Between the host and a GPU, by way of locked pages that torch keeps: fresh ones cost as much time
+as the copy.
+"""
 
 from collections.abc import Sequence
 
@@ -18,20 +20,28 @@ def to_host(tensor: torch.Tensor) -> np.ndarray:
 
 
 def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
-    """Values of several tensors of one kind, from a GPU in one piece: each wait for one gives Python away to other threads."""
+    """Values of several tensors of one kind, from a GPU in one piece: each wait for one gives
+    Python away to other threads.
+    """
     if not tensors or not tensors[0].is_cuda:
         return [tensor.numpy() for tensor in tensors]
-    parts = np.split(to_host(torch.cat([tensor.flatten() for tensor in tensors])), np.cumsum([t.numel() for t in tensors])[:-1])
+    parts = np.split(
+        to_host(torch.cat([tensor.flatten() for tensor in tensors])),
+        np.cumsum([t.numel() for t in tensors])[:-1],
+    )
     return [part.reshape(tensor.shape) for part, tensor in zip(parts, tensors)]
 
 
-def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], device: str) -> torch.Tensor:
+def side_by_side(
+    parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], device: str
+) -> torch.Tensor:
     """Arrays one beside the other on a device, each padded with zeros to one shape.
 
-    ``parts``: of each array, what stands side by side along its last axis, of one height unless it is empty; ``shape``: to pad to.
-    Returns shape (arrays, *shape).
-    """
-    out = torch.empty((len(parts), *shape), dtype=torch.float64, pin_memory=device.startswith("cuda"))
+    ``parts``: of each array, what stands side by side along its last axis, of one height unless it
+    is empty; ``shape``: to pad to. Returns shape (arrays, *shape)."""
+    out = torch.empty(
+        (len(parts), *shape), dtype=torch.float64, pin_memory=device.startswith("cuda")
+    )
     rows = out.numpy()
 
     def lay(i: int) -> None:
@@ -45,7 +55,9 @@ def side_by_side(parts: Sequence[Sequence[np.ndarray]], shape: tuple[int, ...], 
         for axis, height in enumerate(heights):
             row[(slice(None),) * axis + (slice(height, None),)] = 0.0
 
-    if device == "cpu" or out.numel() < FEW:  # batches are laid on all cores already, or it is not worth while
+    if (
+        device == "cpu" or out.numel() < FEW
+    ):  # batches are laid on all cores already, or it is not worth while
         for i in range(len(parts)):
             lay(i)
     else:

@@ -1,4 +1,5 @@
-"""A ball in free flight under motion capture: drag, spin, wind, and what a camera system gets wrong about gravity.
+"""A ball in free flight under motion capture: drag, spin, wind, and what a camera system gets wrong
+about gravity.
 
 The log holds no mass: forces are per kilogram, which is what a path can tell.
 """
@@ -26,9 +27,13 @@ from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "payload_pos_w"
-STEPS = 80  # of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a millimetre
+# of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a
+# millimetre
+STEPS = 80
 FALLS = 0.7
-"""Acceleration besides gravity's, in its, below which a ball is in flight: drag and lift of fast, spinning balls; at rest it is 1."""
+"""Acceleration besides gravity's, in its, below which a ball is in flight: drag and lift of fast,
+spinning balls; at rest it is 1.
+"""
 KNOTS = 9  # of the latent force over a free flight
 
 
@@ -49,13 +54,18 @@ class BallModel(NumericModel):
     def __init__(self, logs: Sequence[FlightLog], params: BallParams) -> None:
         """Cut the free flights out of the logs. Raises LogError where there is none."""
         self.params = params
-        stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _flights(log, i, params)]
+        stretches = [
+            s for i, log in enumerate(logs) if CHANNEL in log for s in _flights(log, i, params)
+        ]
         super().__init__(effects_of("ball", params), (CHANNEL,), stretches)
         self._across = np.array([s.data["across"] for s in self.stretches])
         self._span = np.array([np.ptp(s.data["time"]) for s in self.stretches])
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
-        """See the base class; the unknowns are position and velocity at the first stamp. Returns them over the grid."""
+        """See the base class; the unknowns are position and velocity at the first stamp.
+
+        Returns them over the grid.
+        """
         drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
         spin = top[:, None] * self._across[lanes.owner] + side[:, None] * np.array([0.0, 0.0, 1.0])
@@ -110,16 +120,25 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
         along = along / max(np.linalg.norm(along), 1e-6)
         found.append(
             Stretch(
-                number, "ballistic", np.repeat(time, 3), np.zeros(3 * len(time), dtype=int), pos.ravel(), np.tile(sigma, len(time)),
-                np.concatenate([fit[0], fit[1]]), np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
-                {"time": time, "across": np.array([-along[1], along[0], 0.0])}, **latent_layout(time[0], time[-1], KNOTS, (2,)),
+                number,
+                "ballistic",
+                np.repeat(time, 3),
+                np.zeros(3 * len(time), dtype=int),
+                pos.ravel(),
+                np.tile(sigma, len(time)),
+                np.concatenate([fit[0], fit[1]]),
+                np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
+                {"time": time, "across": np.array([-along[1], along[0], 0.0])},
+                **latent_layout(time[0], time[-1], KNOTS, (2,)),
             )
-        )  # fmt: skip
+        )
     return found
 
 
 def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:
-    """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth of a second each way."""
+    """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth
+    of a second each way.
+    """
     at, vel = derivative(time, pos, 0.05)
     if len(at) < 20:
         return []
@@ -127,5 +146,7 @@ def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[f
     off = np.linalg.norm(acc + np.array([0.0, 0.0, params.gravity]), axis=1)
     falls = off < FALLS * params.gravity
     edges = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]]).astype(int)))
-    spans = [(at[a] + params.edge, at[b - 1] - params.edge) for a, b in zip(edges[::2], edges[1::2])]
+    spans = [
+        (at[a] + params.edge, at[b - 1] - params.edge) for a, b in zip(edges[::2], edges[1::2])
+    ]
     return [(a, b) for a, b in spans if b - a >= params.shortest]

@@ -1,4 +1,6 @@
-"""Catalogues of the setups' models: the files of ``configs/model_effects``, in the numbers that a setup gives."""
+"""Catalogues of the setups' models: the files of ``configs/model_effects``, in the numbers that a
+setup gives.
+"""
 
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -11,10 +13,16 @@ from visthrow import config
 
 @dataclass(frozen=True)
 class ModelEffect(Effect):
-    """An effect of a setup's model; a channel in braces is that which a parameter of this name names, as ``{position}``."""
+    """An effect of a setup's model; a channel in braces is that which a parameter of this name
+    names, as ``{position}``.
+    """
 
-    times: dict[str, str] = field(default_factory=dict)  # bounds, prior_sd, floor -> parameters they are told in, "mass * arm"
-    lowest: str = ""  # parameter of which theta takes no more than there is, in place of the lower bound
+    times: dict[str, str] = field(
+        default_factory=dict
+    )  # bounds, prior_sd, floor -> parameters they are told in, "mass * arm"
+    lowest: str = (
+        ""  # parameter of which theta takes no more than there is, in place of the lower bound
+    )
     needs: str = ""  # parameter that a setup may lack, and the effect with it
 
     def of(self, params: Any) -> "ModelEffect":
@@ -27,9 +35,12 @@ class ModelEffect(Effect):
 
         low, high = (told("bounds", bound) for bound in self.bounds)
         return replace(
-            self, bounds=(-attrgetter(self.lowest)(params) if self.lowest else low, high), prior_sd=told("prior_sd", self.prior_sd),
-            floor=told("floor", self.floor), channels=tuple(name.format_map(vars(params)) for name in self.channels),
-        )  # fmt: skip
+            self,
+            bounds=(-attrgetter(self.lowest)(params) if self.lowest else low, high),
+            prior_sd=told("prior_sd", self.prior_sd),
+            floor=told("floor", self.floor),
+            channels=tuple(name.format_map(vars(params)) for name in self.channels),
+        )
 
 
 @dataclass(frozen=True)
@@ -46,4 +57,8 @@ def _tables(model: str) -> ModelEffects:
 
 def effects_of(model: str, params: Any) -> list[ModelEffect]:
     """Return the effects of a setup's model in the order of its file."""
-    return [e.of(params) for e in _tables(model).effects.values() if not e.needs or getattr(params, e.needs) is not None]
+    return [
+        e.of(params)
+        for e in _tables(model).effects.values()
+        if not e.needs or getattr(params, e.needs) is not None
+    ]

@@ -1,8 +1,9 @@
-"""A quadrotor alone, or with a payload on a cable, driven by its logged commands and its measured attitude.
+"""A quadrotor alone, or with a payload on a cable, driven by its logged commands and its measured
+attitude.
 
-Where the attitude is measured, the path of the centre of mass follows from thrust, drag and gravity alone, whatever controller
-flies; where each motor's command is logged, the rates follow too. No controller has to be known.
-"""
+Where the attitude is measured, the path of the centre of mass follows from thrust, drag and gravity
+alone, whatever controller flies; where each motor's command is logged, the rates follow too. No
+controller has to be known."""
 
 from collections.abc import Sequence
 
@@ -16,7 +17,15 @@ from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, spare, stretches_of
 from visthrow.diagnose.models.laws import exerted
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, hermite, integrate, latent_force, triangles
+from visthrow.diagnose.models.numeric import (
+    Lanes,
+    NumericModel,
+    Stretch,
+    hermite,
+    integrate,
+    latent_force,
+    triangles,
+)
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
@@ -29,20 +38,35 @@ class FlyerModel(NumericModel):
     latent_step = 1e-2
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
-        """Cut the flights into windows. Raises LogError where no log has the channels, or none flies."""
+        """Cut the flights into windows.
+
+        Raises LogError where no log has the channels, or none flies.
+        """
         self.params = params
         self.has_voltage = all("battery_voltage" in log for log in logs)
         more = {"payload_pos_w": params.cable, "rate_b": params.torque}
-        channels = [params.position, *(name for name, simulated in more.items() if simulated is not None)]
+        channels = [
+            params.position,
+            *(name for name, simulated in more.items() if simulated is not None),
+        ]
         stretches = stretches_of(logs, params, channels)
-        there = [name for name in ("battery_voltage", "acc_b", "rate_b") if all(name in log for log in logs)]
+        there = [
+            name
+            for name in ("battery_voltage", "acc_b", "rate_b")
+            if all(name in log for log in logs)
+        ]
         inputs = [params.attitude, params.input, *there]
-        effects = [e for e in effects_of("flyer", params) if not (self.has_voltage and e.name == "thrust_fade")]
+        effects = [
+            e
+            for e in effects_of("flyer", params)
+            if not (self.has_voltage and e.name == "thrust_fade")
+        ]
         super().__init__(effects, channels, stretches, inputs)
         self.steps = round(params.window / params.step)
         # see flyer_windows; the stretch is the first axis
         self._rot, told, self._volts, self._since, self._lean, self._direction = (
-            np.array([s.data[name] for s in stretches]) for name in ("rot", "input", "volts", "since", "lean", "direction")
+            np.array([s.data[name] for s in stretches])
+            for name in ("rot", "input", "volts", "since", "lean", "direction")
         )
         self._told = params.thrust(told)  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
@@ -50,14 +74,20 @@ class FlyerModel(NumericModel):
         self._rate_at = 12 if params.cable is not None else 6
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
-        """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): of held commands through a lag.
+        """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): of
+        held commands through a lag.
 
-        In the middle of a step stands what makes Simpson's rule, and so the integration, give the step's own mean: commands switch there.
-        """
+        In the middle of a step stands what makes Simpson's rule, and so the integration, give the
+        step's own mean: commands switch there."""
         p, fine = self.params, self.params.step / FINE
-        delay, tau = p.command_delay + self.of(lanes, "cmd_delay"), p.motor_time_constant + self.of(lanes, "motor_tau")
+        delay, tau = (
+            p.command_delay + self.of(lanes, "cmd_delay"),
+            p.motor_time_constant + self.of(lanes, "motor_tau"),
+        )
         tau = np.maximum(tau, SHORTEST)
-        at = (p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay) / fine  # tables begin one window early
+        at = (
+            p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay
+        ) / fine  # tables begin one window early
         left = np.clip(at.astype(int), 0, self._told.shape[1] - 1)
         share, out = (at - left)[..., None], np.empty((2, *at.shape, self._told.shape[2]))
         for own in np.unique(tau):
@@ -67,7 +97,10 @@ class FlyerModel(NumericModel):
             whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
             which, rows, part = lanes.owner[lanes_], left[:, lanes_], share[:, lanes_]
             begin, rise = thrust[which, rows], thrust[which, rows + 1] - thrust[which, rows]
-            out[:, :, lanes_] = begin + part * rise, whole[which, rows] + part * (begin + 0.5 * part * rise)
+            out[:, :, lanes_] = (
+                begin + part * rise,
+                whole[which, rows] + part * (begin + 0.5 * part * rise),
+            )
         thrust, whole = out
         mean = np.diff(whole[::2], axis=0) * (fine / p.step)
         thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
@@ -76,52 +109,78 @@ class FlyerModel(NumericModel):
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class.
 
-        The state: position and velocity of the vehicle, with a cable its vector to the payload and that one's rate, with torques the
-        body rates; behind it, the thrust of each motor.
-        """
+        The state: position and velocity of the vehicle, with a cable its vector to the payload and
+        that one's rate, with torques the body rates; behind it, the thrust of each motor."""
         p, forces = self.params, latent_force(lanes.latent, self.steps, self._blocks)
         thrust, curve = self._thrusts(lanes), self.of(lanes, "thrust_curve")[:, None]
         hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
         since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
         faded = 1.0 + self.of(lanes, "thrust_fade") * since
-        real = thrust * self._scale(lanes) * (1.0 + curve * (thrust / hover - 1.0)) * faded[..., None]
+        real = (
+            thrust * self._scale(lanes) * (1.0 + curve * (thrust / hover - 1.0)) * faded[..., None]
+        )
         dynamics = _Dynamics(self, lanes, real, forces)
-        path = integrate(dynamics, dynamics.start(lanes), self.steps, np.full((len(lanes.owner), 1), p.step))
+        path = integrate(
+            dynamics, dynamics.start(lanes), self.steps, np.full((len(lanes.owner), 1), p.step)
+        )
         return np.concatenate([path, real[::2].swapaxes(0, 1)], 2)
 
     def _rise(self, thrust: np.ndarray) -> np.ndarray:
-        """Slope of the whole thrust at the half steps as knots tell it [N/s], shape (half steps, B)."""
+        """Slope of the whole thrust at the half steps as knots tell it [N/s], shape (half steps,
+        B).
+        """
         knots = np.linspace(0.0, self.params.window, KNOTS)
         grid = np.linspace(0.0, self.params.window, len(thrust))
         slope = np.gradient(triangles(knots, grid[::2]) @ thrust[::2].sum(2), knots, axis=0)
         return triangles(grid, knots) @ slope
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
-        """See the base class; the cable's tension is what accelerates the payload against gravity."""
+        """See the base class; the cable's tension is what accelerates the payload
+        against gravity.
+        """
         p, time = self.params, np.unique(stretch.latent_time)
-        grid, halves = stretch.data["start"] + p.step * np.arange(len(path)), np.arange(2 * self.steps + 1) + self._spare
+        grid, halves = (
+            stretch.data["start"] + p.step * np.arange(len(path)),
+            np.arange(2 * self.steps + 1) + self._spare,
+        )
         known = triangles(time, grid) @ path
         rot = Rotation.from_matrix(stretch.data["rot"][halves])
         turned = Slerp(stretch.data["start"] + 0.5 * p.step * np.arange(len(halves)), rot)
         rates = (rot[:-1].inv() * rot[1:]).as_rotvec() / (0.5 * p.step)
         out = {
-            "time": time, "pos_w": known[:, :3], "vel_w": known[:, 3:6], "quat_wb": turned(time).as_quat(),
-            "rate_b": triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2])),
+            "time": time,
+            "pos_w": known[:, :3],
+            "vel_w": known[:, 3:6],
+            "quat_wb": turned(time).as_quat(),
+            "rate_b": (
+                triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
+            ),
             "thrust": known[:, -self._told.shape[2] :].sum(1),
-        }  # fmt: skip
+        }
         if p.cable is not None:
             gap, vel = path[:, 6:9], path[:, 3:6] + path[:, 9:12]
             along = gap / np.linalg.norm(gap, axis=1, keepdims=True)
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
-            at_knots = triangles(time, grid) @ np.column_stack([along, np.maximum(-np.sum(along * force, 1), 0.0)])
-            out |= {"payload_pos_w": known[:, :3] + known[:, 6:9], "payload_vel_w": known[:, 3:6] + known[:, 9:12],
-                    "cable_dir_w": at_knots[:, :3], "tension": at_knots[:, 3], "mount_b": np.zeros((len(time), 3))}  # fmt: skip
+            at_knots = triangles(time, grid) @ np.column_stack(
+                [along, np.maximum(-np.sum(along * force, 1), 0.0)]
+            )
+            out |= {
+                "payload_pos_w": known[:, :3] + known[:, 6:9],
+                "payload_vel_w": known[:, 3:6] + known[:, 9:12],
+                "cable_dir_w": at_knots[:, :3],
+                "tension": at_knots[:, 3],
+                "mount_b": np.zeros((len(time), 3)),
+            }
         return out
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
         p = self.params
-        volts = (self._volts[lanes.owner] - p.reference_voltage) if self.has_voltage else np.zeros(len(lanes.owner))
+        volts = (
+            (self._volts[lanes.owner] - p.reference_voltage)
+            if self.has_voltage
+            else np.zeros(len(lanes.owner))
+        )
         sag = p.voltage_coefficient + self.of(lanes, "battery_sag")
         scale = (1.0 + self.of(lanes, "thrust_gain")) * (1.0 + sag * volts)
         motors = self._told.shape[2]
@@ -142,7 +201,9 @@ class FlyerModel(NumericModel):
             if name == "rate_b":
                 at = self._rate_at
                 grid = start + p.step * np.arange(path.shape[1])
-                out[:, own] = np.array([on_grid(grid, x[:, at : at + 3], time) for x in path]).reshape(len(path), -1)
+                out[:, own] = np.array(
+                    [on_grid(grid, x[:, at : at + 3], time) for x in path]
+                ).reshape(len(path), -1)
                 continue
             late = time[None] - self.of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
             value, rate = path[..., 0:3], path[..., 3:6]
@@ -151,7 +212,9 @@ class FlyerModel(NumericModel):
             pos = hermite(late, start, p.step, value, rate)
             if channel == 0 and "marker_z" in self.numbers:
                 lever = np.stack([self.of(lanes, f"marker_{axis}") for axis in "xyz"], 1)
-                at = np.clip(((time - start) / (0.5 * p.step)).round().astype(int), 0, 2 * self.steps)
+                at = np.clip(
+                    ((time - start) / (0.5 * p.step)).round().astype(int), 0, 2 * self.steps
+                )
                 pos = pos + np.einsum("nij,bj->bni", stretch.data["rot"][at + self._spare], lever)
             out[:, own] = pos.reshape(len(path), -1)
         return out
@@ -160,8 +223,12 @@ class FlyerModel(NumericModel):
 class _Dynamics:
     """Forces and torques of lanes, without the motors' lag."""
 
-    def __init__(self, model: FlyerModel, lanes: Lanes, thrust: np.ndarray, latent: np.ndarray) -> None:
-        """Take the lanes' sizes; ``thrust`` [N], shape (half steps, B, motors); ``latent`` as :func:`latent_force` gives it."""
+    def __init__(
+        self, model: FlyerModel, lanes: Lanes, thrust: np.ndarray, latent: np.ndarray
+    ) -> None:
+        """Take the lanes' sizes; ``thrust`` [N], shape (half steps, B, motors); ``latent`` as
+        :func:`latent_force` gives it.
+        """
         p = model.params
         self.thrust, self.total, self.latent = thrust, thrust.sum(2, keepdims=True), latent
         self.rise = model._rise(thrust) if model.laws else None
@@ -171,7 +238,11 @@ class _Dynamics:
 
         mass = (p.mass + get("mass_quad"))[:, None]
         self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
-        self.blocks = ("", *["payload force"] * (p.cable is not None), *["vehicle torque"] * (p.torque is not None))
+        self.blocks = (
+            "",
+            *["payload force"] * (p.cable is not None),
+            *["vehicle torque"] * (p.torque is not None),
+        )
         self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
         self.lean = get("estimator_lean")[:, None]
         self.turns, self.half = bool(np.any(self.turn) or np.any(self.lean)), -1
@@ -179,7 +250,9 @@ class _Dynamics:
         self.gravity = p.gravity * tilt
         self.wind = np.stack([get("wind_x"), get("wind_y"), 0.0 * mass[:, 0]], 1)
         self.shift = model._spare + get("attitude_delay") / (0.5 * p.step)
-        self.drag = np.stack([p.drag_xy + get("rotor_drag_xy")] * 2 + [p.drag_z + get("rotor_drag_z")], 1)
+        self.drag = np.stack(
+            [p.drag_xy + get("rotor_drag_xy")] * 2 + [p.drag_z + get("rotor_drag_z")], 1
+        )
         self.parasitic, self.lift = get("parasitic")[:, None], get("translational_lift")[:, None]
         if p.cable is not None:
             self.length = (p.cable.length + get("rope_length"))[:, None]
@@ -187,17 +260,23 @@ class _Dynamics:
             self.payload_drag = get("payload_drag")[:, None]
             self.reduced = 1.0 / (1.0 / self.payload + 1.0 / self.mass)
         if p.torque is not None:
-            self.inertia = np.array(p.torque.inertia) * (1.0 + np.stack([get("inertia_xy")] * 2 + [get("inertia_z")], 1))
+            self.inertia = np.array(p.torque.inertia) * (
+                1.0 + np.stack([get("inertia_xy")] * 2 + [get("inertia_z")], 1)
+            )
             self.com = np.stack([get("com_x"), get("com_y")], 1)
 
     def _turn_to(self, half: int) -> None:
-        """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in a row are asked for at each."""
+        """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in
+        a row are asked for at each.
+        """
         self.half, at = half, half + self.shift
         left = np.minimum(np.maximum(at.astype(int), 0), self.model._rot.shape[1] - 2)
         share, before = (at - left)[:, None, None], self.model._rot[self.owner, left]
         self.rot = before + share * (self.model._rot[self.owner, left + 1] - before)
         if self.turns:
-            self.off = self.turn + self.lean * self.model._lean[self.owner, half + self.model._spare]
+            self.off = (
+                self.turn + self.lean * self.model._lean[self.owner, half + self.model._spare]
+            )
 
     def start(self, lanes: Lanes) -> np.ndarray:
         """States from the unknowns at the window's start."""
@@ -205,10 +284,14 @@ class _Dynamics:
         at = 6
         if self.p.cable is not None:
             down = self.model._direction[lanes.owner]
-            side = np.stack([lanes.nuisance[:, 6], lanes.nuisance[:, 7], 0.0 * lanes.nuisance[:, 6]], 1)
+            side = np.stack(
+                [lanes.nuisance[:, 6], lanes.nuisance[:, 7], 0.0 * lanes.nuisance[:, 6]], 1
+            )
             direction = down + side - down * np.sum(down * side, 1, keepdims=True)
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            swing = np.stack([lanes.nuisance[:, 8], lanes.nuisance[:, 9], 0.0 * lanes.nuisance[:, 6]], 1)
+            swing = np.stack(
+                [lanes.nuisance[:, 8], lanes.nuisance[:, 9], 0.0 * lanes.nuisance[:, 6]], 1
+            )
             swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
             parts += [self.length * direction, self.length * swing]
             at = 10
@@ -232,7 +315,9 @@ class _Dynamics:
         if self.model.laws:
             own = self._exerted(half, state, force, latent)
             force = force + own.get("vehicle force", 0.0)
-            latent = np.stack([push + own.get(block, 0.0) for push, block in zip(latent, self.blocks)])
+            latent = np.stack(
+                [push + own.get(block, 0.0) for push, block in zip(latent, self.blocks)]
+            )
         parts = [vel]
         if self.p.cable is None:
             parts.append(force / self.mass + self.gravity)
@@ -242,47 +327,91 @@ class _Dynamics:
             acc_q, acc_p = free_q + pull_w / self.mass, free_p - pull_w / self.payload
             parts += [acc_q, state[:, 9:12], acc_p - acc_q]
         if self.p.torque is not None:
-            parts.append(self._turning(state[:, self.model._rate_at : self.model._rate_at + 3], self.thrust[half], total, latent[-1]))
+            parts.append(
+                self._turning(
+                    state[:, self.model._rate_at : self.model._rate_at + 3],
+                    self.thrust[half],
+                    total,
+                    latent[-1],
+                )
+            )
         return np.concatenate(parts, 1)
 
-    def _pull(self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Accelerations without the cable, its direction, and what it pulls with [N]; it never pushes."""
+    def _pull(
+        self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """Accelerations without the cable, its direction, and what it pulls with [N]; it never
+        pushes.
+        """
         gap, gap_rate = state[:, 6:9], state[:, 9:12]
         vel_p = vel + gap_rate - self.wind
         drag = -self.payload_drag * np.sqrt(_products(vel_p, vel_p)) * vel_p
-        free_q, free_p = force / self.mass + self.gravity, (drag + latent) / self.payload + self.gravity
+        free_q, free_p = (
+            force / self.mass + self.gravity,
+            (drag + latent) / self.payload + self.gravity,
+        )
         length = np.sqrt(_products(gap, gap))
         along = gap / length
         relative = _products(along, free_p - free_q) + _products(gap_rate, gap_rate) / length
         return free_q, free_p, along, np.maximum(relative * self.reduced, 0.0)
 
-    def _exerted(self, half: int, state: np.ndarray, force: np.ndarray, latent: np.ndarray) -> dict[str, np.ndarray]:
+    def _exerted(
+        self, half: int, state: np.ndarray, force: np.ndarray, latent: np.ndarray
+    ) -> dict[str, np.ndarray]:
         """What the laws exert in each latent block, at the cable's tension without them."""
         vel, none, at = state[:, 3:6], np.zeros((len(state), 3)), half + self.model._spare
-        turn = np.einsum("bji,bjk->bik", self.model._rot[self.owner, at - 1], self.model._rot[self.owner, at + 1])
-        skew = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
+        turn = np.einsum(
+            "bji,bjk->bik", self.model._rot[self.owner, at - 1], self.model._rot[self.owner, at + 1]
+        )
+        skew = np.stack(
+            [
+                turn[:, 2, 1] - turn[:, 1, 2],
+                turn[:, 0, 2] - turn[:, 2, 0],
+                turn[:, 1, 0] - turn[:, 0, 1],
+            ],
+            1,
+        )
         known = {
-            "time": none[:, 0], "pos_w": state[:, :3], "vel_w": vel, "rate_b": skew / (2.0 * self.p.step),
-            "thrust": self.total[half, :, 0], "slope": self.rise[half], **{f"axis_{a}": self.rot[:, :, i] for i, a in enumerate("xyz")},
-        }  # fmt: skip
+            "time": none[:, 0],
+            "pos_w": state[:, :3],
+            "vel_w": vel,
+            "rate_b": skew / (2.0 * self.p.step),
+            "thrust": self.total[half, :, 0],
+            "slope": self.rise[half],
+            **{f"axis_{a}": self.rot[:, :, i] for i, a in enumerate("xyz")},
+        }
         if self.p.cable is not None:
             _, _, along, pull = self._pull(state, vel, force, latent[1])
-            known |= {"payload_pos_w": state[:, :3] + state[:, 6:9], "payload_vel_w": vel + state[:, 9:12], "cable_dir_w": along,
-                      "tension": pull[:, 0], "mount_b": none}  # fmt: skip
+            known |= {
+                "payload_pos_w": state[:, :3] + state[:, 6:9],
+                "payload_vel_w": vel + state[:, 9:12],
+                "cable_dir_w": along,
+                "tension": pull[:, 0],
+                "mount_b": none,
+            }
         return exerted(self.model.laws, known)
 
-    def _turning(self, rate: np.ndarray, thrust: np.ndarray, total: np.ndarray, latent: np.ndarray) -> np.ndarray:
+    def _turning(
+        self, rate: np.ndarray, thrust: np.ndarray, total: np.ndarray, latent: np.ndarray
+    ) -> np.ndarray:
         """Angular acceleration from the motors' thrusts and the offset of the centre of mass."""
         of = self.p.torque
         front_left, front_right, rear_left, rear_right = thrust.T
-        torque = np.stack([
-            of.arm_y * (front_left + rear_left - front_right - rear_right) - self.com[:, 1] * total[:, 0],
-            of.arm_x * (rear_left + rear_right - front_left - front_right) + self.com[:, 0] * total[:, 0],
-            of.torque_ratio * thrust @ np.array(of.spin),
-        ], 1)  # fmt: skip
+        torque = np.stack(
+            [
+                of.arm_y * (front_left + rear_left - front_right - rear_right)
+                - self.com[:, 1] * total[:, 0],
+                of.arm_x * (rear_left + rear_right - front_left - front_right)
+                + self.com[:, 0] * total[:, 0],
+                of.torque_ratio * thrust @ np.array(of.spin),
+            ],
+            1,
+        )
         return (torque - cross(rate, self.inertia * rate) + latent) / self.inertia
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Inner products of rows, shape (B, 1); of a few rows, ``np.sum`` and ``np.linalg.norm`` take several times as long."""
+    """Inner products of rows, shape (B, 1); of a few rows, ``np.sum`` and ``np.linalg.norm`` take
+    several times as long.
+    """
     return np.einsum("bi,bi->b", a, b)[:, None]

@@ -1,4 +1,6 @@
-"""Parameters of a quadrotor that is driven by its logged commands and its measured attitude: the table ``flyer`` of a setup."""
+"""Parameters of a quadrotor that is driven by its logged commands and its measured attitude: the
+table ``flyer`` of a setup.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -27,19 +29,28 @@ class TorqueParams:
     arm_x: float  # of each rotor from the centre of mass, along x and along y [m]
     arm_y: float
     torque_ratio: float  # drag torque over thrust [m]
-    spin: tuple[float, float, float, float]  # +1 turns clockwise seen from above; order of the rotors as everywhere
+    spin: tuple[
+        float, float, float, float
+    ]  # +1 turns clockwise seen from above; order of the rotors as everywhere
 
 
 @dataclass(frozen=True)
 class FlyerParams:
-    """The vehicle that is assumed first. Raises ConfigError where torque has no motors' commands, or the map does not rise."""
+    """The vehicle that is assumed first.
 
-    input: Literal["motor_command", "motor_speed", "thrust_command", "command"]  # channel of the commands
+    Raises ConfigError where torque has no motors' commands, or the map does not rise.
+    """
+
+    input: Literal[
+        "motor_command", "motor_speed", "thrust_command", "command"
+    ]  # channel of the commands
     position: str  # channel of the measured position
     attitude: str  # channel of the measured attitude
     mass: float  # of the vehicle alone [kg]
     gravity: float  # [m/s^2]
-    thrust_map: tuple[float, float, float]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
+    thrust_map: tuple[
+        float, float, float
+    ]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
     motor_time_constant: float  # [s]
     command_delay: float  # [s]
     reference_voltage: float  # at which the map holds [V]
@@ -51,7 +62,9 @@ class FlyerParams:
     step: float  # of the integration [s]
     every: int  # the position samples taken: each so-manieth
     most_windows: int  # spread evenly over all logs
-    estimator_rate: float = 1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
+    estimator_rate: float = (
+        1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
+    )
     torque: TorqueParams | None = None  # None: rates are not simulated
     cable: CableParams | None = None  # None: no payload
 
@@ -71,6 +84,8 @@ class FlyerParams:
 
     def __post_init__(self) -> None:
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
-            raise ConfigError(f"torque needs commands of single motors; the input is '{self.input}'")
+            raise ConfigError(
+                f"torque needs commands of single motors; the input is '{self.input}'"
+            )
         if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
             raise ConfigError(f"thrust_map {self.thrust_map} does not rise")

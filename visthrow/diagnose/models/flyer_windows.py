@@ -1,4 +1,6 @@
-"""Cuts logs of a quadrotor into windows: measurements, inputs on a grid, first guesses of the state."""
+"""Cuts logs of a quadrotor into windows: measurements, inputs on a grid, first guesses of the
+state.
+"""
 
 from collections.abc import Sequence
 
@@ -12,29 +14,41 @@ from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
-FINE = 16  # entries of the commands' table in a step of the integration: between them, commands switch at their own times
+# entries of the commands' table in a step of the integration: between them, commands switch at
+# their own times
+FINE = 16
 KNOTS = 8  # of the latent forces over a window
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
-_MOST_THRUST = 5.0  # median thrust over the weight, by the map: a map may be far off, a unit is off by more
+_MOST_THRUST = (
+    5.0  # median thrust over the weight, by the map: a map may be far off, a unit is off by more
+)
 _IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 
-def stretches_of(logs: Sequence[FlightLog], params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:
+def stretches_of(
+    logs: Sequence[FlightLog], params: FlyerParams, channels: Sequence[str]
+) -> list[Stretch]:
     """Windows of all logs, at most ``most_windows``, spread evenly.
 
-    Raises LogError where no log has the channels, or commands are of another size than carries the vehicle.
-    """
+    Raises LogError where no log has the channels, or commands are of another size than carries the
+    vehicle."""
     needed = [params.position, params.attitude, params.input, *channels[1:]]
     usable = [(i, log) for i, log in enumerate(logs) if all(_holds(log, name) for name in needed)]
     if not usable:
         lacking = [name for name in needed if not any(_holds(log, name) for log in logs)]
-        raise LogError(f"no log has all of {', '.join(needed)}; missing everywhere: {', '.join(lacking) or 'none'}")
+        raise LogError(
+            f"no log has all of {', '.join(needed)}; missing everywhere:"
+            f" {', '.join(lacking) or 'none'}"
+        )
     found = [s for number, log in usable for s in _windows(log, number, params, channels)]
     if found:
         _expect_thrust(found, params)
     if len(found) > params.most_windows:
-        found = [found[i] for i in np.linspace(0, len(found) - 1, params.most_windows).round().astype(int)]
+        found = [
+            found[i]
+            for i in np.linspace(0, len(found) - 1, params.most_windows).round().astype(int)
+        ]
     return found
 
 
@@ -49,32 +63,47 @@ def _expect_thrust(found: Sequence[Stretch], params: FlyerParams) -> None:
     ratio = float(np.median(params.thrust(told).sum(axis=1))) / weight
     if ratio > _MOST_THRUST:
         raise LogError(
-            f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the weight of {weight:.3g} N: "
-            "another unit, or another vehicle's map"
+            f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the"
+            f" weight of {weight:.3g} N: another unit, or another vehicle's map"
         )
 
 
-def _windows(log: FlightLog, number: int, params: FlyerParams, channels: Sequence[str]) -> list[Stretch]:
-    sigma = {name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels}  # no less is believed
+def _windows(
+    log: FlightLog, number: int, params: FlyerParams, channels: Sequence[str]
+) -> list[Stretch]:
+    sigma = {
+        name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels
+    }  # no less is believed
     driven = [log[name] for name in (params.position, params.attitude, params.input)]
     first, last = max(c.time[0] for c in driven), min(c.time[-1] for c in driven)
     starts = np.arange(first + params.window, last - params.window, params.window)
-    starts = starts[:: max(1, len(starts) // (4 * params.most_windows))]  # hours are thinned before they are cut
-    covered = (float(start) for start in starts if all(_covered(c, start, start + params.window) for c in driven))
+    starts = starts[
+        :: max(1, len(starts) // (4 * params.most_windows))
+    ]  # hours are thinned before they are cut
+    covered = (
+        float(start)
+        for start in starts
+        if all(_covered(c, start, start + params.window) for c in driven)
+    )
     found = (_window(log, number, params, channels, sigma, start) for start in covered)
     return [stretch for stretch in found if stretch is not None]
 
 
 def _covered(channel: Channel, start: float, end: float) -> bool:
     inside = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
-    return len(inside) > 5 and float(np.max(np.diff(np.concatenate([[start], inside, [end]])))) < _MOST_MISSING
+    return (
+        len(inside) > 5
+        and float(np.max(np.diff(np.concatenate([[start], inside, [end]])))) < _MOST_MISSING
+    )
 
 
 def _window(log, number: int, params: FlyerParams, channels, sigma, start: float) -> Stretch | None:
     end = start + params.window
     rows = []
     for channel in (log[name] for name in channels):
-        inside = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[:: params.every]
+        inside = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[
+            :: params.every
+        ]
         rows.append((channel.time[inside], channel.values[inside].astype(float)))
     if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
         return None
@@ -83,20 +112,42 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
     if np.min(thrust[len(thrust) // 2 :]) < _IDLE * params.mass * params.gravity:
         return None
     margin = spare(params.step)
-    halves = start + 0.5 * params.step * np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
-    volts = log["battery_voltage"].hold(np.array([start + 0.5 * params.window]))[0] if "battery_voltage" in log else 0.0
+    halves = start + 0.5 * params.step * np.arange(
+        -margin, 2 * round(params.window / params.step) + 1 + margin
+    )
+    volts = (
+        log["battery_voltage"].hold(np.array([start + 0.5 * params.window]))[0]
+        if "battery_voltage" in log
+        else 0.0
+    )
     guess, spread, direction = _guess(rows, channels, params)
-    blocks = [0, *([2] if params.cable is not None else []), *([1] if params.torque is not None else [])]
+    blocks = [
+        0,
+        *([2] if params.cable is not None else []),
+        *([1] if params.torque is not None else []),
+    ]
     return Stretch(
-        number, "flight", np.concatenate([np.repeat(time, 3) for time, _ in rows]),
+        number,
+        "flight",
+        np.concatenate([np.repeat(time, 3) for time, _ in rows]),
         np.concatenate([np.full(3 * len(time), i) for i, (time, _) in enumerate(rows)]),
         np.concatenate([values.ravel() for _, values in rows]),
-        np.concatenate([np.tile(sigma[name], len(time)) for name, (time, _) in zip(channels, rows)]), guess, spread,
-        {"start": start, "rot": _attitudes(log[params.attitude], halves), "input": inputs, "volts": float(volts),
-         "direction": direction, "lean": _lean(log, params.attitude, params.estimator_rate, halves),
-         "since": start - float(log[params.input].time[0])},
+        np.concatenate(
+            [np.tile(sigma[name], len(time)) for name, (time, _) in zip(channels, rows)]
+        ),
+        guess,
+        spread,
+        {
+            "start": start,
+            "rot": _attitudes(log[params.attitude], halves),
+            "input": inputs,
+            "volts": float(volts),
+            "direction": direction,
+            "lean": _lean(log, params.attitude, params.estimator_rate, halves),
+            "since": start - float(log[params.input].time[0]),
+        },
         **latent_layout(start, end, KNOTS, blocks),
-    )  # fmt: skip
+    )
 
 
 def spare(step: float) -> int:
@@ -105,12 +156,20 @@ def spare(step: float) -> int:
 
 
 def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
-    """Means of the held commands over fine steps, from one window before the start to its end, shape (fine steps, motors)."""
-    edges = start - params.window + params.step / FINE * np.arange(2 * FINE * round(params.window / params.step) + 1)
+    """Means of the held commands over fine steps, from one window before the start to its end,
+    shape (fine steps, motors).
+    """
+    edges = (
+        start
+        - params.window
+        + params.step / FINE * np.arange(2 * FINE * round(params.window / params.step) + 1)
+    )
     time, values = channel.samples()
     values = values[:, : 1 if params.input == "command" else None]
     ends = np.concatenate([[min(time[0], edges[0])], time[1:], [max(time[-1], edges[-1]) + 1.0]])
-    whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)])
+    whole = np.concatenate(
+        [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)]
+    )
     return np.diff(on_grid(ends, whole, edges), axis=0) / (params.step / FINE)
 
 
@@ -122,14 +181,16 @@ def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
 
 
 def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:
-    """Turn from a leaning estimate of the attitude to the true one, shape (half steps, 3); 0 where nothing tells it.
+    """Turn from a leaning estimate of the attitude to the true one, shape (half steps, 3); 0 where
+    nothing tells it.
 
-    In flight the accelerometer tells thrust alone; a filter that knows it as thrust alone takes what pushes level with the rotors for
-    tilt, at ``rate``. A gyro's offset tilts it as well: the tilt stays at which the correction, the gyro less the estimate's own rate,
-    holds it up. Of the force the flight's middle is taken off: a mount that is not level makes a constant.
+    In flight the accelerometer tells thrust alone; a filter that knows it as thrust alone takes
+    what pushes level with the rotors for tilt, at ``rate``. A gyro's offset tilts it as well: the
+    tilt stays at which the correction, the gyro less the estimate's own rate, holds it up. Of the
+    force the flight's middle is taken off: a mount that is not level makes a constant.
 
-    Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only acceleration in z).
-    """
+    Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only
+    acceleration in z)."""
     if "acc_b" not in log or not np.any(log["acc_b"].valid):
         return np.zeros((len(times), 3))
     time, force = log["acc_b"].samples()
@@ -137,7 +198,9 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1], step)
     keep = np.exp(-rate * step)
-    tilt = lfilter([1.0 - keep], [1.0, -keep], on_grid(time, share - np.median(share, axis=0), even), axis=0)
+    tilt = lfilter(
+        [1.0 - keep], [1.0, -keep], on_grid(time, share - np.median(share, axis=0), even), axis=0
+    )
     turn = np.column_stack([tilt[:, 1], -tilt[:, 0], 0.0 * tilt[:, 0]])
     if "rate_b" in log and np.any(log["rate_b"].valid):
         turn[:, :2] -= _offset(log, attitude)[:2] / rate
@@ -145,7 +208,9 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
 
 
 def _offset(log: FlightLog, attitude: str) -> np.ndarray:
-    """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape (3,)."""
+    """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape
+    (3,).
+    """
     time, rate = rates_of(*log[attitude].samples())
     return np.median(mean_over(*log["rate_b"].samples(), time, 0.06) - rate, axis=0)
 

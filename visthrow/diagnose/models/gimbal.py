@@ -1,8 +1,8 @@
 """A camera that sees a marker on the payload, against motion capture of vehicle and payload.
 
-Convention: a gimbal under the vehicle turns about its x axis, then about its own y axis; the camera stands off along the
-gimbal's x axis; its optical axis is that x axis, its image's x to the right, y down.
-"""
+Convention: a gimbal under the vehicle turns about its x axis, then about its own y axis; the camera
+stands off along the gimbal's x axis; its optical axis is that x axis, its image's x to the right, y
+down."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,9 @@ CHANNEL = "marker_pos_c"
 NEEDED = (CHANNEL, "pos_w", "quat_wb", "payload_pos_w")
 MOST_APART = 0.25  # share of the detections that may be of something else than the payload
 KNOTS = 11  # of the slow wander of detections over a window
-MARGIN = 1.0  # poses are kept this long before and after a window [s], so that a delay can look them up
+MARGIN = (
+    1.0  # poses are kept this long before and after a window [s], so that a delay can look them up
+)
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,14 @@ class GimbalParams:
 
     base_b: tuple[float, float, float]  # the gimbal's centre in the body frame [m]
     camera_offset: float  # of the camera along the gimbal's x axis [m]
-    camera_axes_deg: tuple[float, float, float]  # gimbal to camera: turns about fixed x, y, z in this order [deg]
+    camera_axes_deg: tuple[
+        float, float, float
+    ]  # gimbal to camera: turns about fixed x, y, z in this order [deg]
     marker_z: float  # the marker over the payload's tracked centre, along the vertical [m]
     sigma_across: float  # of the marker's direction times distance [m]
     sigma_along: float  # of its distance [m]
-    stabilised: bool  # whether the gimbal's angles are against the horizon (then only the vehicle's yaw turns it)
+    # whether the gimbal's angles are against the horizon (then only the vehicle's yaw turns it)
+    stabilised: bool
     window: float  # [s]
     every: int  # the samples taken: each so-manieth
     largest: float  # detections further than this from the prediction are of something else [m]
@@ -46,37 +51,67 @@ class GimbalModel(NumericModel):
     lawless = "it is geometry, in which no force moves anything"
 
     def __init__(self, logs: Sequence[FlightLog], params: GimbalParams) -> None:
-        """Cut the logs. Raises LogError where none has both bodies and the marker, or the marker is not seen at the payload."""
+        """Cut the logs.
+
+        Raises LogError where none has both bodies and the marker, or the marker is not seen at the
+        payload.
+        """
         self.params = params
         self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
-        stretches = [s for i, log in enumerate(logs) if all(n in log for n in NEEDED) for s in _cut(log, i, params)]
+        stretches = [
+            s
+            for i, log in enumerate(logs)
+            if all(n in log for n in NEEDED)
+            for s in _cut(log, i, params)
+        ]
         super().__init__(effects_of("gimbal", params), (CHANNEL,), stretches, NEEDED)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
-        tilt, lever, turn = (np.stack([self.of(lanes, f"{what}_{a}") for a in "xyz"], 1)
-                             for what in ("camera_tilt", "camera_lever", "marker_rot"))  # fmt: skip
+        tilt, lever, turn = (
+            np.stack([self.of(lanes, f"{what}_{a}") for a in "xyz"], 1)
+            for what in ("camera_tilt", "camera_lever", "marker_rot")
+        )
         time, table = stretch.time.reshape(-1, 3)[:, 0], stretch.data["table"]
         late = time[None] - self.of(lanes, "camera_delay")[:, None]
-        gap, axes, level = (on_grid(stretch.data["table_time"], table[name], late) for name in ("gap", "rot", "gimbal"))
+        gap, axes, level = (
+            on_grid(stretch.data["table_time"], table[name], late)
+            for name in ("gap", "rot", "gimbal")
+        )
         body = np.einsum("bnji,bnj->bni", axes.reshape(*late.shape, 3, 3), gap)
         body = body + cross(turn[:, None], body)
-        seen = np.einsum("bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b))
+        seen = np.einsum(
+            "bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b)
+        )
         seen = seen - np.array([self.params.camera_offset, 0.0, 0.0])
         point = np.einsum("ij,bnj->bni", self.camera, seen)
         point = point + cross(tilt[:, None], point) - lever[:, None]
-        weights = triangles(time, np.unique(stretch.latent_time))  # what gimbal and detection err by, slowly
+        weights = triangles(
+            time, np.unique(stretch.latent_time)
+        )  # what gimbal and detection err by, slowly
         point = point + np.einsum("bak,nk->bna", lanes.latent.reshape(len(late), 3, -1), weights)
-        scale = 1.0 + np.stack([self.of(lanes, f"{name}_scale") for name in ("focal", "focal", "range")], 1)
+        scale = 1.0 + np.stack(
+            [self.of(lanes, f"{name}_scale") for name in ("focal", "focal", "range")], 1
+        )
         return (point * scale[:, None]).reshape(len(lanes.owner), -1)
 
 
 def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body, matrices as rows of 9."""
+    """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body,
+    matrices as rows of 9.
+    """
     vehicle, attitude, payload = log["pos_w"], log["quat_wb"], log["payload_pos_w"]
-    good = vehicle.valid & attitude.valid & payload.valid if len(vehicle.time) == len(payload.time) else vehicle.valid
+    good = (
+        vehicle.valid & attitude.valid & payload.valid
+        if len(vehicle.time) == len(payload.time)
+        else vehicle.valid
+    )
     time = vehicle.time[good]
-    gap = on_grid(*payload.samples(), time) + np.array([0.0, 0.0, params.marker_z]) - vehicle.values[good]
+    gap = (
+        on_grid(*payload.samples(), time)
+        + np.array([0.0, 0.0, params.marker_z])
+        - vehicle.values[good]
+    )
     rot = matrix_of_quat(attitude.values[good])
     angles = log["gimbal"].values[good] if "gimbal" in log else np.zeros((len(time), 2))
     gimbal = Rotation.from_euler("XY", angles).as_matrix()
@@ -93,8 +128,12 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
         return []
     table_time, tables = _tables(log, params)
     found, apart, seen = [], 0, 0
-    for start in np.arange(marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window):
-        inside = np.flatnonzero(marker.valid & (marker.time >= start) & (marker.time < start + params.window))[:: params.every]
+    for start in np.arange(
+        marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window
+    ):
+        inside = np.flatnonzero(
+            marker.valid & (marker.time >= start) & (marker.time < start + params.window)
+        )[:: params.every]
         near = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
         if len(inside) < 10 or np.sum(near) < 20:
             continue
@@ -109,14 +148,21 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
         sigma = np.tile([params.sigma_across, params.sigma_across, params.sigma_along], len(time))
         found.append(
             Stretch(
-                number, "view", np.repeat(time, 3), np.zeros(3 * len(time), dtype=int), point.ravel(), sigma, np.zeros(0),
-                np.zeros(0), {"table_time": table_time[near], "table": {k: v[near] for k, v in tables.items()}},
+                number,
+                "view",
+                np.repeat(time, 3),
+                np.zeros(3 * len(time), dtype=int),
+                point.ravel(),
+                sigma,
+                np.zeros(0),
+                np.zeros(0),
+                {"table_time": table_time[near], "table": {k: v[near] for k, v in tables.items()}},
                 **latent_layout(start, start + params.window, KNOTS, (2,)),
             )
-        )  # fmt: skip
+        )
     if apart > MOST_APART * seen:
         raise LogError(
-            f"the marker's distance is more than {params.largest:g} m from the payload's in {apart} of {seen} detections: "
-            "other axes, another unit, or another marker"
+            f"the marker's distance is more than {params.largest:g} m from the payload's in {apart}"
+            f" of {seen} detections: other axes, another unit, or another marker"
         )
     return found

@@ -1,13 +1,14 @@
-"""What a model must give to be diagnosed: effects that could be missing from it, and its residuals linearised in them.
+"""What a model must give to be diagnosed: effects that could be missing from it, and its residuals
+linearised in them.
 
-The search for causes (:mod:`visthrow.diagnose.select.selector`) knows nothing of vehicles or ropes. It sees windows of residuals
+The search for causes (:mod:`visthrow.diagnose.select.selector`) knows nothing of vehicles or ropes.
+It sees windows of residuals
 
     r = S theta + X b + G a + e
 
-with theta the sizes of the effects, b what is not known at the start of the window, a the latent forces, e sensor noise. The
-whole throw, a vehicle without payload, a ball in flight, a pendulum, a motor on a stand and a camera against motion capture
-are models of this one kind.
-"""
+with theta the sizes of the effects, b what is not known at the start of the window, a the latent
+forces, e sensor noise. The whole throw, a vehicle without payload, a ball in flight, a pendulum, a
+motor on a stand and a camera against motion capture are models of this one kind."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,65 +23,85 @@ from sim.effects.effect import Effect
 class Window:
     """Residuals of one stretch of a flight, about a linearisation point theta.
 
-    N samples (every component of every channel is a sample of its own), K effects in the model's order, D nuisances,
-    G latent-force coefficients.
-    """
+    N samples (every component of every channel is a sample of its own), K effects in the model's
+    order, D nuisances, G latent-force coefficients."""
 
     flight: int  # number of the flight it was cut from
     phase: str  # hover, flight, throw or ballistic; free text for other models
     time: np.ndarray  # of the samples, in the flight's clock [s], shape (N,)
     channel: np.ndarray  # index into Model.channels, shape (N,)
-    residual: np.ndarray  # measured minus simulated, from b = 0 along the derivatives, in the channel's unit, shape (N,)
+    # measured minus simulated, from b = 0 along the derivatives, in the channel's unit, shape (N,)
+    residual: np.ndarray
     sigma: np.ndarray  # standard deviation of the sensor noise, same unit, shape (N,)
     effects: np.ndarray  # S: derivative of the simulated sample by theta, shape (N, K)
     nuisance: np.ndarray  # X, shape (N, D)
     nuisance_sd: np.ndarray  # vague prior of b, about 0, shape (D,)
     latent: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
-    latent_block: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # index into LATENT_BLOCKS, shape (G,)
-    latent_axis: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # 0, 1, 2 for x, y, z, shape (G,)
-    latent_time: np.ndarray = field(default_factory=lambda: np.zeros(0))  # of the knot [s], shape (G,)
+    latent_block: np.ndarray = field(
+        default_factory=lambda: np.zeros(0, dtype=int)
+    )  # index into LATENT_BLOCKS, shape (G,)
+    latent_axis: np.ndarray = field(
+        default_factory=lambda: np.zeros(0, dtype=int)
+    )  # 0, 1, 2 for x, y, z, shape (G,)
+    latent_time: np.ndarray = field(
+        default_factory=lambda: np.zeros(0)
+    )  # of the knot [s], shape (G,)
     knots: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside the catalogue: ``time``,
-    ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N], ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``,
-    ``tension`` [N], ``mount_b`` (of the rope, from the centre of mass) [m, body frame]."""
-    shaken: bool = False  # whether it begins in a motion that nobody can know, such as a rope's that has just come taut
+    """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside
+    the catalogue: ``time``, ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N],
+    ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``, ``tension`` [N], ``mount_b`` (of the
+    rope, from the centre of mass) [m, body frame].
+    """
+    # whether it begins in a motion that nobody can know, such as a rope's that has just come taut
+    shaken: bool = False
     correlated: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
-    """Of channels whose noise is not white: rows of their samples, shape (stamps, components), and the lower Cholesky factor of the
-    correlation of a component's noise, shape (stamps, stamps)."""
+    """Of channels whose noise is not white: rows of their samples, shape (stamps, components), and
+    the lower Cholesky factor of the correlation of a component's noise, shape (stamps, stamps).
+    """
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Where derivatives were taken, and what they are, so that initial states can follow the effects from there.
+    """Where derivatives were taken, and what they are, so that initial states can follow the
+    effects from there.
 
-    A window whose state stays behind begins with a transient that no derivative tells of, such as rotors out of balance.
-    """
+    A window whose state stays behind begins with a transient that no derivative tells of, such as
+    rotors out of balance."""
 
     theta: Mapping[str, float]  # given to :meth:`Model.windows`
     windows: Mapping[int, Window]  # what came, by number
 
 
 LATENT_BLOCKS = ("vehicle force", "vehicle torque", "payload force")
-"""Latent forces [N, world frame], torques [N m, body frame] and forces on the payload [N, world frame]."""
+"""Latent forces [N, world frame], torques [N m, body frame] and forces on the payload [N, world
+frame].
+"""
 
 
 class Model(Protocol):
     """A simulation of measured flights that can be linearised about any sizes of its effects."""
 
     effects: Sequence[Effect]
-    channels: Sequence[str]  # names, such as "pos_w"; units are those of visthrow.logs.flightlog.STANDARD_CHANNELS
+    channels: Sequence[
+        str
+    ]  # names, such as "pos_w"; units are those of visthrow.logs.flightlog.STANDARD_CHANNELS
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise there."""
+        """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise
+        there.
+        """
         ...
 
-    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+    def residuals(
+        self, theta: Mapping[str, float], about: Linearised | None = None
+    ) -> list[np.ndarray]:
         """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
 
         Args:
             theta: sizes of the effects.
-            about: where the caller's derivatives were taken. Initial states begin with those of that place and follow the effects;
-                what that does by the derivatives is added to the residuals again, which so are those of b = 0. A model that fits
-                initial states in every simulation has no need of it.
+            about: where the caller's derivatives were taken. Initial states begin with those of
+                that place and follow the effects; what that does by the derivatives is added to the
+                residuals again, which so are those of b = 0. A model that fits initial states in
+                every simulation has no need of it.
         """
         ...

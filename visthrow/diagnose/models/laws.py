@@ -1,16 +1,18 @@
-"""Laws outside the catalogue: a force or torque as coefficient times up to two scalars times one vector.
+"""Laws outside the catalogue: a force or torque as coefficient times up to two scalars times one
+vector.
 
-Every factor has a unit, so the coefficient's unit follows; vectors are made of body axes, world vertical, rope and velocities, so
-that a law means the same after the world is turned about the vertical. A term is plain data (:class:`Term`), from which the
-simulator can build a block.
+Every factor has a unit, so the coefficient's unit follows; vectors are made of body axes, world
+vertical, rope and velocities, so that a law means the same after the world is turned about the
+vertical. A term is plain data (:class:`Term`), from which the simulator can build a block.
 
-A torque in the rope's joint acts on both sides: M on the vehicle, -M on the rope. With n the rope's direction and l its length to
-the payload's centre, the couple -M on a rope that is straight does what a pair of forces does,
+A torque in the rope's joint acts on both sides: M on the vehicle, -M on the rope. With n the rope's
+direction and l its length to the payload's centre, the couple -M on a rope that is straight does
+what a pair of forces does,
 
     F_p = (-M x n) / l on the payload,   -F_p at the mount,
 
-so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is conserved.
-"""
+so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is
+conserved."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +30,9 @@ Unit = tuple[int, int, int]  # exponents of kg, m and s
 
 Knots = Mapping[str, np.ndarray]
 
-JOINT = "rope joint"  # block of the torque between vehicle and rope, which acts in all latent blocks at once
+JOINT = (  # block of the torque between vehicle and rope, which acts in all latent blocks at once
+    "rope joint"
+)
 BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
 
 
@@ -48,7 +52,9 @@ class Factor:
     symbol: str
     unit: Unit
     needs: tuple[str, ...]  # keys of Window.knots
-    read: Callable[[Known], np.ndarray]  # (k,) for a scalar, (k, 3) for a vector, in the block's frame
+    read: Callable[
+        [Known], np.ndarray
+    ]  # (k,) for a scalar, (k, 3) for a vector, in the block's frame
 
 
 @dataclass(frozen=True)
@@ -71,11 +77,17 @@ class Term:
     @property
     def needs(self) -> set[str]:
         """Keys of Window.knots that its factors are made of."""
-        return {key for factor in (*(SCALARS[f] for f in self.factors), VECTORS[self.block][self.vector]) for key in factor.needs}
+        return {
+            key
+            for factor in (*(SCALARS[f] for f in self.factors), VECTORS[self.block][self.vector])
+            for key in factor.needs
+        }
 
     @property
     def unit(self) -> str:
-        """Of the coefficient, such that the term is a force [N] or, on the vehicle and in the joint, a torque [N m]."""
+        """Of the coefficient, such that the term is a force [N] or, on the vehicle and in the
+        joint, a torque [N m].
+        """
         target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
         parts = [SCALARS[f].unit for f in self.factors] + [VECTORS[self.block][self.vector].unit]
         left = zip(("kg", "m", "s"), (t - sum(p[i] for p in parts) for i, t in enumerate(target)))
@@ -84,23 +96,37 @@ class Term:
     @property
     def formula(self) -> str:
         """The right-hand side with coefficient c."""
-        symbols = [SCALARS[f].symbol for f in self.factors] + [VECTORS[self.block][self.vector].symbol]
-        left = {"vehicle force": "F", "vehicle torque": "M", "payload force": "F_p", JOINT: "M_j"}[self.block]
+        symbols = [SCALARS[f].symbol for f in self.factors] + [
+            VECTORS[self.block][self.vector].symbol
+        ]
+        left = {"vehicle force": "F", "vehicle torque": "M", "payload force": "F_p", JOINT: "M_j"}[
+            self.block
+        ]
         return f"{left} = c {' '.join(symbols)}"
 
 
 def term_of(law: LawParams) -> Term:
-    """The term of a law that a file holds. Raises ConfigError: a factor or vector that the grammar does not have there."""
-    for name, there in ((law.vector, VECTORS[law.block]), *((factor, SCALARS) for factor in law.factors)):
+    """The term of a law that a file holds.
+
+    Raises ConfigError: a factor or vector that the grammar does not have there.
+    """
+    for name, there in (
+        (law.vector, VECTORS[law.block]),
+        *((factor, SCALARS) for factor in law.factors),
+    ):
         if name not in there:
             raise ConfigError(f"law on {law.block}: no '{name}'; {suggest(name, there)}")
     if len(law.factors) > MOST_SCALARS:
-        raise ConfigError(f"law on {law.block}: {len(law.factors)} factors; expected at most {MOST_SCALARS}")
+        raise ConfigError(
+            f"law on {law.block}: {len(law.factors)} factors; expected at most {MOST_SCALARS}"
+        )
     return Term(law.block, law.factors, law.vector)
 
 
 def exerted(laws: Sequence[LawParams], known: Knots) -> dict[str, np.ndarray]:
-    """What laws exert in each latent block at states with these quantities, shape (k, 3); without laws nothing."""
+    """What laws exert in each latent block at states with these quantities, shape (k, 3); without
+    laws nothing.
+    """
     known, total = Known(known), {}
     for law in laws:
         value = law.coefficient * VECTORS[law.block][law.vector].read(known)
@@ -113,7 +139,9 @@ def exerted(laws: Sequence[LawParams], known: Knots) -> dict[str, np.ndarray]:
 
 def carries(latent_block: np.ndarray, block: str) -> bool:
     """Whether a window has all latents that terms of a block act through."""
-    return set(map(LATENT_BLOCKS.index, LATENT_BLOCKS if block == JOINT else (block,))) <= set(np.unique(latent_block).tolist())
+    return set(map(LATENT_BLOCKS.index, LATENT_BLOCKS if block == JOINT else (block,))) <= set(
+        np.unique(latent_block).tolist()
+    )
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -168,35 +196,63 @@ def _size(vector: np.ndarray) -> np.ndarray:
 _EZ = np.array([0.0, 0.0, 1.0])
 
 DERIVED: dict[str, Callable[[Known], np.ndarray]] = {
-    "quat_wb": lambda k: Rotation.from_matrix(np.stack([k[f"axis_{i}"] for i in "xyz"], axis=-1)).as_quat(),
-    "axis_x": _axis(0), "axis_y": _axis(1), "axis_z": _axis(2), "slope": _slope, "swing": _swing,
-    "along": lambda k: _dot(k["vel_w"], k["axis_z"]), "across": lambda k: k["vel_w"] - k["along"][:, None] * k["axis_z"],
-    "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]), "vel_b": lambda k: rotate_back(k["quat_wb"], k["vel_w"]),
-    "cable_dir_b": lambda k: rotate_back(k["quat_wb"], k["cable_dir_w"]), "reach_w": _reach, "joint_rate_b": _joint_rate,
-}  # fmt: skip
+    "quat_wb": (
+        lambda k: Rotation.from_matrix(np.stack([k[f"axis_{i}"] for i in "xyz"], axis=-1)).as_quat()
+    ),
+    "axis_x": _axis(0),
+    "axis_y": _axis(1),
+    "axis_z": _axis(2),
+    "slope": _slope,
+    "swing": _swing,
+    "along": lambda k: _dot(k["vel_w"], k["axis_z"]),
+    "across": lambda k: k["vel_w"] - k["along"][:, None] * k["axis_z"],
+    "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]),
+    "vel_b": lambda k: rotate_back(k["quat_wb"], k["vel_w"]),
+    "cable_dir_b": lambda k: rotate_back(k["quat_wb"], k["cable_dir_w"]),
+    "reach_w": _reach,
+    "joint_rate_b": _joint_rate,
+}
 """What :class:`Known` computes of the quantities at the knots."""
 
 _POSE, _MOVES = ("quat_wb",), ("vel_w", "quat_wb")
 _PAIR = ("payload_vel_w", "vel_w", "cable_dir_w")
-JOINT_NEEDS = ("payload_pos_w", "payload_vel_w", "pos_w", "vel_w", "quat_wb", "rate_b", "cable_dir_w", "mount_b", "tension")
+JOINT_NEEDS = (
+    "payload_pos_w",
+    "payload_vel_w",
+    "pos_w",
+    "vel_w",
+    "quat_wb",
+    "rate_b",
+    "cable_dir_w",
+    "mount_b",
+    "tension",
+)
 
 SCALARS: dict[str, Factor] = {
     "thrust": Factor("T", (1, 1, -2), ("thrust",), lambda k: k["thrust"]),
     "thrust_rate": Factor("dT/dt", (1, 1, -3), ("thrust", "time"), lambda k: k["slope"]),
-    "abs_thrust_rate": Factor("|dT/dt|", (1, 1, -3), ("thrust", "time"), lambda k: np.abs(k["slope"])),
+    "abs_thrust_rate": Factor(
+        "|dT/dt|", (1, 1, -3), ("thrust", "time"), lambda k: np.abs(k["slope"])
+    ),
     "speed": Factor("|v|", (0, 1, -1), ("vel_w",), lambda k: _size(k["vel_w"])),
     "speed_across": Factor("v_xy", (0, 1, -1), _MOVES, lambda k: _size(k["across"])),
     "speed_across_squared": Factor("v_xy²", (0, 2, -2), _MOVES, lambda k: _size(k["across"]) ** 2),
     "speed_along": Factor("v_z", (0, 1, -1), _MOVES, lambda k: k["along"]),
     "rate": Factor("|ω|", (0, 0, -1), ("rate_b",), lambda k: _size(k["rate_b"])),
     "rate_yaw": Factor("ω_z", (0, 0, -1), ("rate_b",), lambda k: k["rate_b"][:, 2]),
-    "inverse_height": Factor("1/z", (0, -1, 0), ("pos_w",), lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST)),
+    "inverse_height": Factor(
+        "1/z", (0, -1, 0), ("pos_w",), lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST)
+    ),
     "tension": Factor("S", (1, 1, -2), ("tension",), lambda k: k["tension"]),
-    "payload_speed": Factor("|v_p|", (0, 1, -1), ("payload_vel_w",), lambda k: _size(k["payload_vel_w"])),
+    "payload_speed": Factor(
+        "|v_p|", (0, 1, -1), ("payload_vel_w",), lambda k: _size(k["payload_vel_w"])
+    ),
     "swing_speed": Factor("|v_s|", (0, 1, -1), _PAIR, lambda k: _size(k["swing"])),
-    "cable_under_rotors": Factor("(-n·e_z)", (0, 0, 0), ("cable_dir_w", "quat_wb"), lambda k: k["under"]),
+    "cable_under_rotors": Factor(
+        "(-n·e_z)", (0, 0, 0), ("cable_dir_w", "quat_wb"), lambda k: k["under"]
+    ),
     "joint_rate": Factor("|Ω|", (0, 0, -1), JOINT_NEEDS, lambda k: _size(k["joint_rate_b"])),
-}  # fmt: skip
+}
 """Scalars of a term."""
 
 ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
@@ -205,46 +261,71 @@ VECTORS: dict[str, dict[str, Factor]] = {
     "vehicle force": {
         "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
         "body_x": Factor("e_x", (0, 0, 0), _POSE, lambda k: k["axis_x"]),
-        "body_y": Factor("e_y", (0, 0, 0), _POSE, lambda k: k["axis_y"]), "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)),
+        "body_y": Factor("e_y", (0, 0, 0), _POSE, lambda k: k["axis_y"]),
+        "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)),
         "vel": Factor("v", (0, 1, -1), ("vel_w",), lambda k: k["vel_w"]),
         "vel_across": Factor("v_⊥", (0, 1, -1), _MOVES, lambda k: k["across"]),
-        "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(k["axis_z"], k["vel_w"])),
-        "rate_cross_vel": Factor("(ω x v)", (0, 1, -2), (*_MOVES, "rate_b"),
-                                 lambda k: cross(rotate(k["quat_wb"], k["rate_b"]), k["vel_w"])),
+        "axis_cross_vel": Factor(
+            "(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(k["axis_z"], k["vel_w"])
+        ),
+        "rate_cross_vel": Factor(
+            "(ω x v)",
+            (0, 1, -2),
+            (*_MOVES, "rate_b"),
+            lambda k: cross(rotate(k["quat_wb"], k["rate_b"]), k["vel_w"]),
+        ),
         "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
         "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
     },
     "vehicle torque": {
-        "body_x": Factor("e_x", (0, 0, 0), ("time",), _fixed(0)), "body_y": Factor("e_y", (0, 0, 0), ("time",), _fixed(1)),
+        "body_x": Factor("e_x", (0, 0, 0), ("time",), _fixed(0)),
+        "body_y": Factor("e_y", (0, 0, 0), ("time",), _fixed(1)),
         "body_z": Factor("e_z", (0, 0, 0), ("time",), _fixed(2)),
         "rate": Factor("ω", (0, 0, -1), ("rate_b",), lambda k: k["rate_b"]),
-        "axis_cross_rate": Factor("(e_z x ω)", (0, 0, -1), ("rate_b",), lambda k: cross(_EZ, k["rate_b"])),
+        "axis_cross_rate": Factor(
+            "(e_z x ω)", (0, 0, -1), ("rate_b",), lambda k: cross(_EZ, k["rate_b"])
+        ),
         "vel": Factor("v", (0, 1, -1), _MOVES, lambda k: k["vel_b"]),
-        "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES,
-                                 lambda k: cross(_EZ, k["vel_b"])),
-        "axis_cross_cable": Factor("(e_z x n)", (0, 0, 0), ("cable_dir_w", "quat_wb"),
-                                   lambda k: cross(_EZ, k["cable_dir_b"])),
-        "axis_cross_swing": Factor("(e_z x v_s)", (0, 1, -1), (*_PAIR, "quat_wb"),
-                                   lambda k: cross(_EZ, rotate_back(k["quat_wb"], k["swing"]))),
+        "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(_EZ, k["vel_b"])),
+        "axis_cross_cable": Factor(
+            "(e_z x n)",
+            (0, 0, 0),
+            ("cable_dir_w", "quat_wb"),
+            lambda k: cross(_EZ, k["cable_dir_b"]),
+        ),
+        "axis_cross_swing": Factor(
+            "(e_z x v_s)",
+            (0, 1, -1),
+            (*_PAIR, "quat_wb"),
+            lambda k: cross(_EZ, rotate_back(k["quat_wb"], k["swing"])),
+        ),
     },
     "payload force": {
         "payload_vel": Factor("v_p", (0, 1, -1), ("payload_vel_w",), lambda k: k["payload_vel_w"]),
-        "vertical_cross_vel": Factor("(z x v_p)", (0, 1, -1), ("payload_vel_w",),
-                                     lambda k: cross(_EZ, k["payload_vel_w"])),
-        "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)), "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
+        "vertical_cross_vel": Factor(
+            "(z x v_p)", (0, 1, -1), ("payload_vel_w",), lambda k: cross(_EZ, k["payload_vel_w"])
+        ),
+        "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)),
+        "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
         "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
         "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
-        "cable_cross_swing": Factor("(n x v_s)", (0, 1, -1), _PAIR, lambda k: cross(k["cable_dir_w"], k["swing"])),
+        "cable_cross_swing": Factor(
+            "(n x v_s)", (0, 1, -1), _PAIR, lambda k: cross(k["cable_dir_w"], k["swing"])
+        ),
         "vel": Factor("v", (0, 1, -1), ("vel_w",), lambda k: k["vel_w"]),
-        "sideways": Factor("(n - (n·e_z) e_z)", (0, 0, 0), ("cable_dir_w", "quat_wb"),
-                           lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"]),
+        "sideways": Factor(
+            "(n - (n·e_z) e_z)",
+            (0, 0, 0),
+            ("cable_dir_w", "quat_wb"),
+            lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"],
+        ),
     },
     JOINT: {
         "joint_rate": Factor("Ω", (0, 0, -1), JOINT_NEEDS, lambda k: k["joint_rate_b"]),
         "friction": Factor("Ω/|Ω|", (0, 0, 0), JOINT_NEEDS, _friction),
         "axis_cross_cable": Factor("(e_z x n)", (0, 0, 0), JOINT_NEEDS, _spring),
     },
-}  # fmt: skip
+}
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
 
 MOST_SCALARS = 2
@@ -254,7 +335,9 @@ def terms_of(block: str, known: Sequence[str]) -> list[Term]:
     """All terms of a block whose factors can be made of these knots, simplest first."""
     have = set(known)
     out = () if block == JOINT else ONLY_JOINT
-    scalars = [name for name, factor in SCALARS.items() if set(factor.needs) <= have and name not in out]
+    scalars = [
+        name for name, factor in SCALARS.items() if set(factor.needs) <= have and name not in out
+    ]
     vectors = [name for name, factor in VECTORS[block].items() if set(factor.needs) <= have]
     return [
         Term(block, factors, vector)
@@ -281,12 +364,24 @@ class Layout:
         vectors = tuple(dict.fromkeys(t.vector for t in terms_))
         at, place = {f: i + 1 for i, f in enumerate(scalars)}, {v: i for i, v in enumerate(vectors)}
         rows = [([at[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS] for t in terms_]
-        return Layout(terms_[0].block, scalars, vectors, np.array(rows).T, np.array([place[t.vector] for t in terms_]))
+        return Layout(
+            terms_[0].block,
+            scalars,
+            vectors,
+            np.array(rows).T,
+            np.array([place[t.vector] for t in terms_]),
+        )
 
     def factors(self, known: Known) -> tuple[np.ndarray, np.ndarray]:
-        """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors); each is computed once."""
-        scalars = np.stack((np.ones(len(known["time"])), *(SCALARS[f].read(known) for f in self.scalars)), axis=-1)
-        return scalars, np.stack([VECTORS[self.block][v].read(known) for v in self.vectors], axis=-1)
+        """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors);
+        each is computed once.
+        """
+        scalars = np.stack(
+            (np.ones(len(known["time"])), *(SCALARS[f].read(known) for f in self.scalars)), axis=-1
+        )
+        return scalars, np.stack(
+            [VECTORS[self.block][v].read(known) for v in self.vectors], axis=-1
+        )
 
     def table(self, knots: Knots) -> np.ndarray:
         """Values of the terms, shape (k, 3, T)."""
@@ -298,7 +393,8 @@ class Layout:
 
 
 def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]:
-    """What terms exert in each latent block: a torque in the joint on the vehicle, on the rope and, by it, on the payload.
+    """What terms exert in each latent block: a torque in the joint on the vehicle, on the rope and,
+    by it, on the payload.
 
     ``values``: of the terms, shape (k, 3, T), in the block's frame.
     Returns the latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).

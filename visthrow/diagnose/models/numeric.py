@@ -1,8 +1,9 @@
-"""A model that is simulated in NumPy and linearised by central differences, all windows and all lanes at once.
+"""A model that is simulated in NumPy and linearised by central differences, all windows and all
+lanes at once.
 
-A lane is one simulation of one window with sizes of effects, unknowns at its start and latent forces of its own. What is not
-known at the start is fitted before the linearisation, so that the linearisation is about a path near the measured one.
-"""
+A lane is one simulation of one window with sizes of effects, unknowns at its start and latent
+forces of its own. What is not known at the start is fitted before the linearisation, so that the
+linearisation is about a path near the measured one."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -20,17 +21,24 @@ from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel
 
 EFFECT_STEP = 0.05
-"""Step of the differences by effects, in their prior deviations: errors of curvature cancel, those of rounding do not matter."""
+"""Step of the differences by effects, in their prior deviations: errors of curvature cancel, those
+of rounding do not matter.
+"""
 NUISANCE_STEP = 1e-3  # step of the differences by unknowns at the start, in their prior deviations
 SETTLE_STEPS = 5
-SETTLED = 1e-3  # a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
+# a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
+SETTLED = 1e-3
 MOST_LANES = 6000  # simulated in one batch
-ROUNDED = 1e-6  # of a prior deviation, by which a size at its bound may lie outside once it was written down
+# of a prior deviation, by which a size at its bound may lie outside once it was written down
+ROUNDED = 1e-6
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """One window's measurements, before any simulation. All stretches of a model have the same D and G."""
+    """One window's measurements, before any simulation.
+
+    All stretches of a model have the same D and G.
+    """
 
     flight: int
     phase: str
@@ -40,7 +48,9 @@ class Stretch:
     sigma: np.ndarray  # shape (N,)
     nuisance: np.ndarray  # first guess of what is not known at the start, shape (D,)
     nuisance_sd: np.ndarray  # vague, shape (D,)
-    data: Mapping[str, Any] = field(default_factory=dict)  # what simulation and sensors read: inputs, stamps
+    data: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # what simulation and sensors read: inputs, stamps
     latent_block: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     latent_axis: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     latent_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -61,34 +71,51 @@ class Lanes:
 
 
 class NumericModel(ABC):
-    """Implements :class:`visthrow.diagnose.models.interface.Model` on :meth:`simulate` and :meth:`measure`."""
+    """Implements :class:`visthrow.diagnose.models.interface.Model` on :meth:`simulate` and
+    :meth:`measure`.
+    """
 
     cheap = True  # derivatives are taken anew wherever the search goes
     latent_step = 1.0  # of the differences by latent forces [N or N m]
     lawless = ""  # why no law outside the catalogue can act in it
-    bends = False  # whether what a law does to a window is far from its share at the knots, so that the search must fly it
+    # whether what a law does to a window is far from its share at the knots, so that the search
+    # must fly it
+    bends = False
 
     def __init__(
-        self, effects: Sequence[Effect], channels: Sequence[str], stretches: Sequence[Stretch], inputs: Sequence[str] = ()
+        self,
+        effects: Sequence[Effect],
+        channels: Sequence[str],
+        stretches: Sequence[Stretch],
+        inputs: Sequence[str] = (),
     ) -> None:
-        """Take the catalogue, channels that residuals are taken of, windows, and channels that are there and drive the simulation.
+        """Take the catalogue, channels that residuals are taken of, windows, and channels that are
+        there and drive the simulation.
 
-        An effect that needs any other channel cannot be seen. Raises LogError where there is no window.
-        """
+        An effect that needs any other channel cannot be seen. Raises LogError where there is no
+        window."""
         if not stretches:
-            raise LogError(f"no stretch of these logs shows {', '.join(channels)} in a way that this model explains")
+            raise LogError(
+                f"no stretch of these logs shows {', '.join(channels)} in a way that this model"
+                " explains"
+            )
         given = set(inputs) - set(channels)
-        self.effects = tuple(replace(e, channels=tuple(c for c in e.channels if c not in given)) for e in effects)
+        self.effects = tuple(
+            replace(e, channels=tuple(c for c in e.channels if c not in given)) for e in effects
+        )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self.channels, self.stretches = tuple(channels), list(stretches)
         self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] | None = None
-        self._base = np.zeros(len(self.effects))  # sizes that the model has before anything is found
+        self._base = np.zeros(
+            len(self.effects)
+        )  # sizes that the model has before anything is found
         self.laws: tuple[LawParams, ...] = ()  # that act in it besides
         self._flown: NumericModel | None = None  # the same with more laws
 
     def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
-        """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws act besides.
+        """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws
+        act besides.
 
         Raises LogError for a size outside its bounds, and a law that cannot act in this model.
         """
@@ -96,16 +123,27 @@ class NumericModel(ABC):
         for effect, size in zip(self.effects, base):
             low, high = effect.bounds
             if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
-                raise LogError(f"{effect.name} = {size:.4g} {effect.unit}; this model has it from {low:g} to {high:g}")
+                raise LogError(
+                    f"{effect.name} = {size:.4g} {effect.unit}; this model has it from {low:g} to"
+                    f" {high:g}"
+                )
         if laws:
             first, one = self.stretches[0], self._lanes(base).part([0])
             there = self.knots(first, self.simulate(one)[0]).keys()
             for term in map(term_of, laws):
-                lacking = sorted(term.needs - there) or ([] if carries(first.latent_block, term.block) else [term.block])
+                lacking = sorted(term.needs - there) or (
+                    [] if carries(first.latent_block, term.block) else [term.block]
+                )
                 if lacking:
-                    raise LogError(f"the law {term.formula} cannot act here: {self.lawless or 'this model has no ' + ', '.join(lacking)}")
+                    raise LogError(
+                        f"the law {term.formula} cannot act here:"
+                        f" {self.lawless or 'this model has no ' + ', '.join(lacking)}"
+                    )
         self._base, self.laws = base, (*self.laws, *laws)
-        self.effects = tuple(replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b)) for e, b in zip(self.effects, base.tolist()))
+        self.effects = tuple(
+            replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b))
+            for e, b in zip(self.effects, base.tolist())
+        )
 
     def choose(self, names: Sequence[str]) -> None:
         """Keep these effects alone. Raises DiagnoseError for one that it does not know."""
@@ -127,7 +165,10 @@ class NumericModel(ABC):
         return self._flown
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
-        """Simulate lanes; the result has the lane as its first axis. Models without a state need not override it."""
+        """Simulate lanes; the result has the lane as its first axis.
+
+        Models without a state need not override it.
+        """
         return np.empty((len(lanes.owner), 0))
 
     @abstractmethod
@@ -135,17 +176,26 @@ class NumericModel(ABC):
         """What the sensors would have measured in lanes of one stretch, shape (L, N)."""
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Simulated quantities at the knots of the latent forces, for laws outside the catalogue; none by default."""
+        """Simulated quantities at the knots of the latent forces, for laws outside the catalogue;
+        none by default.
+        """
         return {}
 
     def size(self, theta: Mapping[str, float]) -> np.ndarray:
-        """Sizes of all effects in order, with those it had before, shape (K,). Raises LogError for an effect that it does not know."""
+        """Sizes of all effects in order, with those it had before, shape (K,).
+
+        Raises LogError for an effect that it does not know.
+        """
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
         return self._base + np.array([float(theta.get(name, 0.0)) for name in self.numbers])
 
     def of(self, lanes: Lanes, name: str) -> np.ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
-        return lanes.theta[:, self.numbers[name]] if name in self.numbers else np.zeros(len(lanes.owner))
+        return (
+            lanes.theta[:, self.numbers[name]]
+            if name in self.numbers
+            else np.zeros(len(lanes.owner))
+        )
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
@@ -156,13 +206,27 @@ class NumericModel(ABC):
         path = self.simulate(self._lanes(size))
         return [
             Window(
-                s.flight, s.phase, s.time, s.channel, residuals[i], s.sigma, effects[i], slopes[i], s.nuisance_sd, latent[i],
-                s.latent_block, s.latent_axis, s.latent_time, self.knots(s, path[i]),
+                s.flight,
+                s.phase,
+                s.time,
+                s.channel,
+                residuals[i],
+                s.sigma,
+                effects[i],
+                slopes[i],
+                s.nuisance_sd,
+                latent[i],
+                s.latent_block,
+                s.latent_axis,
+                s.latent_time,
+                self.knots(s, path[i]),
             )
             for i, s in enumerate(self.stretches)
-        ]  # fmt: skip
+        ]
 
-    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+    def residuals(
+        self, theta: Mapping[str, float], about: Linearised | None = None
+    ) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`; initial states are fitted anew."""
         return self._settle(self.size(theta))
 
@@ -170,10 +234,17 @@ class NumericModel(ABC):
         """One lane a stretch."""
         count = len(self.stretches)
         start = self._start if start is None else start
-        return Lanes(np.arange(count), np.tile(size, (count, 1)), start, np.zeros((count, len(self.stretches[0].latent_block))))
+        return Lanes(
+            np.arange(count),
+            np.tile(size, (count, 1)),
+            start,
+            np.zeros((count, len(self.stretches[0].latent_block))),
+        )
 
     def _run(self, lanes: Lanes) -> list[np.ndarray]:
-        """Measurements of all lanes, in batches; lane by lane, as windows differ in their number of samples."""
+        """Measurements of all lanes, in batches; lane by lane, as windows differ in their number of
+        samples.
+        """
         out: list[np.ndarray] = [np.empty(0)] * len(lanes.owner)
         for first in range(0, len(lanes.owner), MOST_LANES):
             rows = np.arange(first, min(first + MOST_LANES, len(lanes.owner)))
@@ -181,12 +252,16 @@ class NumericModel(ABC):
             path = self.simulate(part)
             for i in np.unique(part.owner):
                 own = np.flatnonzero(part.owner == i)
-                for row, samples in zip(rows[own], self.measure(self.stretches[i], path[own], part.part(own))):
+                for row, samples in zip(
+                    rows[own], self.measure(self.stretches[i], path[own], part.part(own))
+                ):
                     out[row] = samples
         return out
 
     def _off(self, size: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
-        return [s.measured - out for s, out in zip(self.stretches, self._run(self._lanes(size, start)))]
+        return [
+            s.measured - out for s, out in zip(self.stretches, self._run(self._lanes(size, start)))
+        ]
 
     def _settle(self, size: np.ndarray, fresh: bool = False) -> list[np.ndarray]:
         """Fit what is not known at the start, window by window; returns the residuals."""
@@ -219,7 +294,9 @@ class NumericModel(ABC):
     def _costs(self, residuals: list[np.ndarray], start: np.ndarray) -> np.ndarray:
         costs = []
         for s, residual, at in zip(self.stretches, residuals, start):
-            value = np.sum((residual / s.sigma) ** 2) + np.sum(((at - s.nuisance) / s.nuisance_sd) ** 2)
+            value = np.sum((residual / s.sigma) ** 2) + np.sum(
+                ((at - s.nuisance) / s.nuisance_sd) ** 2
+            )
             costs.append(value if np.isfinite(value) else np.inf)
         return np.array(costs)
 
@@ -227,30 +304,55 @@ class NumericModel(ABC):
         s, slope = self.stretches[i], self._slopes[i]
         weight, prior = 1.0 / s.sigma, 1.0 / s.nuisance_sd
         if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slope))):
-            return np.zeros(len(s.nuisance))  # no step mends that; the search says which window it is
+            return np.zeros(
+                len(s.nuisance)
+            )  # no step mends that; the search says which window it is
         rows = np.concatenate([slope * weight[:, None], np.diag(prior)])
         aim = np.concatenate([residual * weight, (s.nuisance - self._start[i]) * prior])
         step = np.linalg.lstsq(rows, aim, rcond=None)[0]
         return step if 0.5 * aim @ rows @ step > SETTLED else np.zeros_like(step)
 
     def _by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
-        """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central differences; (N, directions) a stretch."""
+        """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central
+        differences; (N, directions) a stretch.
+        """
         stretches, first = len(self.stretches), self.stretches[0]
-        counts = {"theta": len(self.numbers), "nuisance": len(first.nuisance), "latent": len(first.latent_block)}
-        asked = np.arange(counts[name]) if name != "theta" else np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
+        counts = {
+            "theta": len(self.numbers),
+            "nuisance": len(first.nuisance),
+            "latent": len(first.latent_block),
+        }
+        asked = (
+            np.arange(counts[name])
+            if name != "theta"
+            else np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
+        )
         count = len(asked)
-        steps = np.broadcast_to({
-            "theta": np.array([EFFECT_STEP * effect.prior_sd for effect in self.effects]),
-            "nuisance": NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches]),
-            "latent": np.full(count, self.latent_step),
-        }[name], (stretches, count))  # fmt: skip
+        steps = np.broadcast_to(
+            {
+                "theta": np.array([EFFECT_STEP * effect.prior_sd for effect in self.effects]),
+                "nuisance": NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches]),
+                "latent": np.full(count, self.latent_step),
+            }[name],
+            (stretches, count),
+        )
         moves = {key: np.zeros((stretches * count, n)) for key, n in counts.items()}
-        moves[name] = (steps[:, :, None] * np.eye(counts[name])[asked]).reshape(stretches * count, counts[name])
-        still = Lanes(np.repeat(np.arange(stretches), count), size, np.repeat(self._start, count, axis=0), 0.0)
-        moved = [Lanes(still.owner, *(getattr(still, key) + sign * move for key, move in moves.items())) for sign in (1.0, -1.0)]
+        moves[name] = (steps[:, :, None] * np.eye(counts[name])[asked]).reshape(
+            stretches * count, counts[name]
+        )
+        still = Lanes(
+            np.repeat(np.arange(stretches), count), size, np.repeat(self._start, count, axis=0), 0.0
+        )
+        moved = [
+            Lanes(still.owner, *(getattr(still, key) + sign * move for key, move in moves.items()))
+            for sign in (1.0, -1.0)
+        ]
         sides = [self._run(lanes) for lanes in moved]
         slopes = [0.5 * (a - b) / step for a, b, step in zip(*sides, steps.ravel())]
-        return [np.reshape(slopes[i * count : (i + 1) * count], (count, len(s.measured))).T for i, s in enumerate(self.stretches)]
+        return [
+            np.reshape(slopes[i * count : (i + 1) * count], (count, len(s.measured))).T
+            for i, s in enumerate(self.stretches)
+        ]
 
 
 def sigma_of(channel: Channel, least: float) -> np.ndarray:
@@ -262,11 +364,13 @@ def sigma_of(channel: Channel, least: float) -> np.ndarray:
     return np.maximum(np.where(np.isfinite(seen), seen, 10.0 * least), least)
 
 
-def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray) -> np.ndarray:
+def integrate(
+    slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray
+) -> np.ndarray:
     """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
 
-    ``slope``: of the half step counted from the start, and the state; ``state``: at the start, shape (B, S); ``step``: [s], shape (B, 1).
-    """
+    ``slope``: of the half step counted from the start, and the state; ``state``: at the start,
+    shape (B, S); ``step``: [s], shape (B, 1)."""
     path, half = np.empty((len(state), steps + 1, state.shape[1])), 0.5 * step
     path[:, 0] = state
     for i in range(steps):
@@ -278,7 +382,9 @@ def integrate(slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray,
     return path
 
 
-def hermite(time: np.ndarray, start: float, step: float, value: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def hermite(
+    time: np.ndarray, start: float, step: float, value: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
     """Values at stamps from values and rates on an even grid, cubic.
 
     Returns shape (L, N, C).
@@ -319,15 +425,18 @@ def latent_layout(
     times = np.linspace(start, end, count)
     layout = [(block, axis, time) for block in blocks for axis in axes for time in times]
     block, axis, time = (np.array(column) for column in zip(*layout))
-    return {"latent_block": block.astype(int), "latent_axis": axis.astype(int), "latent_time": time.astype(float)}
+    return {
+        "latent_block": block.astype(int),
+        "latent_axis": axis.astype(int),
+        "latent_time": time.astype(float),
+    }
 
 
 def latent_force(latent: np.ndarray, steps: int, blocks: int, axes: int = 3) -> np.ndarray:
     """Latent forces at the half steps of the grid.
 
-    ``latent``: coefficients, shape (B, G), ordered by :func:`latent_layout`; ``blocks``: number of blocks in the layout; ``axes``: of each
-    block. Returns shape (2 steps + 1, blocks, B, axes).
-    """
+    ``latent``: coefficients, shape (B, G), ordered by :func:`latent_layout`; ``blocks``: number of
+    blocks in the layout; ``axes``: of each block. Returns shape (2 steps + 1, blocks, B, axes)."""
     knots = latent.shape[1] // (blocks * axes)
     weights = triangles(np.linspace(0.0, 1.0, 2 * steps + 1), np.linspace(0.0, 1.0, knots))
     return np.einsum("xbak,tk->tbxa", latent.reshape(len(latent), blocks, axes, knots), weights)

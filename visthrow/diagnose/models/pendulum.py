@@ -1,4 +1,6 @@
-"""A pendulum on an encoder: natural frequency, friction of three kinds, and errors of the encoder."""
+"""A pendulum on an encoder: natural frequency, friction of three kinds, and errors of
+the encoder.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,8 +26,14 @@ from visthrow.logs.flightlog import FlightLog
 CHANNEL = "angle"
 KNOTS = 11  # of the latent force on the bob over a window
 FEWEST = 20  # samples of a window
-FARTHEST = 2.0 * np.pi  # median distance from where the pendulum hangs [rad]: no free swing goes round and round most of the time
-SMOOTH = 0.02  # dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the integrator
+FARTHEST = (
+    2.0 * np.pi
+    # median distance from where the pendulum hangs [rad]: no free swing goes round and round most
+    # of the time
+)
+# dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the
+# integrator
+SMOOTH = 0.02
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,8 @@ class PendulumParams:
     """The pendulum that is assumed before anything is found."""
 
     gravity: float  # [m/s^2]
-    length: float  # of the equivalent simple pendulum, inertia about the pivot over mass times lever [m]
+    # of the equivalent simple pendulum, inertia about the pivot over mass times lever [m]
+    length: float
     hanging: float  # what the encoder says where it hangs [rad]
     viscous: float  # friction in proportion to the rate, per inertia [1/s]
     coulomb: float  # dry friction per inertia [rad/s^2]
@@ -51,32 +60,50 @@ class PendulumParams:
 class PendulumModel(NumericModel):
     """Free swings, cut into windows.
 
-    Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg at the pendulum's length.
-    """
+    Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg
+    at the pendulum's length."""
 
     latent_step, bends = 0.1, True
 
     def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
-        """Cut the logs. Raises LogError where none holds an angle, or one holds angles that are no radians from where it hangs."""
+        """Cut the logs.
+
+        Raises LogError where none holds an angle, or one holds angles that are no radians from
+        where it hangs.
+        """
         self.params = params
-        stretches = [s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)]
+        stretches = [
+            s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)
+        ]
         self._steps = round(params.window / params.step)
         super().__init__(effects_of("pendulum", params), (CHANNEL,), stretches)
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
-        """See the base class; the unknowns are angle from hanging and rate at the window's start. Returns them over the grid."""
+        """See the base class; the unknowns are angle from hanging and rate at the window's start.
+
+        Returns them over the grid.
+        """
         p = self.params
         length, viscous, coulomb, quadratic, _, _, clock, spring = lanes.theta.T
         stiffness = p.gravity / (p.length + length)
-        viscous, coulomb, quadratic = p.viscous + viscous, p.coulomb + coulomb, p.quadratic + quadratic
+        viscous, coulomb, quadratic = (
+            p.viscous + viscous,
+            p.coulomb + coulomb,
+            p.quadratic + quadratic,
+        )
         push = latent_force(lanes.latent, self._steps, 1, 2)[:, 0]
 
         def slope(at: int, state: np.ndarray) -> np.ndarray:
             angle, rate = state.T
-            sine, friction = np.sin(angle), viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate
+            sine, friction = (
+                np.sin(angle),
+                viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate,
+            )
             force = push[at]
             if self.laws:
-                force = force + exerted(self.laws, self._known(angle, state))["payload force"][:, ::2]
+                force = (
+                    force + exerted(self.laws, self._known(angle, state))["payload force"][:, ::2]
+                )
             along = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
             return np.stack([rate, -stiffness * sine - spring * angle - friction + along], 1)
 
@@ -85,24 +112,46 @@ class PendulumModel(NumericModel):
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class."""
-        time, grid = np.unique(stretch.latent_time), stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path))
+        time, grid = (
+            np.unique(stretch.latent_time),
+            stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path)),
+        )
         return self._known(time, triangles(time, grid) @ path)
 
     def _known(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
-        """Quantities of a law at angles and rates, shape (k, 2); the pivot stands upright and still."""
+        """Quantities of a law at angles and rates, shape (k, 2); the pivot stands upright and
+        still.
+        """
         length, (angle, rate) = self.params.length, state.T
-        along, vel, upright = np.zeros((len(state), 3)), np.zeros((len(state), 3)), np.zeros((len(state), 4))
+        along, vel, upright = (
+            np.zeros((len(state), 3)),
+            np.zeros((len(state), 3)),
+            np.zeros((len(state), 4)),
+        )
         along[:, 0], along[:, 2], upright[:, 3] = np.sin(angle), -np.cos(angle), 1.0
         vel[:, 0], vel[:, 2] = -length * rate * along[:, 2], length * rate * along[:, 0]
         tension = np.maximum(length * rate**2 - self.params.gravity * along[:, 2], 0.0)
-        return {"time": time, "payload_pos_w": length * along, "payload_vel_w": vel, "cable_dir_w": along, "quat_wb": upright,
-                "under": -along[:, 2], "tension": tension}  # fmt: skip
+        return {
+            "time": time,
+            "payload_pos_w": length * along,
+            "payload_vel_w": vel,
+            "cable_dir_w": along,
+            "quat_wb": upright,
+            "under": -along[:, 2],
+            "tension": tension,
+        }
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         offset, scale, clock = lanes.theta.T[4:7]
         rate = path[..., 1:] * (1.0 + clock[:, None, None])
-        angle = hermite(stretch.time, stretch.data["start"], self.params.window / self._steps, path[..., :1], rate)[..., 0]
+        angle = hermite(
+            stretch.time,
+            stretch.data["start"],
+            self.params.window / self._steps,
+            path[..., :1],
+            rate,
+        )[..., 0]
         return angle * (1.0 + scale)[:, None] + offset[:, None] + self.params.hanging
 
 
@@ -114,8 +163,9 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
         return []
     if np.median(np.abs(angle - params.hanging)) > FARTHEST:
         raise LogError(
-            f"the pendulum is {np.median(np.abs(angle - params.hanging)):.3g} rad from where it hangs ({params.hanging:.3g} rad); "
-            "expected radians within a turn: degrees, or another zero?"
+            f"the pendulum is {np.median(np.abs(angle - params.hanging)):.3g} rad from where it"
+            f" hangs ({params.hanging:.3g} rad); expected radians within a turn: degrees, or"
+            " another zero?"
         )
     sigma = float(sigma_of(channel, 1e-5)[0])
     found = []
@@ -127,8 +177,16 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
         fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
         found.append(
             Stretch(
-                number, "swing", t, np.zeros(len(t), dtype=int), y, np.full(len(t), sigma), fit[:2], np.array([0.2, 1.0]),
-                {"start": start}, **latent_layout(start, start + params.window, KNOTS, (2,), (0, 2)),
+                number,
+                "swing",
+                t,
+                np.zeros(len(t), dtype=int),
+                y,
+                np.full(len(t), sigma),
+                fit[:2],
+                np.array([0.2, 1.0]),
+                {"start": start},
+                **latent_layout(start, start + params.window, KNOTS, (2,), (0, 2)),
             )
-        )  # fmt: skip
+        )
     return found

@@ -1,7 +1,8 @@
-"""Mean commands of the four motors in slow flight: what feedback had to do so that forces and torques balance.
+"""Mean commands of the four motors in slow flight: what feedback had to do so that forces and
+torques balance.
 
-Where neither attitude nor rates are logged, the balance still tells: thrusts must carry the weight and turn nothing.
-"""
+Where neither attitude nor rates are logged, the balance still tells: thrusts must carry the weight
+and turn nothing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,9 +46,18 @@ class TrimModel(NumericModel):
     def __init__(self, logs: Sequence[FlightLog], params: TrimParams) -> None:
         """Cut the logs. Raises LogError where none flies slowly with motor commands logged."""
         self.params = params
-        usable = [(i, log) for i, log in enumerate(logs) if params.command in log and params.position in log]
+        usable = [
+            (i, log)
+            for i, log in enumerate(logs)
+            if params.command in log and params.position in log
+        ]
         stretches = [s for i, log in usable for s in _cut(log, i, params)]
-        super().__init__(effects_of("trim", params), (params.command,), stretches, (params.position, "battery_voltage"))
+        super().__init__(
+            effects_of("trim", params),
+            (params.command,),
+            stretches,
+            (params.position, "battery_voltage"),
+        )
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: the commands at which everything balances, shape (B, 4)."""
@@ -61,24 +71,41 @@ class TrimModel(NumericModel):
         off_y = ((p.mass + mass) * com_y + added @ y) / total
         spin = np.array(p.spin)
         lift = stretch.data["lift"]
-        draught = lanes.latent.reshape(len(theta), 4, 2).mean(2)  # a push along the vertical, then three torques
+        draught = lanes.latent.reshape(len(theta), 4, 2).mean(
+            2
+        )  # a push along the vertical, then three torques
         if self.laws:
-            own = {block: np.mean(value, axis=0) for block, value in exerted(self.laws, self.knots(stretch, path)).items()}
-            draught = draught + np.append(own.get("vehicle force", np.zeros(3))[2], own.get("vehicle torque", np.zeros(3)))
+            own = {
+                block: np.mean(value, axis=0)
+                for block, value in exerted(self.laws, self.knots(stretch, path)).items()
+            }
+            draught = draught + np.append(
+                own.get("vehicle force", np.zeros(3))[2], own.get("vehicle torque", np.zeros(3))
+            )
         push, roll, pitch, turn = draught.T
         share = np.outer(off_x, x) / p.arm**2 + np.outer(off_y, y) / p.arm**2 - np.outer(yaw, spin)
         thrust = 0.25 * (1.0 + share) * (weight * lift)[:, None] - 0.25 * push[:, None]
-        thrust = thrust - 0.25 * (np.outer(roll, y) - np.outer(pitch, x)) / p.arm**2 - 0.25 * np.outer(turn, spin) / p.torque_ratio
+        thrust = (
+            thrust
+            - 0.25 * (np.outer(roll, y) - np.outer(pitch, x)) / p.arm**2
+            - 0.25 * np.outer(turn, spin) / p.torque_ratio
+        )
         volts = 1.0 + (p.voltage_coefficient + sag) * (stretch.data["volts"] - p.reference_voltage)
-        per_map = thrust / (np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None])
+        per_map = thrust / (
+            np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None]
+        )
         return command_of(p.thrust_map, per_map)
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; nothing tells the attitude, hence not the body's velocity either."""
         data, (start, end) = stretch.data, np.unique(stretch.latent_time)
         thrust = self.params.mass * self.params.gravity * data["lift"]
-        return {"time": np.array([start, end]), "pos_w": np.tile(data["pos"], (2, 1)), "vel_w": np.tile(data["vel"], (2, 1)),
-                "thrust": np.full(2, thrust)}  # fmt: skip
+        return {
+            "time": np.array([start, end]),
+            "pos_w": np.tile(data["pos"], (2, 1)),
+            "vel_w": np.tile(data["vel"], (2, 1)),
+            "thrust": np.full(2, thrust),
+        }
 
 
 def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
@@ -96,25 +123,50 @@ def _latent(start: float, end: float) -> dict[str, np.ndarray]:
 
 
 def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
-    window, stamps, nothing = params.slowest_window, log[params.command].time, (np.zeros(0), np.zeros(0))
+    window, stamps, nothing = (
+        params.slowest_window,
+        log[params.command].time,
+        (np.zeros(0), np.zeros(0)),
+    )
     (time, sent), (time_p, pos) = log[params.command].samples(), log[params.position].samples()
-    time_v, vel = log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
+    time_v, vel = (
+        log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
+    )
     time_u, volts = log["battery_voltage"].samples() if "battery_voltage" in log else nothing
     found = []
     for start in np.arange(stamps[0], stamps[-1] - window, window):
-        inside, near, moving, charged = ((t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u))
+        inside, near, moving, charged = (
+            (t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u)
+        )
         if min(np.sum(inside), np.sum(near), np.sum(moving)) < 20:
             continue
         own = vel[moving]
-        if np.min(pos[near][:, 2]) < params.lowest or np.mean(np.linalg.norm(own, axis=1)) > params.fastest:
+        if (
+            np.min(pos[near][:, 2]) < params.lowest
+            or np.mean(np.linalg.norm(own, axis=1)) > params.fastest
+        ):
             continue
         lift = 1.0 + (own[-5:, 2].mean() - own[:5, 2].mean()) / window / params.gravity
-        data = {"volts": float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage, "lift": lift,
-                "pos": np.mean(pos[near], axis=0), "vel": np.mean(own, axis=0)}  # fmt: skip
+        data = {
+            "volts": (
+                float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage
+            ),
+            "lift": lift,
+            "pos": np.mean(pos[near], axis=0),
+            "vel": np.mean(own, axis=0),
+        }
         found.append(
             Stretch(
-                number, "hover", np.full(4, start), np.zeros(4, dtype=int), np.mean(sent[inside], axis=0), np.full(4, params.spread),
-                np.zeros(0), np.zeros(0), data, **_latent(start, start + window),
+                number,
+                "hover",
+                np.full(4, start),
+                np.zeros(4, dtype=int),
+                np.mean(sent[inside], axis=0),
+                np.full(4, params.spread),
+                np.zeros(0),
+                np.zeros(0),
+                data,
+                **_latent(start, start + window),
             )
-        )  # fmt: skip
+        )
     return found

@@ -1,15 +1,19 @@
-"""Excitation that is optimised: sweeps laid over a manoeuvre, within limits, for the most expected nats a second.
+"""Excitation that is optimised: sweeps laid over a manoeuvre, within limits, for the most expected
+nats a second.
 
-What is varied: how much of the manoeuvre is kept; a sweep of the path along each axis and one of the heading, from one frequency to
-another; sweeps that are added to rates and thrust, at frequencies that no path follows. A sweep moves as far at each of its frequencies as
-its share of the limits lets, and all are made smaller until the path keeps within them, so that every design does.
+What is varied: how much of the manoeuvre is kept; a sweep of the path along each axis and one of
+the heading, from one frequency to another; sweeps that are added to rates and thrust, at
+frequencies that no path follows. A sweep moves as far at each of its frequencies as its share of
+the limits lets, and all are made smaller until the path keeps within them, so that every design
+does.
 
-The objective is that of :class:`visthrow.diagnose.planning.plan.Aim` for the Fisher information of the simulated flight, by the linearised
-model that the selection uses, over its seconds. The search is differential evolution from a Sobol sequence about the
-manoeuvre: where the rope goes slack, how near a flight comes to being aborted has no derivative. A generation's flights are one batch.
+The objective is that of :class:`visthrow.diagnose.planning.plan.Aim` for the Fisher information of
+the simulated flight, by the linearised model that the selection uses, over its seconds. The search
+is differential evolution from a Sobol sequence about the manoeuvre: where the rope goes slack, how
+near a flight comes to being aborted has no derivative. A generation's flights are one batch.
 
-Source: Bayesian optimal designs: Chaloner and Verdinelli 1995; inputs for flight vehicles: Morelli 2021, multisines.
-"""
+Source: Bayesian optimal designs: Chaloner and Verdinelli 1995; inputs for flight vehicles: Morelli
+2021, multisines."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,51 +29,81 @@ from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, ris
 from visthrow.diagnose.planning.plan import Aim
 
 SLOWEST, FASTEST = 0.08, 2.0
-"""Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop still follows."""
+"""Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop
+still follows.
+"""
 
 ADDED = 0.5, 12.0
-"""Frequencies of what is added to the commands [Hz]: above the position loop, up to a quarter of the rate of the reference's rows."""
+"""Frequencies of what is added to the commands [Hz]: above the position loop, up to a quarter of
+the rate of the reference's rows.
+"""
 
 FADE = 1.0  # in which sweeps begin and end [s]
 YAW_RATE = 1.5  # of the heading's sweep [rad/s]: within what the hover controller asks for
 ABORTED = 1e3  # cost of a flight that is aborted at the limit: above what any other costs [nats/s]
 
 NEAR = 0.5
-"""Way from the manoeuvre to the corners of the box of numbers that the first look goes at most: with all sweeps at once, few fly."""
+"""Way from the manoeuvre to the corners of the box of numbers that the first look goes at most:
+with all sweeps at once, few fly.
+"""
 
 SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wants it
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What vehicle and hall allow. Raises DiagnoseError: one that is not above 0, or a ceiling below the floor."""
+    """What vehicle and hall allow.
 
-    half: tuple[float, float] = (2.5, 2.5)  # of the hall, from its middle, that the path stays in [m]
+    Raises DiagnoseError: one that is not above 0, or a ceiling below the floor.
+    """
+
+    half: tuple[float, float] = (
+        2.5,
+        2.5,
+    )  # of the hall, from its middle, that the path stays in [m]
     lowest: float = 0.8  # [m]
     highest: float = 2.6  # [m]
     speed: float = 3.0  # [m/s]
     acceleration: float = 4.0  # [m/s^2]
-    rate: float = 3.0  # added to the body rates: that of the doublets, at which motors do not saturate [rad/s]
+    # added to the body rates: that of the doublets, at which motors do not saturate [rad/s]
+    rate: float = 3.0
     thrust: float = 0.4  # added to the thrust, as a share of it
 
     def __post_init__(self) -> None:
-        if not (min(*self.half, self.speed, self.acceleration, self.rate, self.thrust) > 0.0 and self.highest > self.lowest > 0.0):
+        if not (
+            min(*self.half, self.speed, self.acceleration, self.rate, self.thrust) > 0.0
+            and self.highest > self.lowest > 0.0
+        ):
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
     def share(self, path: np.ndarray, more: np.ndarray) -> float:
-        """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of both ``PERIOD`` apart, (N, 3)."""
-        middle, room = (0.0, 0.0, 0.5 * (self.highest + self.lowest)), (*self.half, 0.5 * (self.highest - self.lowest))
+        """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of
+        both ``PERIOD`` apart, (N, 3).
+        """
+        middle, room = (
+            (0.0, 0.0, 0.5 * (self.highest + self.lowest)),
+            (
+                *self.half,
+                0.5 * (self.highest - self.lowest),
+            ),
+        )
         ways = [((path - middle)[:, [i]], more[:, [i]], room[i]) for i in range(3)]
         ways += zip(_derivatives(path), _derivatives(more), (self.speed, self.acceleration))
         return min(1.0, *(_leaving(*way) for way in ways))
 
     def around(self, path: np.ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""
-        speed, acceleration = (float(np.linalg.norm(rows, axis=1).max()) for rows in _derivatives(path))
+        speed, acceleration = (
+            float(np.linalg.norm(rows, axis=1).max()) for rows in _derivatives(path)
+        )
         return replace(
-            self, half=tuple(np.maximum(self.half, np.abs(path[:, :2]).max(0)).tolist()), lowest=min(self.lowest, path[:, 2].min()),
-            highest=max(self.highest, path[:, 2].max()), speed=max(self.speed, speed), acceleration=max(self.acceleration, acceleration),
-        )  # fmt: skip
+            self,
+            half=tuple(np.maximum(self.half, np.abs(path[:, :2]).max(0)).tolist()),
+            lowest=min(self.lowest, path[:, 2].min()),
+            highest=max(self.highest, path[:, 2].max()),
+            speed=max(self.speed, speed),
+            acceleration=max(self.acceleration, acceleration),
+        )
 
 
 def _derivatives(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,9 +114,15 @@ def _derivatives(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _leaving(at: np.ndarray, along: np.ndarray, radius: float) -> float:
     """Share of a way from within a ball about 0 at which its first row leaves it, shapes (N, D)."""
-    inward, square, slack = -(at * along).sum(1), (along**2).sum(1), np.maximum(radius**2 - (at**2).sum(1), 0.0)
+    inward, square, slack = (
+        -(at * along).sum(1),
+        (along**2).sum(1),
+        np.maximum(radius**2 - (at**2).sum(1), 0.0),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):  # of a row that does not move
-        return float(np.nanmin((inward + np.sqrt(inward**2 + square * slack)) / square, initial=np.inf))
+        return float(
+            np.nanmin((inward + np.sqrt(inward**2 + square * slack)) / square, initial=np.inf)
+        )
 
 
 @dataclass(frozen=True)
@@ -95,15 +135,24 @@ class Sweep:
     phase: float = 0.0  # at the start [rad]
 
     def at(self, t: np.ndarray, most: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Values at times after its start [s], with the amplitude that ``most`` gives for a frequency [Hz]."""
+        """Values at times after its start [s], with the amplitude that ``most`` gives for a
+        frequency [Hz].
+        """
         frequency = self.low + (self.high - self.low) * t / self.seconds
         turned = 2.0 * np.pi * (self.low + 0.5 * (self.high - self.low) * t / self.seconds) * t
         fade = rise(t, 0.0, FADE) * (1.0 - rise(t, self.seconds - FADE, FADE))
         return most(frequency) * fade * np.sin(turned + self.phase)
 
 
-NUMBERS = ("kept", *(f"{what}_{axis}" for axis in ("x", "y", "z", "yaw") for what in ("share", "from", "to")),
-           "rate_x", "rate_y", "rate_z", "thrust", "added_to")  # fmt: skip
+NUMBERS = (
+    "kept",
+    *(f"{what}_{axis}" for axis in ("x", "y", "z", "yaw") for what in ("share", "from", "to")),
+    "rate_x",
+    "rate_y",
+    "rate_z",
+    "thrust",
+    "added_to",
+)
 """What is varied, each from 0 to 1: shares of the limits, frequencies by their logarithm."""
 
 START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the manoeuvre as it is
@@ -120,8 +169,12 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
         low, high = (SLOWEST * (FASTEST / SLOWEST) ** x[f"{end}_{axis}"] for end in ("from", "to"))
         return Sweep(low, high, seconds)
 
-    def farthest(reach: float, speed: float, acceleration: float) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda f: np.minimum(np.minimum(reach, speed / (2.0 * np.pi * f)), acceleration / (2.0 * np.pi * f) ** 2)
+    def farthest(
+        reach: float, speed: float, acceleration: float
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda f: np.minimum(
+            np.minimum(reach, speed / (2.0 * np.pi * f)), acceleration / (2.0 * np.pi * f) ** 2
+        )
 
     reach = dict(zip("xyz", (*limits.half, 0.5 * (limits.highest - limits.lowest))))
 
@@ -129,8 +182,13 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
         return middle + x["kept"] * (base.path(t) - middle)
 
     def swept(t: np.ndarray) -> np.ndarray:
-        return np.column_stack([x[f"share_{axis}"] * sweep(axis).at(t, farthest(reach[axis], limits.speed, limits.acceleration))
-                                for axis in "xyz"])  # fmt: skip
+        return np.column_stack(
+            [
+                x[f"share_{axis}"]
+                * sweep(axis).at(t, farthest(reach[axis], limits.speed, limits.acceleration))
+                for axis in "xyz"
+            ]
+        )
 
     rows = np.arange(0.0, seconds + 0.5 * PERIOD, PERIOD)
     fitting = limits.share(kept(rows), swept(rows))
@@ -138,16 +196,27 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     added = [Sweep(ADDED[0], top, seconds, phase=2.0 * np.pi * i / 3.0) for i in range(3)]
 
     def rates(t: np.ndarray) -> np.ndarray:
-        own = [limits.rate * x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)]
+        own = [
+            limits.rate * x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)
+        ]
         return x["kept"] * base.rates(t) + np.column_stack(own)
 
     return replace(
-        base, name=f"{base.name}, optimised", purpose="the most nats a second within the limits", rates=rates,
+        base,
+        name=f"{base.name}, optimised",
+        purpose="the most nats a second within the limits",
+        rates=rates,
         path=lambda t: kept(t) + fitting * swept(t),
-        yaw=lambda t: x["kept"] * base.yaw(t) + x["share_yaw"] * sweep("yaw").at(t, farthest(np.pi, YAW_RATE, np.inf)),
-        thrust=lambda t: 1.0 + x["kept"] * (base.thrust(t) - 1.0)
-        + limits.thrust * x["thrust"] * Sweep(top, ADDED[0], seconds).at(t, np.ones_like),
-    )  # fmt: skip
+        yaw=lambda t: (
+            x["kept"] * base.yaw(t)
+            + x["share_yaw"] * sweep("yaw").at(t, farthest(np.pi, YAW_RATE, np.inf))
+        ),
+        thrust=lambda t: (
+            1.0
+            + x["kept"] * (base.thrust(t) - 1.0)
+            + limits.thrust * x["thrust"] * Sweep(top, ADDED[0], seconds).at(t, np.ones_like)
+        ),
+    )
 
 
 @dataclass(frozen=True)
@@ -170,14 +239,27 @@ class Design:
     def said(self) -> dict[str, Any]:
         """For JSON."""
         return {
-            "base": self.base.name, "manoeuvre": self.manoeuvre.name, "nats_a_second": self.rate, "of_the_base": self.start,
-            "flights": self.flights, "numbers": dict(zip(NUMBERS, self.numbers.tolist())),
-        }  # fmt: skip
+            "base": self.base.name,
+            "manoeuvre": self.manoeuvre.name,
+            "nats_a_second": self.rate,
+            "of_the_base": self.start,
+            "flights": self.flights,
+            "numbers": dict(zip(NUMBERS, self.numbers.tolist())),
+        }
 
 
-def optimise(aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits, *, seed: int = 0, steps: int = 6,
-             progress: Callable[[str], None] = lambda text: None) -> Design | None:  # fmt: skip
-    """Find the sweeps over a manoeuvre that promise the most nats a second; None where nothing that was tried can be flown.
+def optimise(
+    aim: Aim,
+    base: Manoeuvre,
+    simulate: Simulate,
+    limits: Limits,
+    *,
+    seed: int = 0,
+    steps: int = 6,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Design | None:
+    """Find the sweeps over a manoeuvre that promise the most nats a second; None where nothing that
+    was tried can be flown.
 
     ``steps``: generations of the search, of as many flights as the first look.
     """
@@ -193,13 +275,30 @@ def optimise(aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits, *, s
         return costs
 
     differential_evolution(
-        generation, [(0.0, 1.0)] * count, init=np.vstack((START, scattered)), maxiter=steps, vectorized=True, updating="deferred",
-        strategy="currenttobest1bin", mutation=(0.3, 0.6), recombination=0.5, polish=False, seed=seed,
-    )  # fmt: skip
+        generation,
+        [(0.0, 1.0)] * count,
+        init=np.vstack((START, scattered)),
+        maxiter=steps,
+        vectorized=True,
+        updating="deferred",
+        strategy="currenttobest1bin",
+        mutation=(0.3, 0.6),
+        recombination=0.5,
+        polish=False,
+        seed=seed,
+    )
     if search.best is None:
         return None
     rate, numbers, information = search.best
-    return Design(base, designed(base, limits, numbers), numbers, information, -float(start), rate, search.flights)
+    return Design(
+        base,
+        designed(base, limits, numbers),
+        numbers,
+        information,
+        -float(start),
+        rate,
+        search.flights,
+    )
 
 
 class _Search:
@@ -211,7 +310,8 @@ class _Search:
         self.flights = 0
 
     def costs(self, columns: np.ndarray) -> np.ndarray:
-        """Less for more expected nats a second; of what would be aborted, more than of all others and the more the nearer to a crash.
+        """Less for more expected nats a second; of what would be aborted, more than of all others
+        and the more the nearer to a crash.
 
         ``columns``: designs, shape (numbers, n).
         """

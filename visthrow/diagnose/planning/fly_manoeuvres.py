@@ -1,4 +1,6 @@
-"""Manoeuvres flown in the simulator as the diagnosis left it, recorded as the user records: all of them in one batch."""
+"""Manoeuvres flown in the simulator as the diagnosis left it, recorded as the user records: all of
+them in one batch.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -26,17 +28,24 @@ from visthrow.task import Experiment, plant_of
 
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
 COARSE = 2.0  # steps of a promise, in those of the search
-AWAY = 1.5  # time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]
-HIGHEST = 75.0  # swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string hangs slack
+# time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]
+AWAY = 1.5
+# swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string
+# hangs slack
+HIGHEST = 75.0
 
 ASTRAY = 0.5
-"""Distance from the reference [m] beyond which a flight is aborted: as :meth:`Reference.limits` says, its box is wider by that."""
+"""Distance from the reference [m] beyond which a flight is aborted: as :meth:`Reference.limits`
+says, its box is wider by that.
+"""
 
 TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
 """A controller that follows a moving reference: the hover controller with room for it."""
 
 LOST = 10.0  # the same of a vehicle that flies off
-THREAD = 1e-3  # mass of a setup's cable, in that of its payload: the setup's model has it without mass
+THREAD = (
+    1e-3  # mass of a setup's cable, in that of its payload: the setup's model has it without mass
+)
 
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 
@@ -45,41 +54,82 @@ SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed"
 class Simulated:
     """A manoeuvre as it was flown in the simulator."""
 
-    model: Model | None  # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be replayed
+    model: (
+        Model | None
+        # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be
+        # replayed
+    )
     used: float  # the largest part of ``HIGHEST`` or ``ASTRAY`` that was reached
 
 
 Simulate = Callable[[Sequence[Manoeuvre]], list[Simulated]]
 
 
-def simulator_of(model: Model, diagnosis: Diagnosis, made: Callable[[Sequence[FlightLog]], Model] | None = None, *,
-                 seed: int = 0) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:  # fmt: skip
-    """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it can.
+def simulator_of(
+    model: Model,
+    diagnosis: Diagnosis,
+    made: Callable[[Sequence[FlightLog]], Model] | None = None,
+    *,
+    seed: int = 0,
+) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:
+    """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it
+    can.
 
-    ``diagnosis``: for the sizes of what was found and the sensors' noise; ``made``: gives a setup's own model of some logs.
+    ``diagnosis``: for the sizes of what was found and the sensors' noise; ``made``: gives a setup's
+    own model of some logs.
     Raises DiagnoseError: no vehicle flies in this model.
     """
     if isinstance(model, ThrowModel):
-        plant, device, asked = apply(model.entries, model.setting, diagnosis.theta).plant, model.device, {e.name for e in model.effects}
+        plant, device, asked = (
+            apply(model.entries, model.setting, diagnosis.theta).plant,
+            model.device,
+            {e.name for e in model.effects},
+        )
 
         def own(flight: "Flight") -> Model:
             log, carries = flight.log(noise), flight.manoeuvre.payload
-            there = effects_for(model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release))
-            return ThrowModel([log], model.setting.plant, sensing=model.setting.sensing, device=device,
-                              substep=COARSE * model.substep, only=[n for n in there if n in asked], carries=carries)  # fmt: skip
+            there = effects_for(
+                model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
+            )
+            return ThrowModel(
+                [log],
+                model.setting.plant,
+                sensing=model.setting.sensing,
+                device=device,
+                substep=COARSE * model.substep,
+                only=[n for n in there if n in asked],
+                carries=carries,
+            )
+
     elif isinstance(model, FlyerModel) and made is not None:
-        plant, device = vehicle_of(model.params, plant_of(config.load(Experiment, config.find("train", "state")))), "cpu"
+        plant, device = (
+            vehicle_of(
+                model.params, plant_of(config.load(Experiment, config.find("train", "state")))
+            ),
+            "cpu",
+        )
 
         def own(flight: "Flight") -> Model:
-            return made([flight.setup_log(model.params, noise, ("battery_voltage",) * model.has_voltage)])
+            return made(
+                [flight.setup_log(model.params, noise, ("battery_voltage",) * model.has_voltage)]
+            )
+
     else:
-        raise DiagnoseError("manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's with or without payload")
+        raise DiagnoseError(
+            "manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's"
+            " with or without payload"
+        )
     noise = _sensor_noise(diagnosis)
 
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
         return [flight.simulated(own) for flight in fly(plant, manoeuvres, seed, device)]
 
-    return simulate, lambda manoeuvre: carried(manoeuvre, model.params) if isinstance(model, FlyerModel) else manoeuvre
+    return (
+        simulate,
+        lambda manoeuvre: (
+            carried(manoeuvre, model.params) if isinstance(model, FlyerModel) else manoeuvre
+        ),
+    )
 
 
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
@@ -91,18 +141,34 @@ def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
 
 
 def vehicle_of(params: FlyerParams, known: PlantParams) -> PlantParams:
-    """Plant of a setup's vehicle: a known one made to its mass, at equal Froude number, with the numbers that the setup tells."""
+    """Plant of a setup's vehicle: a known one made to its mass, at equal Froude number, with the
+    numbers that the setup tells.
+    """
     ratio = known.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
     v, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
     still = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
-    aero = replace(v.aero, **{**still, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z})
-    v = replace(v, body=replace(v.body, mass=params.mass), queue=replace(v.queue, delay=params.command_delay), aero=aero,
-                motor=replace(v.motor, time_constant=params.motor_time_constant), thrust=replace(v.thrust, voltage_coefficient=0.0),
-                controller=replace(v.controller, voltage_compensation=1.0))  # fmt: skip
+    aero = replace(
+        v.aero,
+        **{**still, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z},
+    )
+    v = replace(
+        v,
+        body=replace(v.body, mass=params.mass),
+        queue=replace(v.queue, delay=params.command_delay),
+        aero=aero,
+        motor=replace(v.motor, time_constant=params.motor_time_constant),
+        thrust=replace(v.thrust, voltage_coefficient=0.0),
+        controller=replace(v.controller, voltage_compensation=1.0),
+    )
     if params.cable is not None:
-        rope = replace(rope, length=params.cable.length - rope.payload_offset, payload_mass=params.cable.mass, mount=(0.0, 0.0, 0.0),
-                       rope_mass=THREAD * params.cable.mass)  # fmt: skip
+        rope = replace(
+            rope,
+            length=params.cable.length - rope.payload_offset,
+            payload_mass=params.cable.mass,
+            mount=(0.0, 0.0, 0.0),
+            rope_mass=THREAD * params.cable.mass,
+        )
     return replace(known, vehicle=v, rope=rope)
 
 
@@ -115,7 +181,9 @@ def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Flight:
-    """What the simulator tells of one manoeuvre; arrays of :data:`SAMPLED`, without noise, every ``SAMPLE_PERIOD``."""
+    """What the simulator tells of one manoeuvre; arrays of :data:`SAMPLED`, without noise, every
+    ``SAMPLE_PERIOD``.
+    """
 
     manoeuvre: Manoeuvre
     reference: Reference
@@ -130,9 +198,14 @@ class Flight:
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
     def simulated(self, own: Callable[["Flight"], Model]) -> Simulated:
-        """Say how near it came to being aborted, and give it the model that ``own`` makes of it if it was not."""
+        """Say how near it came to being aborted, and give it the model that ``own`` makes of it if
+        it was not.
+        """
         places = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)]
-        used = max(self.swing / HIGHEST, float(np.linalg.norm(places - self.reference.pos_w, axis=1).max()) / ASTRAY)
+        used = max(
+            self.swing / HIGHEST,
+            float(np.linalg.norm(places - self.reference.pos_w, axis=1).max()) / ASTRAY,
+        )
         used = min(used, LOST) if np.isfinite(used) else LOST
         try:
             return Simulated(own(self) if used < 1.0 else None, used)
@@ -141,7 +214,9 @@ class Flight:
 
     @property
     def swing(self) -> float:
-        """Largest angle between the rope and the rotors' axis while the payload hangs [deg]; 0 without payload."""
+        """Largest angle between the rope and the rotors' axis while the payload hangs [deg]; 0
+        without payload.
+        """
         if not self.manoeuvre.payload:
             return 0.0
         held = self.time < np.min(self.reference.time[self.reference.release], initial=np.inf)
@@ -155,43 +230,87 @@ class Flight:
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
         seen = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         channels = {
-            "pos_w": Channel(self.time, seen["pos_w"], "m", "world"), "quat_wb": Channel(self.time, seen["quat_wb"], "1", "world"),
+            "pos_w": Channel(self.time, seen["pos_w"], "m", "world"),
+            "quat_wb": Channel(self.time, seen["quat_wb"], "1", "world"),
             "command": Channel(self.reference.time, self.commands, "N, rad/s", "body"),
-        }  # fmt: skip
+        }
         if self.manoeuvre.payload:
             channels["payload_pos_w"] = Channel(self.time, seen["payload_pos_w"], "m", "world")
-            channels["release_command"] = Channel(self.reference.time, self.reference.release.astype(float), "1")
+            channels["release_command"] = Channel(
+                self.reference.time, self.reference.release.astype(float), "1"
+            )
         return FlightLog(channels, {"period": PERIOD})
 
-    def setup_log(self, params: FlyerParams, noise: Mapping[str, float], extra: Sequence[str] = ()) -> FlightLog:
-        """As the logs of a setup are: its own names, inputs through its map of thrust, and what an IMU on board tells."""
+    def setup_log(
+        self, params: FlyerParams, noise: Mapping[str, float], extra: Sequence[str] = ()
+    ) -> FlightLog:
+        """As the logs of a setup are: its own names, inputs through its map of thrust, and what an
+        IMU on board tells.
+        """
         truth, time = self.truth, self.time
         force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
-        volts = params.reference_voltage * truth["voltage"] / self.plant.vehicle.battery.reference_voltage
-        seen = {params.position: truth["pos_w"], "payload_pos_w": truth["payload_pos_w"], "rate_b": truth["rate_b"]}
-        channels = {name: Channel(time, values + noise.get(name, 0.0) * self.rng.standard_normal(values.shape), unit, frame)
-                    for (name, values), unit, frame in zip(seen.items(), ("m", "m", "rad/s"), ("world", "world", "body"))}  # fmt: skip
+        volts = (
+            params.reference_voltage
+            * truth["voltage"]
+            / self.plant.vehicle.battery.reference_voltage
+        )
+        seen = {
+            params.position: truth["pos_w"],
+            "payload_pos_w": truth["payload_pos_w"],
+            "rate_b": truth["rate_b"],
+        }
+        channels = {
+            name: Channel(
+                time,
+                values + noise.get(name, 0.0) * self.rng.standard_normal(values.shape),
+                unit,
+                frame,
+            )
+            for (name, values), unit, frame in zip(
+                seen.items(), ("m", "m", "rad/s"), ("world", "world", "body")
+            )
+        }
         channels |= {
-            params.attitude: Channel(time, truth["quat_wb"], "1", "world"), params.input: self._input(params),
-            "acc_b": Channel(time, np.einsum("nji,nj->ni", matrix_of_quat(truth["quat_wb"]), force_w), "m/s^2", "body"),
+            params.attitude: Channel(time, truth["quat_wb"], "1", "world"),
+            params.input: self._input(params),
+            "acc_b": Channel(
+                time,
+                np.einsum("nji,nj->ni", matrix_of_quat(truth["quat_wb"]), force_w),
+                "m/s^2",
+                "body",
+            ),
             "battery_voltage": Channel(time, volts, "V"),
-        }  # fmt: skip
-        absent = {"battery_voltage"} - set(extra) | (set() if self.manoeuvre.payload else {"payload_pos_w"})
-        return FlightLog({name: channel for name, channel in channels.items() if name not in absent}, {})
+        }
+        absent = {"battery_voltage"} - set(extra) | (
+            set() if self.manoeuvre.payload else {"payload_pos_w"}
+        )
+        return FlightLog(
+            {name: channel for name, channel in channels.items() if name not in absent}, {}
+        )
 
     def _input(self, params: FlyerParams) -> Channel:
-        """What a setup's log holds as the input: the map of thrust, the lag and the delay inverted."""
+        """What a setup's log holds as the input: the map of thrust, the lag and the
+        delay inverted.
+        """
         if params.input in ("command", "thrust_command"):
             told = command_of(params.thrust_map, self.commands[:, :1])
             values = np.hstack((told, self.commands[:, 1:])) if params.input == "command" else told
-            return Channel(self.reference.time, values, "N, rad/s" if params.input == "command" else "N")
+            return Channel(
+                self.reference.time, values, "N, rad/s" if params.input == "command" else "N"
+            )
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
-        wanted = thrust + self.plant.vehicle.motor.time_constant * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
-        stamps = self.time - params.command_delay - 0.5 * SAMPLE_PERIOD  # samples that are held stand for what lies about them
+        wanted = thrust + self.plant.vehicle.motor.time_constant * np.gradient(
+            thrust, SAMPLE_PERIOD, axis=0
+        )
+        stamps = (
+            self.time - params.command_delay - 0.5 * SAMPLE_PERIOD
+        )  # samples that are held stand for what lies about them
         return Channel(stamps, command_of(params.thrust_map, wanted), "1")
 
 
-def fly(plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu") -> list[Flight]:
+def fly(
+    plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu"
+) -> list[Flight]:
     """Fly all manoeuvres at once; those without payload drop it first."""
     from sim.hybrid import HybridSim
 
@@ -216,33 +335,44 @@ def fly(plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: 
 class _Pilot:
     """Follows the references and keeps what it sent."""
 
-    def __init__(self, sim, plant: PlantParams, references: Sequence[Reference], carried: np.ndarray) -> None:
+    def __init__(
+        self, sim, plant: PlantParams, references: Sequence[Reference], carried: np.ndarray
+    ) -> None:
         self.sim, self.references = sim, references
         self.loaded, self.bare = plant.total_mass, plant.vehicle.body.mass
         motors = plant.vehicle.controller
-        limits = replace(TRACKING, min_thrust=4.0 * motors.min_thrust, max_thrust=4.0 * motors.max_thrust)
+        limits = replace(
+            TRACKING, min_thrust=4.0 * motors.min_thrust, max_thrust=4.0 * motors.max_thrust
+        )
         self.controller = HoverController(limits, PERIOD, len(references))
         self.sent: list[np.ndarray] = []
         self.let_go = ~carried
 
     def step(self, row: int | None) -> dict[str, np.ndarray]:
-        """Send one command and hold it for a period; without a row, hover where the reference begins.
+        """Send one command and hold it for a period; without a row, hover where the reference
+        begins.
 
         Returns samples of the period: :data:`SAMPLED`, shape (S, E, ...).
         """
         at = [min(row or 0, len(r.time) - 1) for r in self.references]
-        place, speed, push = (np.array([getattr(r, name)[i] for r, i in zip(self.references, at)])
-                              for name in ("pos_w", "vel_w", "acc_w"))  # fmt: skip
+        place, speed, push = (
+            np.array([getattr(r, name)[i] for r, i in zip(self.references, at)])
+            for name in ("pos_w", "vel_w", "acc_w")
+        )
         gains = self.controller.params
         goal = place + (speed + push / gains.velocity_gain) / gains.position_gain
-        pos, quat, vel = (self.sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w"))
+        pos, quat, vel = (
+            self.sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")
+        )
         mass = np.where(self.let_go, self.bare, self.loaded)
         yaw = np.array([r.yaw[i] for r, i in zip(self.references, at)])
         command = self.controller.step(pos, quat, vel, goal, mass, yaw)
         if row is not None:
             command[:, 1:] += np.array([r.rates_b[i] for r, i in zip(self.references, at)])
             command[:, 0] *= np.array([r.thrust_factor[i] for r, i in zip(self.references, at)])
-            self.let_go = self.let_go | np.array([r.release[i] for r, i in zip(self.references, at)])
+            self.let_go = self.let_go | np.array(
+                [r.release[i] for r, i in zip(self.references, at)]
+            )
             self.sent.append(command)
         self.sim.set_command(command, self.let_go)
         samples: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLED}

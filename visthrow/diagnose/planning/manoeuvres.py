@@ -1,8 +1,9 @@
-"""Safe flights that separate causes: references of position, heading and what is added to the commands, 50 times a second.
+"""Safe flights that separate causes: references of position, heading and what is added to the
+commands, 50 times a second.
 
-A pilot or controller follows the position; doublets and thrust steps are added to its commands. Each stays within a box of a few
-metres and leaves the payload well below the rotors; :meth:`Reference.limits` says when to abort.
-"""
+A pilot or controller follows the position; doublets and thrust steps are added to its commands.
+Each stays within a box of a few metres and leaves the payload well below the rotors;
+:meth:`Reference.limits` says when to abort."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,10 +13,14 @@ import numpy as np
 
 PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
 SETTLE = 1.0  # hover before and after [s]
-HEIGHT = 1.5  # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
+HEIGHT = (
+    1.5  # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
+)
 
 RUN = 3.6
-"""Way of a throw from rest to rest [m], released half way: over a shorter one the payload would trail as high as the rotors."""
+"""Way of a throw from rest to rest [m], released half way: over a shorter one the payload would
+trail as high as the rotors.
+"""
 
 
 @dataclass(frozen=True)
@@ -44,15 +49,31 @@ class Reference:
         low, high = self.pos_w.min(0) - 0.5, self.pos_w.max(0) + 0.5
         floor = max(0.05, self.pos_w[:, 2].min() - min(0.3, 0.5 * self.pos_w[:, 2].min()))
         speed = np.linalg.norm(self.vel_w, axis=1).max()
-        return (f"x {low[0]:.1f}..{high[0]:.1f}, y {low[1]:.1f}..{high[1]:.1f}, z {floor:.2f}..{high[2]:.1f} m, "
-                f"{1.5 * speed + 0.5:.1f} m/s, 60 deg of tilt")  # fmt: skip
+        return (
+            f"x {low[0]:.1f}..{high[0]:.1f}, y {low[1]:.1f}..{high[1]:.1f}, z"
+            f" {floor:.2f}..{high[2]:.1f} m, {1.5 * speed + 0.5:.1f} m/s, 60 deg of tilt"
+        )
 
     def csv(self) -> str:
         """The reference as a table with units in its header."""
-        header = ("time [s],x_w [m],y_w [m],z_w [m],vx_w [m/s],vy_w [m/s],vz_w [m/s],yaw [rad],"
-                  "added rate_x_b [rad/s],added rate_y_b [rad/s],added rate_z_b [rad/s],thrust factor,release")  # fmt: skip
-        rows = np.column_stack((self.time, self.pos_w, self.vel_w, self.yaw, self.rates_b, self.thrust_factor, self.release))
-        return "\n".join([header, *(",".join(f"{value:.5g}" for value in row) for row in rows)]) + "\n"
+        header = (
+            "time [s],x_w [m],y_w [m],z_w [m],vx_w [m/s],vy_w [m/s],vz_w [m/s],yaw [rad],added"
+            " rate_x_b [rad/s],added rate_y_b [rad/s],added rate_z_b [rad/s],thrust factor,release"
+        )
+        rows = np.column_stack(
+            (
+                self.time,
+                self.pos_w,
+                self.vel_w,
+                self.yaw,
+                self.rates_b,
+                self.thrust_factor,
+                self.release,
+            )
+        )
+        return (
+            "\n".join([header, *(",".join(f"{value:.5g}" for value in row) for row in rows)]) + "\n"
+        )
 
 
 @dataclass(frozen=True)
@@ -62,7 +83,9 @@ class Manoeuvre:
     name: str
     purpose: str
     seconds: float  # with SETTLE at both ends
-    path: Callable[[np.ndarray], np.ndarray]  # of the time after SETTLE [s], shape (N,), to a place [m], shape (N, 3)
+    path: Callable[
+        [np.ndarray], np.ndarray
+    ]  # of the time after SETTLE [s], shape (N,), to a place [m], shape (N, 3)
     yaw: Callable[[np.ndarray], np.ndarray] = field(default=lambda t: np.zeros_like(t))
     rates: Callable[[np.ndarray], np.ndarray] = field(default=lambda t: np.zeros((len(t), 3)))
     thrust: Callable[[np.ndarray], np.ndarray] = field(default=lambda t: np.ones_like(t))
@@ -81,7 +104,9 @@ class Manoeuvre:
         moving = (time > SETTLE) & (time < self.seconds - SETTLE)
         rates = np.where(moving[:, None], self.rates(inner), 0.0)
         thrust = np.where(moving, self.thrust(inner), 1.0)
-        return Reference(time, self.path(inner), self.yaw(inner), rates, thrust, time - SETTLE >= self.release)
+        return Reference(
+            time, self.path(inner), self.yaw(inner), rates, thrust, time - SETTLE >= self.release
+        )
 
 
 def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
@@ -98,8 +123,12 @@ def _at(x=0.0, y=0.0, z=HEIGHT) -> Callable[[np.ndarray], np.ndarray]:
     return path
 
 
-def _passes(length: float, speeds: tuple[float, ...]) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """Back and forth over a length, each way in the time that its mean speed takes, a second between."""
+def _passes(
+    length: float, speeds: tuple[float, ...]
+) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """Back and forth over a length, each way in the time that its mean speed takes, a second
+    between.
+    """
 
     def along(t: np.ndarray) -> np.ndarray:
         value, begin, forth = np.zeros_like(t), 0.0, 1.0
@@ -125,7 +154,9 @@ def _doublets(size: float, width: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _steps(t: np.ndarray) -> np.ndarray:
-    """Thrust up and down by 40 %, 0.15 s each way and back, every 1.5 s; the controller brings the height back."""
+    """Thrust up and down by 40 %, 0.15 s each way and back, every 1.5 s; the controller brings the
+    height back.
+    """
     inside = np.mod(t, 1.5)
     return 1.0 + 0.4 * ((inside < 0.15) * 1.0 - ((inside >= 0.15) & (inside < 0.3)))
 
@@ -137,7 +168,9 @@ def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
 
 
 def _stop(t: np.ndarray) -> np.ndarray:
-    """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope stays taut."""
+    """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope
+    stays taut.
+    """
     far = 1.5 * 0.5 * (1.6 + 0.3)
     there = 1.5 * (_risen(t, 0.0, 1.6) - _risen(t, 1.6, 0.3))
     return there - far * rise(t, 3.9, 2.5) - 0.5 * far
@@ -161,29 +194,97 @@ def catalogue() -> tuple[Manoeuvre, ...]:
     slow, slow_time = _passes(3.0, (0.8, 0.8, 1.2, 1.2))
     fast, fast_time = _passes(4.8, (1.6, 1.6, 1.9, 1.9))
     runs = tuple(
-        Manoeuvre(f"throw at {speed:.0f} m/s", "when the payload leaves, at several speeds and pulls",
-                  2.8 + RUN * 1.875 / speed, _at(x=_run(speed), z=1.7), release=0.5 * RUN * 1.875 / speed)
+        Manoeuvre(
+            f"throw at {speed:.0f} m/s",
+            "when the payload leaves, at several speeds and pulls",
+            2.8 + RUN * 1.875 / speed,
+            _at(x=_run(speed), z=1.7),
+            release=0.5 * RUN * 1.875 / speed,
+        )
         for speed in (2.0, 3.0, 4.0)
-    )  # fmt: skip
+    )
     return (
         Manoeuvre("hover", "thrust against weight, battery, frame against gravity", 8.0, _at()),
-        Manoeuvre("hover without payload", "thrust against the vehicle's weight alone", 7.0, _at(), payload=False),
-        Manoeuvre("hover low without payload", "ground effect", 11.0,
-                  _at(z=lambda t: 0.6 - 0.3 * rise(t, 0.0, 1.5) - 0.15 * rise(t, 4.0, 1.0) - 0.04 * rise(t, 6.5, 0.7)),
-                  payload=False),
-        Manoeuvre("vertical sine", "drag and inflow along the rotors' axis, delay against clock", 8.0,
-                  _at(z=lambda t: HEIGHT + 0.25 * np.sin(2 * np.pi * 0.8 * t) * rise(t, 0.0, 1.0) * (1.0 - rise(t, 5.0, 1.0)))),
+        Manoeuvre(
+            "hover without payload",
+            "thrust against the vehicle's weight alone",
+            7.0,
+            _at(),
+            payload=False,
+        ),
+        Manoeuvre(
+            "hover low without payload",
+            "ground effect",
+            11.0,
+            _at(
+                z=lambda t: (
+                    0.6
+                    - 0.3 * rise(t, 0.0, 1.5)
+                    - 0.15 * rise(t, 4.0, 1.0)
+                    - 0.04 * rise(t, 6.5, 0.7)
+                )
+            ),
+            payload=False,
+        ),
+        Manoeuvre(
+            "vertical sine",
+            "drag and inflow along the rotors' axis, delay against clock",
+            8.0,
+            _at(
+                z=lambda t: (
+                    HEIGHT
+                    + 0.25
+                    * np.sin(2 * np.pi * 0.8 * t)
+                    * rise(t, 0.0, 1.0)
+                    * (1.0 - rise(t, 5.0, 1.0))
+                )
+            ),
+        ),
         Manoeuvre("thrust steps", "motor lag, thrust curve", 8.0, _at(), thrust=_steps),
-        Manoeuvre("rate doublets", "motor lag, rate controller, inertia, delay", 8.0, _at(), rates=_doublets(3.0, 0.08)),
-        Manoeuvre("yaw turns", "centre of mass and markers (turn along) against frame and wind (stay)", 16.0, _at(), yaw=_turns),
-        Manoeuvre("slow passes x", "drag along x, both ways: wind against drag", 2.0 + slow_time, _at(x=slow)),
+        Manoeuvre(
+            "rate doublets",
+            "motor lag, rate controller, inertia, delay",
+            8.0,
+            _at(),
+            rates=_doublets(3.0, 0.08),
+        ),
+        Manoeuvre(
+            "yaw turns",
+            "centre of mass and markers (turn along) against frame and wind (stay)",
+            16.0,
+            _at(),
+            yaw=_turns,
+        ),
+        Manoeuvre(
+            "slow passes x",
+            "drag along x, both ways: wind against drag",
+            2.0 + slow_time,
+            _at(x=slow),
+        ),
         Manoeuvre("slow passes y", "drag along y, both ways", 2.0 + slow_time, _at(y=slow)),
-        Manoeuvre("fast passes x", "drag that grows with the square of the speed, lift by translation", 2.0 + fast_time,
-                  _at(x=fast)),
-        Manoeuvre("circle", "drag in all directions, lever arms", 10.0,
-                  _at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t)))),
-        Manoeuvre("swing and decay", "rope length by period, damping by decay, payload drag", 9.0,
-                  _at(x=lambda t: 0.35 * rise(t, 0.0, 0.8))),
-        Manoeuvre("stop after speed", "rope mass and bending, payload's second mode, mount", 9.0, _at(x=_stop)),
+        Manoeuvre(
+            "fast passes x",
+            "drag that grows with the square of the speed, lift by translation",
+            2.0 + fast_time,
+            _at(x=fast),
+        ),
+        Manoeuvre(
+            "circle",
+            "drag in all directions, lever arms",
+            10.0,
+            _at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t))),
+        ),
+        Manoeuvre(
+            "swing and decay",
+            "rope length by period, damping by decay, payload drag",
+            9.0,
+            _at(x=lambda t: 0.35 * rise(t, 0.0, 0.8)),
+        ),
+        Manoeuvre(
+            "stop after speed",
+            "rope mass and bending, payload's second mode, mount",
+            9.0,
+            _at(x=_stop),
+        ),
         *runs,
-    )  # fmt: skip
+    )

@@ -1,8 +1,9 @@
-"""What is left as a smooth table over the state, unexplained: the yardstick for named causes, and the last resort without one.
+"""What is left as a smooth table over the state, unexplained: the yardstick for named causes, and
+the last resort without one.
 
-Forces in the body frame are a Gaussian process over body velocity, body rates and thrust, in its sparse form: linear in a few
-radial functions whose weights have a normal prior. It is trained on the same statistics as the search.
-"""
+Forces in the body frame are a Gaussian process over body velocity, body rates and thrust, in its
+sparse form: linear in a few radial functions whose weights have a normal prior. It is trained on
+the same statistics as the search."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +20,8 @@ from visthrow.diagnose.select.point import Point
 CENTRES = 20
 WIDTH = 1.5  # width of a radial function, in deviations of the inputs
 REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
-"""Prior deviations of the weights, in the block's strongest latent force; the likeliest is taken."""
+"""Prior deviations of the weights, in the block's strongest latent force; the likeliest is taken.
+"""
 
 
 def _inputs(window: Window) -> np.ndarray:
@@ -27,8 +29,12 @@ def _inputs(window: Window) -> np.ndarray:
     knots = window.knots
     parts = [np.zeros((len(knots.get("time", ())), 0))]
     if "vel_w" in knots:
-        parts.append(rotate_back(knots["quat_wb"], knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"])
-    parts += [knots[name].reshape(len(knots[name]), -1) for name in ("rate_b", "thrust") if name in knots]
+        parts.append(
+            rotate_back(knots["quat_wb"], knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"]
+        )
+    parts += [
+        knots[name].reshape(len(knots[name]), -1) for name in ("rate_b", "thrust") if name in knots
+    ]
     return np.hstack(parts)
 
 
@@ -52,14 +58,24 @@ class Table:
         basis, parts, known = self.radial(_inputs(window)), [], laws.Known(window.knots)
         for block in self.blocks:
             turned = block != "vehicle torque" and "quat_wb" in known
-            axes = np.stack([known[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1)) for i, row in zip("xyz", np.eye(3))], -1)
+            axes = np.stack(
+                [
+                    known[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1))
+                    for i, row in zip("xyz", np.eye(3))
+                ],
+                -1,
+            )
             through = grammar.through_latents(window, known, block)
-            parts.append(through @ (axes[..., None] * basis[:, None, None]).reshape(through.shape[1], -1))
+            parts.append(
+                through @ (axes[..., None] * basis[:, None, None]).reshape(through.shape[1], -1)
+            )
         return np.hstack(parts)
 
 
 def table_of(point: Point, rng: np.random.Generator) -> Table | None:
-    """Choose the basis from the states that were flown; None where windows carry no knots, or no latent force acts."""
+    """Choose the basis from the states that were flown; None where windows carry no knots, or no
+    latent force acts.
+    """
     if not all("time" in w.knots and w.latent.size for w in point.windows):
         return None
     inputs = np.vstack([_inputs(w) for w in point.windows])
@@ -97,39 +113,54 @@ class Trained:
         return mean
 
 
-def train(point: Point, table: Table, groups: Sequence[int], theta: np.ndarray | None = None) -> Trained:
+def train(
+    point: Point, table: Table, groups: Sequence[int], theta: np.ndarray | None = None
+) -> Trained:
     """Gather what the windows say about the table's weights.
 
-    ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors, shape (K,); default 0.
-    """
+    ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors,
+    shape (K,); default 0."""
     back = point.statistics.theta - (0.0 if theta is None else theta)
     names = np.array(sorted(set(groups)))
     size = table.columns(point.windows[0]).shape[1]
     information, score = np.zeros((len(names), size, size)), np.zeros((len(names), size))
-    for window, part, group in zip(point.windows, statistics(point.grams, point.noise, point.device), groups):
+    for window, part, group in zip(
+        point.windows, statistics(point.grams, point.noise, point.device), groups
+    ):
         columns = table.columns(window)
         f = int(np.searchsorted(names, group))
         information[f] += columns.T @ part.latent_information @ columns
         score[f] += columns.T @ (part.latent_score + part.latent_effects @ back)
-    reach = np.concatenate([
-        np.full(size // len(table.blocks), max(v for (b, _), v in point.noise.latent_sd.items() if LATENT_BLOCKS[b] == name))
-        for name in table.blocks
-    ])  # fmt: skip
+    reach = np.concatenate(
+        [
+            np.full(
+                size // len(table.blocks),
+                max(v for (b, _), v in point.noise.latent_sd.items() if LATENT_BLOCKS[b] == name),
+            )
+            for name in table.blocks
+        ]
+    )
     return Trained(names, information, score, reach)
 
 
 def unexplained(point: Point, seed: int) -> dict | None:
     """A table of what is left at a point, as plain data; None where none can be made.
 
-    Force in body axes = sum over functions of weights times (1, inputs, radial functions of the inputs), inputs in deviations.
-    """
+    Force in body axes = sum over functions of weights times (1, inputs, radial functions of the
+    inputs), inputs in deviations."""
     table = table_of(point, np.random.default_rng(seed))
     if table is None:
         return None
-    weights = train(point, table, [0] * len(point.windows), point.statistics.theta).weights(np.ones(1, dtype=bool))
+    weights = train(point, table, [0] * len(point.windows), point.statistics.theta).weights(
+        np.ones(1, dtype=bool)
+    )
     by_block = weights.reshape(len(table.blocks), 3, -1)
     return {
-        "label": "unexplained", "inputs": "body velocity [m/s], body rates [rad/s], thrust [N], as far as known",
-        "mean": table.mean.tolist(), "deviation": table.deviation.tolist(), "centres": table.centres.tolist(), "width": WIDTH,
+        "label": "unexplained",
+        "inputs": "body velocity [m/s], body rates [rad/s], thrust [N], as far as known",
+        "mean": table.mean.tolist(),
+        "deviation": table.deviation.tolist(),
+        "centres": table.centres.tolist(),
+        "width": WIDTH,
         "weights": dict(zip(table.blocks, by_block.tolist())),
-    }  # fmt: skip
+    }

@@ -1,9 +1,9 @@
 """Effects hidden in the user's own noise: which sizes would have been named in these flights.
 
-The worlds are drawn from the statistics: scores of the flights' own residuals with random signs a flight, every effect somewhere
-within its floor, plus the score of the hidden effect. :class:`Hidden` hides an effect in the measurements themselves, for a
-full search with the simulation.
-"""
+The worlds are drawn from the statistics: scores of the flights' own residuals with random signs a
+flight, every effect somewhere within its floor, plus the score of the hidden effect.
+:class:`Hidden` hides an effect in the measurements themselves, for a full search with the
+simulation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,9 @@ from visthrow.diagnose.select.result import Diagnosis
 SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
 
 DRAWS = 200
-FEWEST_FLIGHTS = 6  # fewer give too few patterns of signs; noise is then drawn from its fitted level
+FEWEST_FLIGHTS = (
+    6  # fewer give too few patterns of signs; noise is then drawn from its fitted level
+)
 NAMED = 0.9
 
 
@@ -31,7 +33,8 @@ class Completeness:
     exact: tuple[float, ...]  # share named, alone
     up_to_class: tuple[float, ...]  # share named or within 3 nats of what was named
     wrong: tuple[float, ...]  # share in which something else was named
-    limit: float  # size named, up to class, with probability 0.9 [unit]; NaN where none within its bounds is
+    # size named, up to class, with probability 0.9 [unit]; NaN where none within its bounds is
+    limit: float
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,11 @@ class Blind:
 
 
 def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
-    """Hide each effect at rising sizes in the flights' own noise and see whether the statistics name it.
+    """Hide each effect at rising sizes in the flights' own noise and see whether the statistics
+    name it.
 
-    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out first; ``draws``: worlds for each effect,
-    size and sign.
-    """
+    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out
+    first; ``draws``: worlds for each effect, size and sign."""
     work, rng = diagnosis.work, np.random.default_rng(seed)
     point, priors, effects = work.after, work.problem.priors, work.problem.model.effects
     information, own = point.information, point.statistics.score
@@ -81,17 +84,32 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             gain, found = named(score)
             best = gain.argmax(axis=1) == j
             close = gain[:, j] > gain.max(axis=1) - STRONG
-            rows.append((size, np.mean(found & best), np.mean(found & close), np.mean(found & ~close)))
+            rows.append(
+                (size, np.mean(found & best), np.mean(found & close), np.mean(found & ~close))
+            )
         size, exact, near, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
         limit = _limit(size, near) * effect.floor if rows else float("nan")
-        curves.append(Completeness(effect.name, effect.unit, *map(tuple, (size * effect.floor, exact, near, wrong)), limit))
+        curves.append(
+            Completeness(
+                effect.name,
+                effect.unit,
+                *map(tuple, (size * effect.floor, exact, near, wrong)),
+                limit,
+            )
+        )
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))
-    source = "drawn from its fitted level" if parametric else "the flights' own residuals, with random signs a flight"
+    source = (
+        "drawn from its fitted level"
+        if parametric
+        else "the flights' own residuals, with random signs a flight"
+    )
     return Blind(tuple(curves), float(alarms.mean()), 10 * draws, source)
 
 
 def _limit(size: np.ndarray, share: np.ndarray) -> float:
-    """Size from which on the share stays at or above NAMED, interpolated in the logarithm of the size."""
+    """Size from which on the share stays at or above NAMED, interpolated in the logarithm of the
+    size.
+    """
     below = np.flatnonzero(share < NAMED)
     if not len(below):
         return float(size[0])
@@ -103,18 +121,27 @@ def _limit(size: np.ndarray, share: np.ndarray) -> float:
 
 
 class Hidden:
-    """A model whose flights hold one more effect: their measurements are shifted by what the simulation says it does."""
+    """A model whose flights hold one more effect: their measurements are shifted by what the
+    simulation says it does.
+    """
 
     def __init__(self, model: Model, truth: Mapping[str, float]) -> None:
-        """Simulate twice and keep the difference; ``truth``: hidden sizes, in the effects' units."""
+        """Simulate twice and keep the difference; ``truth``: hidden sizes, in the
+        effects' units.
+        """
         self.model, self.effects, self.channels = model, model.effects, model.channels
         self._shift = [a - b for a, b in zip(model.residuals({}), model.residuals(truth))]
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
-        return [replace(w, residual=w.residual + s) for w, s in zip(self.model.windows(theta), self._shift)]
+        return [
+            replace(w, residual=w.residual + s)
+            for w, s in zip(self.model.windows(theta), self._shift)
+        ]
 
-    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
+    def residuals(
+        self, theta: Mapping[str, float], about: Linearised | None = None
+    ) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         return [r + s for r, s in zip(self.model.residuals(theta, about), self._shift)]
 
@@ -132,23 +159,45 @@ class Trial:
     named: tuple[str, ...]
 
 
-def verify(diagnosis: Diagnosis, count: int, *, floors: float = 10.0, seed: int = 0, only: Sequence[str] = ()) -> list[Trial]:
+def verify(
+    diagnosis: Diagnosis,
+    count: int,
+    *,
+    floors: float = 10.0,
+    seed: int = 0,
+    only: Sequence[str] = (),
+) -> list[Trial]:
     """Hide effects in the measurements and run the whole search on each.
 
-    ``floors``: size of what is hidden; ``only``: names to choose among; empty for all that can be seen.
-    """
+    ``floors``: size of what is hidden; ``only``: names to choose among; empty for all that can be
+    seen."""
     from visthrow.diagnose.select.search import explain
 
     rng, problem = np.random.default_rng(seed), diagnosis.work.problem
-    able = [e for e, v in zip(problem.model.effects, problem.priors.visible) if v and (not only or e.name in only)]
+    able = [
+        e
+        for e, v in zip(problem.model.effects, problem.priors.visible)
+        if v and (not only or e.name in only)
+    ]
     trials = []
     for effect in (able[i] for i in rng.permutation(len(able))[:count]):
-        signs = [s for s in (-1.0, 1.0) if effect.bounds[0] <= s * floors * effect.floor <= effect.bounds[1]]
+        signs = [
+            s
+            for s in (-1.0, 1.0)
+            if effect.bounds[0] <= s * floors * effect.floor <= effect.bounds[1]
+        ]
         if not signs:
             continue
         size = float(rng.choice(signs)) * floors * effect.floor
-        found = explain(Hidden(problem.model, {effect.name: size}), seed=seed, without=diagnosis.events, laws=False)
+        found = explain(
+            Hidden(problem.model, {effect.name: size}),
+            seed=seed,
+            without=diagnosis.events,
+            laws=False,
+        )
         own = found[effect.name]
         expected = diagnosis.theta.get(effect.name, 0.0) + size
-        trials.append(Trial(effect.name, size, effect.unit, expected, own.estimate, own.verdict, found.named))
+        trials.append(
+            Trial(effect.name, size, effect.unit, expected, own.estimate, own.verdict, found.named)
+        )
     return trials

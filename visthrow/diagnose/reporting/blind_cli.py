@@ -1,4 +1,6 @@
-"""``visthrow diagnose blind``: effects hidden in your own noise, and which sizes of them would have been named."""
+"""``visthrow diagnose blind``: effects hidden in your own noise, and which sizes of them would have
+been named.
+"""
 
 import argparse
 from pathlib import Path
@@ -12,13 +14,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from visthrow.diagnose.inputs.opening import add_arguments as shared
 
     parser.epilog = (
-        "examples:\n"
-        "  visthrow diagnose blind flights/*.npz                 detection limits of every effect in these flights\n"
-        "  visthrow diagnose blind flights/*.npz --verify 5      and five hidden in the measurements, each searched for anew\n"
+        "examples:\n  visthrow diagnose blind flights/*.npz                 detection limits of"
+        " every effect in these flights\n  visthrow diagnose blind flights/*.npz --verify 5     "
+        " and five hidden in the measurements, each searched for anew\n"
     )
     shared(parser)
-    parser.add_argument("--verify", type=WHOLE, default=0, metavar="N", help="also hide N effects in the measurements themselves")
-    parser.add_argument("--floors", type=ABOVE_ZERO, default=10.0, help="size of those, in floors (default: 10)")
+    parser.add_argument(
+        "--verify",
+        type=WHOLE,
+        default=0,
+        metavar="N",
+        help="also hide N effects in the measurements themselves",
+    )
+    parser.add_argument(
+        "--floors", type=ABOVE_ZERO, default=10.0, help="size of those, in floors (default: 10)"
+    )
     add_out(parser, "out/blind", "of picture and JSON")
 
 
@@ -33,7 +43,14 @@ def run(args: argparse.Namespace) -> int:
 
     check_place(Path(args.out) / "blind.json")
     model, logs = opening.open_model(args)
-    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
+    diagnosis = explained(
+        model,
+        logs,
+        setup.known(args.config),
+        args.seed,
+        opening.numbers(args.without, logs),
+        laws=False,
+    )
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     hidden = blind.hide(diagnosis, seed=args.seed)
@@ -41,13 +58,22 @@ def run(args: argparse.Namespace) -> int:
     for curve in hidden.curves:
         print(f"  {curve.name:24} {curve.limit:10.3g} {curve.unit}")
     print(f"false alarms: {100 * hidden.false_alarms:.2f} % of {hidden.worlds} worlds")
-    trials = blind.verify(diagnosis, args.verify, floors=args.floors, seed=args.seed) if args.verify else []
+    trials = (
+        blind.verify(diagnosis, args.verify, floors=args.floors, seed=args.seed)
+        if args.verify
+        else []
+    )
     for t in trials:
-        said = f"{t.verdict}, {t.estimate:+.3g} of {t.expected:+.3g}; named {', '.join(t.named) or 'nothing'}"
+        said = (
+            f"{t.verdict}, {t.estimate:+.3g} of {t.expected:+.3g}; named"
+            f" {', '.join(t.named) or 'nothing'}"
+        )
         print(f"  hidden {t.name} {t.size:+.3g} {t.unit}: {said}")
     value = {**dataclasses.asdict(hidden), "trials": [dataclasses.asdict(t) for t in trials]}
     folder = Path(args.out)
-    atomic_write(folder / "completeness.png", pictures.completeness(hidden, [e.floor for e in model.effects]))
+    atomic_write(
+        folder / "completeness.png", pictures.completeness(hidden, [e.floor for e in model.effects])
+    )
     write_json(folder / "blind.json", value)
     if args.json:
         write_json(args.json, value)

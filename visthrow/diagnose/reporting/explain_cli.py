@@ -10,9 +10,13 @@ from visthrow.common.arguments import add_out
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, OUT_OF_DOMAIN, UNKNOWN, Diagnosis
 
 MOST_SPOILED = 0.5
-"""Share of the logs that may contradict themselves and be left out; where more do, nothing is to be learnt from any."""
+"""Share of the logs that may contradict themselves and be left out; where more do, nothing is to be
+learnt from any.
+"""
 
-REFUSED = 1  # exit status where no cause can be named: the data contradict themselves, or the simulation does not follow them
+# exit status where no cause can be named: the data contradict themselves, or the simulation does
+# not follow them
+REFUSED = 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,16 +24,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from visthrow.diagnose.inputs.opening import add_arguments as shared
 
     parser.epilog = (
-        "examples:\n"
-        "  visthrow diagnose explain flights/*.npz                      throws of ours, against the training simulator\n"
-        "  visthrow diagnose explain flights --plant mine.toml         against a vehicle and rope of your own\n"
-        "  visthrow diagnose explain swing.csv --config pendulum       another model, tables read by its mapping\n"
+        "examples:\n  visthrow diagnose explain flights/*.npz                      throws of ours,"
+        " against the training simulator\n  visthrow diagnose explain flights --plant mine.toml    "
+        "     against a vehicle and rope of your own\n  visthrow diagnose explain swing.csv"
+        " --config pendulum       another model, tables read by its mapping\n"
     )
     shared(parser)
-    parser.add_argument("--test", metavar="LOG", nargs="+", default=[], help="say what the names are worth on these flights, too")
+    parser.add_argument(
+        "--test",
+        metavar="LOG",
+        nargs="+",
+        default=[],
+        help="say what the names are worth on these flights, too",
+    )
     add_out(parser, "out/explain", "of the report")
-    parser.add_argument("--no-report", action="store_true", help="print the verdicts only; no gain, no page, no recording")
-    parser.add_argument("--no-blind", action="store_true", help="leave the detection limits out of the report")
+    parser.add_argument(
+        "--no-report",
+        action="store_true",
+        help="print the verdicts only; no gain, no page, no recording",
+    )
+    parser.add_argument(
+        "--no-blind", action="store_true", help="leave the detection limits out of the report"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,22 +58,46 @@ def run(args: argparse.Namespace) -> int:
         check_place(Path(args.out) / "report.html")
     model, logs = opening.open_model(args)
     without = opening.numbers(args.without, logs)
-    others = opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))[0] if args.test else None
-    diagnosis = explained(model, logs, setup.known(args.config), args.seed, without, lambda x: print(x, flush=True))
+    others = (
+        opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))[0]
+        if args.test
+        else None
+    )
+    diagnosis = explained(
+        model, logs, setup.known(args.config), args.seed, without, lambda x: print(x, flush=True)
+    )
     gain = None
     if not args.no_report and diagnosis.work is not None:
-        gain = write_report(Path(args.out), diagnosis, model, logs, args.seed, not args.no_blind, opening.made_with(args))
+        gain = write_report(
+            Path(args.out),
+            diagnosis,
+            model,
+            logs,
+            args.seed,
+            not args.no_blind,
+            opening.made_with(args),
+        )
     print("\n" + report.summary(diagnosis, gain))
     tested = _tested(others, diagnosis) if others is not None and diagnosis.work is not None else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
-        write_json(args.json, report.to_json(diagnosis, gain, extra={**opening.made_with(args), "tested": tested}))
+        write_json(
+            args.json,
+            report.to_json(diagnosis, gain, extra={**opening.made_with(args), "tested": tested}),
+        )
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
 def explained(
-    model, logs, known, seed: int = 0, without: Sequence[int] = (), say: Callable[[str], None] = lambda _: None, *, laws: bool = True
+    model,
+    logs,
+    known,
+    seed: int = 0,
+    without: Sequence[int] = (),
+    say: Callable[[str], None] = lambda _: None,
+    *,
+    laws: bool = True,
 ) -> Diagnosis:
     """Leave out what contradicts itself, or repeats another log, and search for causes in the rest.
 
@@ -67,7 +107,10 @@ def explained(
     from visthrow.logs.check.run import check, contradictions, copies
 
     checked = check(logs, known)
-    reasons, spoiled = contradictions(checked), tuple(i for i, log in enumerate(checked) if contradictions([log]))
+    reasons, spoiled = (
+        contradictions(checked),
+        tuple(i for i, log in enumerate(checked) if contradictions([log])),
+    )
     if len(spoiled) > MOST_SPOILED * len(logs):
         return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
     say(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
@@ -76,8 +119,15 @@ def explained(
     for reason in reasons:
         say(f"  left out: {reason}")
     left_out = (*without, *spoiled, *doubled)
-    found = search.explain(model, seed=seed, without=left_out, laws=laws, progress=lambda line: say(f"  {line}"))
-    noted = [f"check: {one.name}: {row.text}" for one in checked for row in one.rows if (row.topic, row.verdict) == ("thrust", "warn")]
+    found = search.explain(
+        model, seed=seed, without=left_out, laws=laws, progress=lambda line: say(f"  {line}")
+    )
+    noted = [
+        f"check: {one.name}: {row.text}"
+        for one in checked
+        for row in one.rows
+        if (row.topic, row.verdict) == ("thrust", "warn")
+    ]
     if (why := getattr(model, "lawless", "")) and found.overall in (UNKNOWN, IN_PART):
         noted.append(f"no law outside the catalogue is looked for: {why}")
     told = (*found.reasons, *(f"left out: {reason}" for reason in reasons), *noted)
@@ -85,25 +135,43 @@ def explained(
 
 
 def _tested(after, diagnosis) -> dict[str, tuple[float, float, float]]:
-    """Prediction errors of other flights by the model as its setup has it without extensions, by that with all that was found, and of
-    noise alone; printed."""
+    """Prediction errors of other flights by the model as its setup has it without extensions, by
+    that with all that was found, and of noise alone; printed.
+    """
     from visthrow.diagnose.likelihood.forms import READABLE, unit_of
     from visthrow.diagnose.models.laws import term_of
     from visthrow.diagnose.reporting.gain import on_others
 
     before = after.plain() if hasattr(after, "plain") else after
     if diagnosis.explanations and hasattr(after, "with_laws"):
-        after = after.with_laws([term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]])
+        after = after.with_laws(
+            [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
+        )
     errors = on_others(before, after, diagnosis.theta, diagnosis)
     for channel, found in errors.items():
         factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
         before, after, floor = (factor * x for x in found)
-        won = f", {(before - after) / (before - floor):.0%} of what is above it" if before > floor else ""
-        print(f"on the tested flights, {channel}: {before:.3g} -> {after:.3g} {unit}, noise alone {floor:.3g}{won}")
+        won = (
+            f", {(before - after) / (before - floor):.0%} of what is above it"
+            if before > floor
+            else ""
+        )
+        print(
+            f"on the tested flights, {channel}: {before:.3g} -> {after:.3g} {unit}, noise alone"
+            f" {floor:.3g}{won}"
+        )
     return errors
 
 
-def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool = True, made_with: Mapping[str, Any] | None = None):
+def write_report(
+    folder: Path,
+    diagnosis,
+    model,
+    logs,
+    seed: int,
+    limits: bool = True,
+    made_with: Mapping[str, Any] | None = None,
+):
     """Write page, JSON, pictures and recording; returns the gain on held-out flights.
 
     ``made_with``: see :func:`visthrow.diagnose.inputs.opening.made_with`.
@@ -115,14 +183,30 @@ def write_report(folder: Path, diagnosis, model, logs, seed: int, limits: bool =
     from visthrow.view import page
 
     measured = gain.measure(diagnosis, seed=seed)
-    measured = measured if measured.channels else None  # windows of one sample have nothing ahead that could be predicted
+    measured = (
+        measured if measured.channels else None
+    )  # windows of one sample have nothing ahead that could be predicted
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error() if hasattr(model, "step_error") else None
     origin = provenance.collect()
-    about = {"logs": len(logs), "command": origin["command"], "commit": origin["commit"], "time": origin["time"]}
+    about = {
+        "logs": len(logs),
+        "command": origin["command"],
+        "commit": origin["commit"],
+        "time": origin["time"],
+    }
     made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
-    page.write(folder, "What the simulation gets wrong about these flights", report.sentence_of(diagnosis), made)
-    table = blackbox.unexplained(diagnosis.work.after, seed) if diagnosis.overall == result.UNKNOWN else None
+    page.write(
+        folder,
+        "What the simulation gets wrong about these flights",
+        report.sentence_of(diagnosis),
+        made,
+    )
+    table = (
+        blackbox.unexplained(diagnosis.work.after, seed)
+        if diagnosis.overall == result.UNKNOWN
+        else None
+    )
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / "diagnosis.json", whole)

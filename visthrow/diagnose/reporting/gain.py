@@ -1,8 +1,8 @@
 """What the named causes are worth on flights that were not used to find them.
 
-Each flight is left out in turn; the search is repeated on the others by their statistics, and its answer predicts the one left out.
-Beside it stand the noise floor, which cannot be beaten, and a black box trained on the same flights.
-"""
+Each flight is left out in turn; the search is repeated on the others by their statistics, and its
+answer predicts the one left out. Beside it stand the noise floor, which cannot be beaten, and a
+black box trained on the same flights."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,18 +23,26 @@ from visthrow.diagnose.throw.landing import Landings
 
 @dataclass(frozen=True)
 class LandingGain:
-    """What the named causes do to predicted landings; lengths in metres, intervals of 95 % by bootstrap over throws."""
+    """What the named causes do to predicted landings; lengths in metres, intervals of 95 % by
+    bootstrap over throws.
+    """
 
     throws: int
     held_out: bool  # whether each throw was predicted with causes sized by the other flights
-    before: float  # mean distance of prediction and measurement, open loop from before the throw, the model as it stands
+    # mean distance of prediction and measurement, open loop from before the throw, the model as it
+    # stands
+    before: float
     after: float  # with what was named
     low: float  # of ``after``
     high: float
     released_before: float  # the same from a state fitted up to the separation
     released_after: float
-    moved: dict[str, float]  # named effect -> mean distance by which it moves the predicted landings
-    off_before: tuple[tuple[float, float], ...] = ()  # of each throw, prediction less measurement along world x and y
+    moved: dict[
+        str, float
+    ]  # named effect -> mean distance by which it moves the predicted landings
+    off_before: tuple[
+        tuple[float, float], ...
+    ] = ()  # of each throw, prediction less measurement along world x and y
     off_after: tuple[tuple[float, float], ...] = ()
 
 
@@ -44,11 +52,15 @@ class Gain:
 
     channels: tuple[ChannelGain, ...]
     nats_per_sample: float  # of held-out log-likelihood
-    named_in: dict[str, float] = field(default_factory=dict)  # effect -> share of folds that named it
+    named_in: dict[str, float] = field(
+        default_factory=dict
+    )  # effect -> share of folds that named it
     folds: int = 0
     left_out: str = "flights"  # or "parts of flights"
     landing: LandingGain | None = None  # where the model has throws whose landing was seen
-    whole: bool = False  # windows have no initial state that would have to be fitted first, and are predicted from end to end
+    # windows have no initial state that would have to be fitted first, and are predicted from end
+    # to end
+    whole: bool = False
 
     def __getitem__(self, channel: str) -> ChannelGain:
         return next(c for c in self.channels if c.channel == channel)
@@ -57,11 +69,13 @@ class Gain:
 def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     """Measure the gain of a diagnosis on held-out flights.
 
-    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; ``seed``: of the black box's basis.
-    """
+    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; ``seed``: of the black box's
+    basis."""
     work, rng = diagnosis.work, np.random.default_rng(seed)
     cross = crossed(diagnosis)
-    box = _blackbox(work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng)
+    box = _blackbox(
+        work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng
+    )
     gains = channel_gains(work, cross, box)
     sizes = cross.trained if cross.left_out == "flights" and diagnosis.theta else ()
     trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}
@@ -85,8 +99,12 @@ def landing_gain(
     flown = sorted({w.flight for w in work.after.windows})
     plain = model.landings({}, flown)
     named = model.landings(theta, flown) if theta else plain
-    parts = [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]
-    held = Landings(*(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts))))
+    parts = (
+        [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]
+    )
+    held = Landings(
+        *(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts)))
+    )
     good = np.isfinite(plain.errors) & np.isfinite(held.errors)
     if not good.any():
         return None
@@ -94,27 +112,46 @@ def landing_gain(
     for name in theta:
         others = {other: size for other, size in theta.items() if other != name}
         without = model.landings(others, flown) if others else plain
-        moved[name] = float(np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1)))
+        moved[name] = float(
+            np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1))
+        )
     after = mean(held.errors[good], seed=seed)
     released = [float(np.nanmean(found.released_errors[good])) for found in (plain, held)]
     off = [tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist())) for x in (plain, held)]
     return LandingGain(
-        int(good.sum()), bool(trained), float(plain.errors[good].mean()), after.value, after.low, after.high, *released, moved, *off
+        int(good.sum()),
+        bool(trained),
+        float(plain.errors[good].mean()),
+        after.value,
+        after.low,
+        after.high,
+        *released,
+        moved,
+        *off,
     )
 
 
-def on_others(before: Model, after: Model, theta: Mapping[str, float], found: Diagnosis) -> dict[str, tuple[float, float, float]]:
+def on_others(
+    before: Model, after: Model, theta: Mapping[str, float], found: Diagnosis
+) -> dict[str, tuple[float, float, float]]:
     """Prediction errors of flights that nothing was estimated from.
 
-    Returns channel -> root mean square error before and after, and of the sensors' noise and the initial state's uncertainty alone, in
-    the channel's unit; every component counts alike.
+    Returns channel -> root mean square error before and after, and of the sensors' noise and the
+    initial state's uncertainty alone, in the channel's unit; every component counts alike.
 
     Args:
         before: model of these flights that says what is worth it.
-        after: model of these flights that was diagnosed, with the laws that were found. theta: sizes that were found.
+        after: model of these flights that was diagnosed, with the laws that were found. theta:
+            sizes that were found.
         found: that diagnosis, whose noise is taken.
     """
-    noise, rms = replace(found.work.after.noise, scale=np.array([found.sensor_scale[name] for name in after.channels])), []
+    noise, rms = (
+        replace(
+            found.work.after.noise,
+            scale=np.array([found.sensor_scale[name] for name in after.channels]),
+        ),
+        [],
+    )
     for model, sizes in ((before, {}), (after, theta)):
         sums = np.zeros((3, len(model.channels)))
         finite = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
@@ -125,11 +162,23 @@ def on_others(before: Model, after: Model, theta: Mapping[str, float], found: Di
                 total += np.bincount(window.channel[horizon >= 0], own, len(total))
         rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
     (plain, _), (named, floor) = rms
-    return {name: tuple(map(float, row)) for name, row in zip(after.channels, np.column_stack((plain, named, floor)))}
+    return {
+        name: tuple(map(float, row))
+        for name, row in zip(after.channels, np.column_stack((plain, named, floor)))
+    }
 
 
-def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channels: int, rng: np.random.Generator):
-    """Squared errors of the black box on held-out groups, shape (F, C, H); None where it cannot be trained."""
+def _blackbox(
+    before: Point,
+    groups: Sequence[int],
+    folds,
+    after: Point,
+    channels: int,
+    rng: np.random.Generator,
+):
+    """Squared errors of the black box on held-out groups, shape (F, C, H); None where it cannot be
+    trained.
+    """
     table = table_of(before, rng)
     if table is None:
         return None
@@ -139,13 +188,19 @@ def _blackbox(before: Point, groups: Sequence[int], folds, after: Point, channel
         rest = np.setdiff1d(np.arange(len(weights)), fold)
         weights[fold] = trained.weights(rest) if len(rest) else 0.0
     own = weights[np.searchsorted(trained.groups, groups)]
-    left = [w.residual - w.latent @ (table.columns(w) @ size) for w, size in zip(before.windows, own)]
+    left = [
+        w.residual - w.latent @ (table.columns(w) @ size) for w, size in zip(before.windows, own)
+    ]
     return errors(before.windows, groups, after.noise, left, channels).square
 
 
 def _nats(before: Point, after: Point, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain, own, change = regrouped(before, cross.groups), regrouped(after, cross.groups), cross.trained - after.theta
+    plain, own, change = (
+        regrouped(before, cross.groups),
+        regrouped(after, cross.groups),
+        cross.trained - after.theta,
+    )
     quadratic = np.einsum("fi,fij,fj->f", change, own.information, change)
     square = own.square - 2.0 * np.einsum("fi,fi->f", change, own.score) + quadratic
     return float(0.5 * (plain.square.sum() - square.sum()) / own.samples.sum())

@@ -1,4 +1,6 @@
-"""Pictures of a diagnosis, in the style of :mod:`visthrow.common.style`; each function returns a PNG."""
+"""Pictures of a diagnosis, in the style of :mod:`visthrow.common.style`; each function returns a
+PNG.
+"""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -22,25 +24,41 @@ WIDTH = 9.2  # [inch]
 BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
 SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
-MOST_CURVES = 24  # curves of the completeness picture; of more effects it shows where their curves rise
+MOST_CURVES = (
+    24  # curves of the completeness picture; of more effects it shows where their curves rise
+)
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
 STEPS_ACROSS = 3
 NAMES_ACROSS = 26  # letters in a line of a set's names
 MOST_TICKS = 16  # over the whole width
-STEPS_OF_TICKS = ((1, 2, 5), (1, 3), (1,))  # within a decade of a logarithmic axis; the finest that leaves room is taken
+STEPS_OF_TICKS = (
+    (1, 2, 5),
+    (1, 3),
+    (1,),
+)  # within a decade of a logarithmic axis; the finest that leaves room is taken
+
 
 def _figure(rows: int, columns: int, height: float, **more):
     import matplotlib.pyplot as plt
 
     style.use()
-    return plt.subplots(rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **more)
+    return plt.subplots(
+        rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **more
+    )
 
 
 def plain_ticks(low: float, high: float, most: int) -> list[float]:
-    """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no choice of them fits."""
+    """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no
+    choice of them fits.
+    """
     far = max(abs(low), abs(high))
     for digits in STEPS_OF_TICKS:
-        sizes = [digit * 10.0**power for power in range(-4, 7) for digit in digits if digit * 10.0**power <= far]
+        sizes = [
+            digit * 10.0**power
+            for power in range(-4, 7)
+            for digit in digits
+            if digit * 10.0**power <= far
+        ]
         if low <= 0.0 <= high:
             sizes = [size for size in sizes if size >= 1.0]
             sizes = [*(-size for size in sizes[::-1]), 0.0, *sizes]
@@ -58,7 +76,9 @@ def _plain(axis, most: int) -> None:
 
 
 def left_over(window: Window, noise: Noise) -> np.ndarray:
-    """Residuals with the initial state fitted to the whole window, in the channels' units, shape (N,)."""
+    """Residuals with the initial state fitted to the whole window, in the channels' units, shape
+    (N,).
+    """
     weight = 1.0 / (window.sigma * noise.scale[window.channel])
     states = window.nuisance * window.nuisance_sd * weight[:, None]
     normal = states.T @ states + np.eye(states.shape[1])
@@ -67,14 +87,21 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
 
 
 def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> bytes:
-    """What an optimised manoeuvre lays over the one that it began with, and what each manoeuvre promises.
+    """What an optimised manoeuvre lays over the one that it began with, and what each manoeuvre
+    promises.
 
     ``rates``: expected nats a second of manoeuvres by their name.
     """
-    rows = {"x [m]": lambda r: r.pos_w[:, 0], "y [m]": lambda r: r.pos_w[:, 1], "z [m]": lambda r: r.pos_w[:, 2],
-            "heading [deg]": lambda r: np.degrees(r.yaw), "thrust [%]": lambda r: 100.0 * (r.thrust_factor - 1.0),
-            "rate x [rad/s]": lambda r: r.rates_b[:, 0], "rate y [rad/s]": lambda r: r.rates_b[:, 1],
-            "rate z [rad/s]": lambda r: r.rates_b[:, 2]}  # fmt: skip
+    rows = {
+        "x [m]": lambda r: r.pos_w[:, 0],
+        "y [m]": lambda r: r.pos_w[:, 1],
+        "z [m]": lambda r: r.pos_w[:, 2],
+        "heading [deg]": lambda r: np.degrees(r.yaw),
+        "thrust [%]": lambda r: 100.0 * (r.thrust_factor - 1.0),
+        "rate x [rad/s]": lambda r: r.rates_b[:, 0],
+        "rate y [rad/s]": lambda r: r.rates_b[:, 1],
+        "rate z [rad/s]": lambda r: r.rates_b[:, 2],
+    }
     figure, axes = _figure(3, 3, 6.2)
     for axis, (label, value) in zip(axes.flat, rows.items()):
         for manoeuvre, colour in ((base, BEFORE), (found, AFTER)):
@@ -83,41 +110,69 @@ def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> by
         axis.set(ylabel=label, xlabel="time [s]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     best = sorted(rates, key=rates.get)[-6:]
-    axes[2, 2].barh(best, [rates[name] for name in best], color=[AFTER if name == found.name else BEFORE for name in best])
+    axes[2, 2].barh(
+        best,
+        [rates[name] for name in best],
+        color=[AFTER if name == found.name else BEFORE for name in best],
+    )
     axes[2, 2].tick_params(axis="y", labelsize=6)
     axes[2, 2].set(xlabel="expected nats a second")
     return png_of(figure)
 
 
 def residuals(work: Work, channel: int) -> bytes:
-    """Residuals of one channel before and after, laid over each other, in the windows where most was gained, and in a usual one."""
+    """Residuals of one channel before and after, laid over each other, in the windows where most
+    was gained, and in a usual one.
+    """
     name = work.problem.model.channels[channel]
     factor, unit = READABLE.get(unit_of(name), (1.0, unit_of(name)))
     pairs = []
     for before, after in zip(work.before.windows, work.after.windows):
         rows = before.channel == channel
         if rows.any():
-            pairs.append((before, after, rows, left_over(before, work.after.noise)[rows], left_over(after, work.after.noise)[rows]))
+            pairs.append(
+                (
+                    before,
+                    after,
+                    rows,
+                    left_over(before, work.after.noise)[rows],
+                    left_over(after, work.after.noise)[rows],
+                )
+            )
     gained = np.argsort([np.mean(b**2) - np.mean(a**2) for *_, b, a in pairs])[::-1]
-    chosen = [*gained[: SHOWN_WINDOWS - 1], gained[len(gained) // 2]] if len(gained) >= SHOWN_WINDOWS else list(gained)
+    chosen = (
+        [*gained[: SHOWN_WINDOWS - 1], gained[len(gained) // 2]]
+        if len(gained) >= SHOWN_WINDOWS
+        else list(gained)
+    )
     figure, axes = _figure(1, len(chosen), 2.9, sharey=True)
     for axis, i in zip(axes[0], chosen):
         before, _, rows, old, new = pairs[i]
-        time, noise = before.time[rows], factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
+        time, noise = (
+            before.time[rows],
+            factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel]),
+        )
         axis.axhspan(-noise, noise, color=style.FAINT, lw=0, label="noise, 2 sigma")
         axis.plot(time, factor * old, ".", ms=2.2, color=BEFORE, label="model as it stands")
         axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
         axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
     axes[0, 0].set_ylabel(f"measured - simulated [{unit}]" if unit else "measured - simulated")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3, markerscale=4)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3, markerscale=4
+    )
     return png_of(figure)
 
 
 def ladder(diagnosis: Diagnosis) -> bytes:
-    """Nats of each step's candidates, screened and with the simulation run again, and what they must exceed; rows of three."""
+    """Nats of each step's candidates, screened and with the simulation run again, and what they
+    must exceed; rows of three.
+    """
     steps = diagnosis.steps
     across = min(len(steps), STEPS_ACROSS)
-    down, most = -(-len(steps) // across), max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps)
+    down, most = (
+        -(-len(steps) // across),
+        max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps),
+    )
     figure, axes = _figure(down, across, down * (0.55 + 0.27 * most))
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
@@ -129,10 +184,20 @@ def ladder(diagnosis: Diagnosis) -> bytes:
         for y, name in enumerate(names):
             if name in step.refitted:
                 won = name == step.named
-                axis.plot(max(step.refitted[name], 0.0), y, marker="o" if won else "^", ms=6, color=AFTER if won else style.QUIET)
+                axis.plot(
+                    max(step.refitted[name], 0.0),
+                    y,
+                    marker="o" if won else "^",
+                    ms=6,
+                    color=AFTER if won else style.QUIET,
+                )
         axis.axvline(step.least, color=BEFORE, lw=1)
         several = f"{step.named.count(', ') + 1} causes"
-        axis.set(xscale="symlog", xlabel="nats", title=f"step {number}: {several if ', ' in step.named else step.named}")
+        axis.set(
+            xscale="symlog",
+            xlabel="nats",
+            title=f"step {number}: {several if ', ' in step.named else step.named}",
+        )
         axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
         _plain(axis.xaxis, MOST_TICKS // across)
         axis.tick_params(axis="y", labelsize=8)
@@ -141,8 +206,13 @@ def ladder(diagnosis: Diagnosis) -> bytes:
 
 def verdicts(diagnosis: Diagnosis) -> bytes:
     """Every effect's interval in its floors, by verdict."""
-    colours = {result.FOUND: AFTER, result.CLASS: style.COLOURS[3], result.CANDIDATE: style.COLOURS[3], result.BOUNDED: style.QUIET,
-               result.NOT_IDENTIFIABLE: style.COLOURS[4]}  # fmt: skip
+    colours = {
+        result.FOUND: AFTER,
+        result.CLASS: style.COLOURS[3],
+        result.CANDIDATE: style.COLOURS[3],
+        result.BOUNDED: style.QUIET,
+        result.NOT_IDENTIFIABLE: style.COLOURS[4],
+    }
     shown = [f for f in diagnosis.findings if f.verdict in colours][::-1]
     figure, axes = _figure(1, 1, 0.8 + 0.19 * len(shown))
     axis, seen = axes[0, 0], set()
@@ -151,10 +221,27 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
         label = None if f.verdict in seen else f.verdict
         seen.add(f.verdict)
         middle = f.estimate if f.verdict in result.NAMED else 0.5 * (f.low + f.high)
-        axis.plot(np.array([f.low, f.high]) / f.floor, [y, y], color=colours[f.verdict], lw=2.4, solid_capstyle="butt")
-        axis.plot(middle / f.floor, y, "o" if f.estimate else "|", color=colours[f.verdict], ms=6, label=label)
+        axis.plot(
+            np.array([f.low, f.high]) / f.floor,
+            [y, y],
+            color=colours[f.verdict],
+            lw=2.4,
+            solid_capstyle="butt",
+        )
+        axis.plot(
+            middle / f.floor,
+            y,
+            "o" if f.estimate else "|",
+            color=colours[f.verdict],
+            ms=6,
+            label=label,
+        )
     axis.axvline(0.0, color=style.QUIET, lw=0.8)
-    axis.set(xlabel="size in floors (grey: within the floor)", yticks=range(len(shown)), ylim=(-1, len(shown)))
+    axis.set(
+        xlabel="size in floors (grey: within the floor)",
+        yticks=range(len(shown)),
+        ylim=(-1, len(shown)),
+    )
     axis.set_yticklabels([f.name for f in shown], fontsize=8)
     axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
     _plain(axis.xaxis, MOST_TICKS)
@@ -184,8 +271,10 @@ def landings(landing: LandingGain) -> bytes:
     """Where each throw was predicted to land, seen from where it landed."""
     figure, axes = _figure(1, 1, 3.6)
     axis = axes[0, 0]
-    for off, colour, marker, label in ((landing.off_before, BEFORE, "^", "model as it stands"),
-                                       (landing.off_after, AFTER, "o", "with what was named")):  # fmt: skip
+    for off, colour, marker, label in (
+        (landing.off_before, BEFORE, "^", "model as it stands"),
+        (landing.off_after, AFTER, "o", "with what was named"),
+    ):
         axis.plot(*(1e3 * np.array(off).T), marker, color=colour, label=label)
     for before, after in zip(landing.off_before, landing.off_after):
         axis.plot(*(1e3 * np.array((before, after)).T), color=style.FAINT, lw=1, zorder=0)
@@ -196,13 +285,21 @@ def landings(landing: LandingGain) -> bytes:
 
 
 def confusion(diagnosis: Diagnosis) -> bytes:
-    """Correlations of the effects' estimates with all of them free: what these flights cannot tell apart."""
+    """Correlations of the effects' estimates with all of them free: what these flights cannot tell
+    apart.
+    """
     work = diagnosis.work
     visible = np.flatnonzero(work.problem.priors.visible)
-    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))[np.ix_(visible, visible)]
+    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))[
+        np.ix_(visible, visible)
+    ]
     deviation = np.sqrt(np.diag(sigma))
     correlation = sigma / np.outer(deviation, deviation)
-    strongest = np.where(np.isin(visible, work.active), 2.0, np.abs(correlation - np.eye(len(visible))).max(axis=1, initial=0.0))
+    strongest = np.where(
+        np.isin(visible, work.active),
+        2.0,
+        np.abs(correlation - np.eye(len(visible))).max(axis=1, initial=0.0),
+    )
     at = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
     names = [work.problem.model.effects[j].name for j in visible[at]]
     figure, axes = _figure(1, 1, 1.6 + 0.3 * len(at))
@@ -219,7 +316,9 @@ def confusion(diagnosis: Diagnosis) -> bytes:
 
 
 def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
-    """Share of worlds in which a hidden effect is named, over its size in floors; of many effects where it rises."""
+    """Share of worlds in which a hidden effect is named, over its size in floors; of many effects
+    where it rises.
+    """
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
     last = {c.name: c.limit / f if np.isfinite(c.limit) else np.inf for c, f in pairs}
     pairs = sorted(pairs, key=lambda p: last[p[0].name])
@@ -229,8 +328,19 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     figure, axes = _figure(1, 2, 4.4, sharey=True)
     for axis, group in zip(axes[0], (pairs[:half], pairs[half:])):
         for i, (curve, floor) in enumerate(group):
-            look = {"color": style.COLOURS[i % 6], "marker": style.MARKERS[i % 6], "ls": ("-", "--", ":", "-.")[i // 6 % 4]}
-            axis.plot(np.array(curve.sizes) / floor, curve.up_to_class, ms=3.5, lw=1.1, label=curve.name, **look)
+            look = {
+                "color": style.COLOURS[i % 6],
+                "marker": style.MARKERS[i % 6],
+                "ls": ("-", "--", ":", "-.")[i // 6 % 4],
+            }
+            axis.plot(
+                np.array(curve.sizes) / floor,
+                curve.up_to_class,
+                ms=3.5,
+                lw=1.1,
+                label=curve.name,
+                **look,
+            )
         axis.axhline(0.9, color=style.FAINT)
         axis.set(xscale="log", xlabel="hidden size [floors]", ylim=(-0.02, 1.02))
         axis.legend(fontsize=6.5, ncol=2)
@@ -239,16 +349,33 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
 
 
 def _rises(pairs: Sequence[tuple]) -> bytes:
-    """Sizes from which each effect is named in half and in nine tenths of worlds, in floors; open to the right if never."""
+    """Sizes from which each effect is named in half and in nine tenths of worlds, in floors; open
+    to the right if never.
+    """
     figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
     axis = axes[0, 0]
     for y, (curve, floor) in enumerate(pairs[::-1]):
         sizes, share = np.array(curve.sizes) / floor, np.maximum.accumulate(curve.up_to_class)
-        half, most = (float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9))
+        half, most = (
+            float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9)
+        )
         axis.plot((half, most), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
-        axis.plot(most, y, "o" if share[-1] >= 0.9 else ">", color=AFTER if share[-1] >= 0.9 else BEFORE, ms=5)
-    axis.set(xscale="log", xlabel="hidden size [floors] named in 50 % and (mark) 90 % of worlds; >: never within what was tried",
-             yticks=range(len(pairs)), ylim=(-1, len(pairs)))  # fmt: skip
+        axis.plot(
+            most,
+            y,
+            "o" if share[-1] >= 0.9 else ">",
+            color=AFTER if share[-1] >= 0.9 else BEFORE,
+            ms=5,
+        )
+    axis.set(
+        xscale="log",
+        xlabel=(
+            "hidden size [floors] named in 50 % and (mark) 90 % of worlds; >: never within what was"
+            " tried"
+        ),
+        yticks=range(len(pairs)),
+        ylim=(-1, len(pairs)),
+    )
     axis.set_yticklabels([curve.name for curve, _ in pairs[::-1]], fontsize=7)
     axis.set_xticks((1, 2, 5, 10, 20, 50), ("1", "2", "5", "10", "20", "50"))
     axis.minorticks_off()

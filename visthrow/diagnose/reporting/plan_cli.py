@@ -1,4 +1,6 @@
-"""``visthrow diagnose plan``: the flight that tells most of what could not be told, with its reference to fly."""
+"""``visthrow diagnose plan``: the flight that tells most of what could not be told, with its
+reference to fly.
+"""
 
 import argparse
 import math
@@ -13,18 +15,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from visthrow.diagnose.inputs.opening import add_arguments as shared
 
     parser.epilog = (
-        "examples:\n"
-        "  visthrow diagnose plan flights/*.npz                                the next flight after these\n"
-        "  visthrow diagnose plan flights/*.npz --about ground_effect          what would show this effect\n"
-        "  visthrow diagnose plan flights/*.npz --hall 4,3,2.5 --speed 2       in a small hall\n"
-        "  visthrow diagnose plan log*.csv --config cf_payload --steps 0   only rank the manoeuvres that there are\n"
+        "examples:\n  visthrow diagnose plan flights/*.npz                                the next"
+        " flight after these\n  visthrow diagnose plan flights/*.npz --about ground_effect         "
+        " what would show this effect\n  visthrow diagnose plan flights/*.npz --hall 4,3,2.5"
+        " --speed 2       in a small hall\n  visthrow diagnose plan log*.csv --config cf_payload"
+        " --steps 0   only rank the manoeuvres that there are\n"
     )
     shared(parser)
-    parser.add_argument("--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all")
-    parser.add_argument("--about", metavar="NAMES", default="", help="plan for these effects, by commas; default: all unclear ones")
-    parser.add_argument("--steps", type=WHOLE, default=6, help="generations of the optimiser; 0: only rank manoeuvres (default: 6)")
-    parser.add_argument("--hall", metavar="X,Y,Z", default="5,5,2.6", help="room that the path stays in [m] (default: 5,5,2.6)")
-    parser.add_argument("--speed", type=ABOVE_ZERO, default=3.0, help="of the vehicle at most [m/s] (default: 3)")
+    parser.add_argument(
+        "--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all"
+    )
+    parser.add_argument(
+        "--about",
+        metavar="NAMES",
+        default="",
+        help="plan for these effects, by commas; default: all unclear ones",
+    )
+    parser.add_argument(
+        "--steps",
+        type=WHOLE,
+        default=6,
+        help="generations of the optimiser; 0: only rank manoeuvres (default: 6)",
+    )
+    parser.add_argument(
+        "--hall",
+        metavar="X,Y,Z",
+        default="5,5,2.6",
+        help="room that the path stays in [m] (default: 5,5,2.6)",
+    )
+    parser.add_argument(
+        "--speed", type=ABOVE_ZERO, default=3.0, help="of the vehicle at most [m/s] (default: 3)"
+    )
     add_out(parser, "out/plan", "of references and JSON")
 
 
@@ -42,35 +63,61 @@ def run(args: argparse.Namespace) -> int:
     check_place(Path(args.out) / "plan.json")
     limits, chosen = _limits(args), _chosen(args.manoeuvres)
     model, logs = opening.open_model(args)
-    diagnosis = explained(model, logs, setup.known(args.config), args.seed, opening.numbers(args.without, logs), laws=False)
+    diagnosis = explained(
+        model,
+        logs,
+        setup.known(args.config),
+        args.seed,
+        opening.numbers(args.without, logs),
+        laws=False,
+    )
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     aim = plan.Aim(diagnosis, tuple(name for name in args.about.split(",") if name))
-    simulate, flown = simulator_of(model, diagnosis, lambda logs: setup.model_of(setup.load(args.config), logs), seed=args.seed)
+    simulate, flown = simulator_of(
+        model, diagnosis, lambda logs: setup.model_of(setup.load(args.config), logs), seed=args.seed
+    )
     manoeuvres = [m for m in map(flown, chosen) if m is not None]
-    told = [(m, aim.information(s.model)) for m, s in zip(manoeuvres, simulate(manoeuvres)) if s.model is not None]
+    told = [
+        (m, aim.information(s.model))
+        for m, s in zip(manoeuvres, simulate(manoeuvres))
+        if s.model is not None
+    ]
     found = None
     if told and args.steps > 0:
         base = max(told, key=lambda each: aim.nats(each[1]) / each[0].seconds)[0]
-        found = design.optimise(aim, base, simulate, limits, seed=args.seed, steps=args.steps, progress=print)
+        found = design.optimise(
+            aim, base, simulate, limits, seed=args.seed, steps=args.steps, progress=print
+        )
     if found:
         told.append((found.manoeuvre, found.information))
         rates = {m.name: aim.nats(information) / m.seconds for m, information in told}
-        atomic_write(Path(args.out) / "plan.png", pictures.planned(found.base, found.manoeuvre, rates))
+        atomic_write(
+            Path(args.out) / "plan.png", pictures.planned(found.base, found.manoeuvre, rates)
+        )
     ranked = plan.propose(aim, told)
     for manoeuvre, _ in told:
         atomic_write(Path(args.out) / manoeuvre.file, manoeuvre.reference().csv())
     _print(ranked)
     session = plan.session(ranked)
     if session:
-        print(f"together they settle the most: {', '.join(p.name + f' x{p.repeats}' * (p.repeats > 1) for p in session)}")
-    extra = {"proposals": [dataclasses.asdict(p) for p in ranked], "session": [p.name for p in session],
-             "optimised": found.said() if found else None}  # fmt: skip
+        print(
+            "together they settle the most:"
+            f" {', '.join(p.name + f' x{p.repeats}' * (p.repeats > 1) for p in session)}"
+        )
+    extra = {
+        "proposals": [dataclasses.asdict(p) for p in ranked],
+        "session": [p.name for p in session],
+        "optimised": found.said() if found else None,
+    }
     value = report.to_json(diagnosis, extra=extra)
     write_json(Path(args.out) / "plan.json", value)
     print(f"references as CSV: {args.out}")
-    print(f"sweeps that autopilots fly by themselves: {', '.join(path.name for path in excitation.write(args.out))}")
+    print(
+        "sweeps that autopilots fly by themselves:"
+        f" {', '.join(path.name for path in excitation.write(args.out))}"
+    )
     if args.json:
         write_json(args.json, value)
     return 0
@@ -82,10 +129,15 @@ def _limits(args: argparse.Namespace):
     try:
         x, y, z = (float(part) for part in args.hall.split(","))
     except ValueError as error:
-        raise DiagnoseError(f"--hall {args.hall}: expected three lengths in metres between commas, such as 5,5,2.6") from error
+        raise DiagnoseError(
+            f"--hall {args.hall}: expected three lengths in metres between commas, such as 5,5,2.6"
+        ) from error
     lowest = Limits.lowest
     if not (0.0 < x < math.inf and 0.0 < y < math.inf and lowest < z < math.inf):
-        raise DiagnoseError(f"--hall {args.hall}: expected lengths above 0 and a height above {lowest:g} m, the lowest that is flown")
+        raise DiagnoseError(
+            f"--hall {args.hall}: expected lengths above 0 and a height above {lowest:g} m, the"
+            " lowest that is flown"
+        )
     return Limits(half=(0.5 * x, 0.5 * y), highest=z, speed=args.speed)
 
 
@@ -99,7 +151,13 @@ def _chosen(names: str | None):
 
 
 def _print(ranked) -> None:
-    print(f"{'manoeuvre or measurement':40} {'seconds':>7} {'nats':>8} {'a second':>8} {'times':>5}  separates")
+    print(
+        f"{'manoeuvre or measurement':40} {'seconds':>7} {'nats':>8} {'a second':>8} {'times':>5} "
+        " separates"
+    )
     for p in ranked:
         separates = "; ".join(" from ".join(group) for group in p.separates) or "-"
-        print(f"{p.name:40} {p.seconds:7.1f} {p.nats:8.2f} {p.nats / p.seconds:8.3f} {p.repeats or '-':>5}  {separates}")
+        print(
+            f"{p.name:40} {p.seconds:7.1f} {p.nats:8.2f} {p.nats / p.seconds:8.3f}"
+            f" {p.repeats or '-':>5}  {separates}"
+        )

@@ -1,4 +1,6 @@
-"""The recording of a diagnosis for the rerun viewer: measured, simulated before and simulated after, flight by flight."""
+"""The recording of a diagnosis for the rerun viewer: measured, simulated before and simulated
+after, flight by flight.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +20,11 @@ PATHS = ("pos_w", "payload_pos_w")  # channels that are drawn in space
 
 
 def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> None:
-    """Write a ``.rrd``: for each flight the measured paths, the ghosts of both models, and all residuals over time.
+    """Write a ``.rrd``: for each flight the measured paths, the ghosts of both models, and all
+    residuals over time.
 
-    ``logs``: in the order in which the model numbers them; a model that numbers them otherwise gets residuals alone.
+    ``logs``: in the order in which the model numbers them; a model that numbers them otherwise gets
+    residuals alone.
     Raises StorageError: the place cannot be written.
     """
     work = diagnosis.work
@@ -32,7 +36,9 @@ def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> 
                 _channel(stream, name, c, before, after, work.after.noise, log)
 
 
-def _channel(stream, name: str, channel: int, before: Window, after: Window, noise, log: FlightLog | None) -> None:
+def _channel(
+    stream, name: str, channel: int, before: Window, after: Window, noise, log: FlightLog | None
+) -> None:
     rows = np.flatnonzero(before.channel == channel)
     if not len(rows):
         return
@@ -52,15 +58,25 @@ def _channel(stream, name: str, channel: int, before: Window, after: Window, noi
     if np.abs(measured.time[index] - at).max() > 1e-6:
         return
     place = measured.values[index]
-    for points, label, colour in ((place, "measured", style.INK), (place - old, "before", BEFORE), (place - new, "after", AFTER)):
+    for points, label, colour in (
+        (place, "measured", style.INK),
+        (place - old, "before", BEFORE),
+        (place - new, "after", AFTER),
+    ):
         _path(stream, f"{home}/{name}/{label}", at, points, colour)
 
 
 def _series(stream, entity: str, time: np.ndarray, values: np.ndarray, colour: str) -> None:
     count = values.shape[1]
-    stream.log(entity, rr.SeriesPoints(colors=[colour_code(colour)] * count, marker_sizes=[1.5] * count), static=True)
+    stream.log(
+        entity,
+        rr.SeriesPoints(colors=[colour_code(colour)] * count, marker_sizes=[1.5] * count),
+        static=True,
+    )
     column = rr.TimeColumn(TIMELINE, duration=time)
-    stream.send_columns(entity, [column], rr.Scalars.columns(scalars=np.ascontiguousarray(values, dtype=float)))
+    stream.send_columns(
+        entity, [column], rr.Scalars.columns(scalars=np.ascontiguousarray(values, dtype=float))
+    )
 
 
 def _path(stream, entity: str, time: np.ndarray, points: np.ndarray, colour: str) -> None:

@@ -1,11 +1,13 @@
 """Commands that got lost: a random effect of every single command.
 
-Whether command k came is m_k, 0 or 1 with probability theta. A window shows the sum of C m, with C the change of its samples by each
-command that did not come; m is taken for normal with mean theta and variance theta (1 - theta), and integrated out. Windows of a
-:attr:`visthrow.diagnose.select.point.Problem.lost` share differ by the mean, and have the rest of C m among what is not known of them.
+Whether command k came is m_k, 0 or 1 with probability theta. A window shows the sum of C m, with C
+the change of its samples by each command that did not come; m is taken for normal with mean theta
+and variance theta (1 - theta), and integrated out. Windows of a
+:attr:`visthrow.diagnose.select.point.Problem.lost` share differ by the mean, and have the rest of C
+m among what is not known of them.
 
-Source: an innovation variance (Harvey 1989) of the command channel; the likelihood of its size is that of a random effect.
-"""
+Source: an innovation variance (Harvey 1989) of the command channel; the likelihood of its size is
+that of a random effect."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,19 +28,30 @@ from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judg
 NAME = "dropped_commands"  # of the random effect in the catalogue
 
 EITHER = 0.5
-"""Mean and deviation of m where either is as likely. From half of it as a deviation 0 and 1 are told apart: half way is two from both."""
+"""Mean and deviation of m where either is as likely.
+
+From half of it as a deviation 0 and 1 are told apart: half way is two from both.
+"""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What windows say of K effects and T commands each, about 0; windows of fewer commands have columns of 0."""
+    """What windows say of K effects and T commands each, about 0; windows of fewer commands have
+    columns of 0.
+    """
 
     information: np.ndarray  # shape (W, K + T, K + T)
     score: np.ndarray  # shape (W, K + T)
     commands: int  # T
 
     @staticmethod
-    def of(problem: Problem, point: Point, windows: Sequence[Window], columns: Sequence[np.ndarray], rows: Sequence[int]) -> "Told":
+    def of(
+        problem: Problem,
+        point: Point,
+        windows: Sequence[Window],
+        columns: Sequence[np.ndarray],
+        rows: Sequence[int],
+    ) -> "Told":
         """Ask windows under a point's noise levels.
 
         Args:
@@ -48,19 +61,37 @@ class Told:
             rows: numbers of the windows among the point's.
         """
         most, known = max(own.shape[1] for own in columns), len(point.theta)
-        wide = [np.hstack((w.effects, np.pad(own, ((0, len(w.residual) - len(own)), (0, most - own.shape[1])))))
-                for w, own in zip(windows, columns)]  # fmt: skip
+        wide = [
+            np.hstack(
+                (
+                    w.effects,
+                    np.pad(own, ((0, len(w.residual) - len(own)), (0, most - own.shape[1]))),
+                )
+            )
+            for w, own in zip(windows, columns)
+        ]
         windows = [replace(w, effects=effects) for w, effects in zip(windows, wide)]
-        grams = grams_of(windows, np.append(problem.priors.floor, np.ones(most)), len(problem.model.channels), point.device)
+        grams = grams_of(
+            windows,
+            np.append(problem.priors.floor, np.ones(most)),
+            len(problem.model.channels),
+            point.device,
+        )
         grams = correlated_of(grams, windows, point.noise.correlation_time, point.device)
         noise = levels.only(point.noise, grams, rows)
         shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
         information = np.array([own.information for own in shares])
-        return Told(information, np.array([own.score for own in shares]) + information[:, :, :known] @ point.theta, most)
+        return Told(
+            information,
+            np.array([own.score for own in shares]) + information[:, :, :known] @ point.theta,
+            most,
+        )
 
     def ahead(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
         """Nats of these shares of dropped commands against none, beside a set of effects."""
-        return np.array([self._evidence(float(p), priors, active) for p in shares]) - self._evidence(0.0, priors, active)
+        return np.array(
+            [self._evidence(float(p), priors, active) for p in shares]
+        ) - self._evidence(0.0, priors, active)
 
     def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
         e, c = (slice(0, -self.commands), slice(-self.commands, None))
@@ -70,7 +101,9 @@ class Told:
             own, mean = self.information[:, c, c], np.full(self.commands, share)
             left, moved = self.score[:, c] - own @ mean, score - mean @ beside
             factor = np.linalg.cholesky(variance * own + np.eye(self.commands))
-            half = np.linalg.solve(factor, np.sqrt(variance) * np.concatenate((left[..., None], beside), axis=2))
+            half = np.linalg.solve(
+                factor, np.sqrt(variance) * np.concatenate((left[..., None], beside), axis=2)
+            )
             tells, through = half[..., 0], half[..., 1:]
             value = float((mean @ (self.score[:, c] + left).T).sum() + (tells**2).sum()) / 2.0
             value -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
@@ -80,13 +113,18 @@ class Told:
 
 
 def verdict(problem: Problem, point: Point, active: Sequence[int], least: float) -> Scatter | None:
-    """Whether commands got lost, beside a set of effects or any that are still missing; None where none was, or a model cannot tell.
+    """Whether commands got lost, beside a set of effects or any that are still missing; None where
+    none was, or a model cannot tell.
 
     ``least``: nats that a finding needs.
     """
     if not hasattr(problem.model, "without_commands"):
         return None
-    v, priors, sizes = next(v for v in random_effects() if v.name == NAME), problem.priors, problem.sizes(point.theta)
+    v, priors, sizes = (
+        next(v for v in random_effects() if v.name == NAME),
+        problem.priors,
+        problem.sizes(point.theta),
+    )
     reach = REACH * v.prior_sd
     sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
     every = range(len(problem.kept))
@@ -100,17 +138,29 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
 
 
 def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
-    """The verdict with the share of those commands of which a window tells by itself whether they came, with Jeffreys' interval.
+    """The verdict with the share of those commands of which a window tells by itself whether they
+    came, with Jeffreys' interval.
 
-    ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these leave; ``found``: the verdict before.
-    """
-    told = Told.of(problem, point, [point.about.windows[i] for i in problem.kept], point.commands, range(len(problem.kept)))
-    own, score = told.information[:, -told.commands :, -told.commands :], told.score[:, -told.commands :]
+    ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these
+    leave; ``found``: the verdict before."""
+    told = Told.of(
+        problem,
+        point,
+        [point.about.windows[i] for i in problem.kept],
+        point.commands,
+        range(len(problem.kept)),
+    )
+    own, score = (
+        told.information[:, -told.commands :, -told.commands :],
+        told.score[:, -told.commands :],
+    )
     spread = np.linalg.inv(own + np.eye(told.commands) / EITHER**2)
     off = (spread @ (score - EITHER * own.sum(2))[..., None])[..., 0]  # from half way
     clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
     count, gone = np.count_nonzero(clear), np.count_nonzero(clear & (off > 0.0))
     if not count:
         return found
-    size, low, high = (float(x) for x in beta.ppf((0.5, 0.025, 0.975), gone + 0.5, count - gone + 0.5))
+    size, low, high = (
+        float(x) for x in beta.ppf((0.5, 0.025, 0.975), gone + 0.5, count - gone + 0.5)
+    )
     return replace(found, size=size, low=low, high=high)

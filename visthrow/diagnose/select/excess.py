@@ -1,8 +1,8 @@
-"""Latent forces by block and phase: what still moves the vehicle after the causes were named, and whether that is too much.
+"""Latent forces by block and phase: what still moves the vehicle after the causes were named, and
+whether that is too much.
 
-Gusts and draught do not know what the vehicle is doing. A latent force that is several times stronger in throws than in the
-quietest phase is no gust but something that the model lacks.
-"""
+Gusts and draught do not know what the vehicle is doing. A latent force that is several times
+stronger in throws than in the quietest phase is no gust but something that the model lacks."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,24 +21,31 @@ from visthrow.diagnose.select.result import Level
 from visthrow.logs.flightlog import STANDARD_CHANNELS
 
 LANDING = 5e-3
-"""Distance [m] that a latent force must move a body along an axis within a window, else it does not matter: a cause that moves a
-landing by less is below its floor as well."""
+"""Distance [m] that a latent force must move a body along an axis within a window, else it does not
+matter: a cause that moves a landing by less is below its floor as well.
+"""
 
 STEP, MOST_STEPS = 1.4, 60
-"""Factor from one level to the next above the best, until one is too high. A level that nothing holds up lies anywhere below."""
+"""Factor from one level to the next above the best, until one is too high.
+
+A level that nothing holds up lies anywhere below.
+"""
 
 
 def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple[Level, ...]:
-    """Compare the latent forces of each block and phase with the block's quietest phase, and with what would move a landing.
+    """Compare the latent forces of each block and phase with the block's quietest phase, and with
+    what would move a landing.
 
-    ``least``: nats from which a level would count as excessive if it were the only one; of many, one is higher by chance.
-    """
+    ``least``: nats from which a level would count as excessive if it were the only one; of many,
+    one is higher by chance."""
     found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
     of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
     floors = floors_of(problem, after)
     for block in blocks:
-        limits = {phase: of[phase].upper_limit(block) for b, phase in after.noise.latent_sd if b == block}
+        limits = {
+            phase: of[phase].upper_limit(block) for b, phase in after.noise.latent_sd if b == block
+        }
         quiet = min(limits.values())
         for phase in limits:
             level = after.noise.latent_sd[block, phase]
@@ -46,25 +53,49 @@ def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple
             if level > most:
                 nats = of[phase].likelihood(block, level) - of[phase].likelihood(block, most)
             earlier = before.noise.latent_sd.get((block, phase), float("nan"))
-            found.append(Level(LATENT_BLOCKS[block], phase, earlier, level, quiet, float(nats), bool(nats > least)))
+            found.append(
+                Level(
+                    LATENT_BLOCKS[block],
+                    phase,
+                    earlier,
+                    level,
+                    quiet,
+                    float(nats),
+                    bool(nats > least),
+                )
+            )
     return tuple(found)
 
 
 def compares_phases(point: Point) -> bool:
-    """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the sensors' noise."""
+    """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the
+    sensors' noise.
+    """
     return max(Counter(block for block, _ in point.noise.latent_sd).values(), default=0) > 1
 
 
 def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
-    """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING`` within the median window."""
+    """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING``
+    within the median window.
+    """
     channels, moves = problem.model.channels, {}
-    positions = [c for c, name in enumerate(channels) if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"]
+    positions = [
+        c
+        for c, name in enumerate(channels)
+        if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"
+    ]
     for gram, window in zip(point.grams, point.windows):
         seen = window.latent[np.isin(window.channel, positions)]
         for block in np.unique(gram.latent_block) if len(seen) else ():
             reach = seen @ gram.factor[:, gram.latent_block == block]
-            moves.setdefault((int(block), gram.phase), []).append(float(np.sqrt((reach**2).sum(1).max())))
-    return {key: LANDING / median for key, found in moves.items() if (median := float(np.median(found))) > 0.0}
+            moves.setdefault((int(block), gram.phase), []).append(
+                float(np.sqrt((reach**2).sum(1).max()))
+            )
+    return {
+        key: LANDING / median
+        for key, found in moves.items()
+        if (median := float(np.median(found))) > 0.0
+    }
 
 
 class _Phase:
@@ -73,7 +104,11 @@ class _Phase:
     def __init__(self, point: Point, phase: str):
         """Put them side by side."""
         windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
-        self.noise, self.phase, self.stack = point.noise, phase, Stack([point.grams[w] for w in windows], point.device, windows)
+        self.noise, self.phase, self.stack = (
+            point.noise,
+            phase,
+            Stack([point.grams[w] for w in windows], point.device, windows),
+        )
 
     def likelihood(self, block: int, level: float) -> float:
         """Of the phase's residuals."""
@@ -90,15 +125,21 @@ class _Phase:
         return float(best * STEP**step)
 
 
-def acts_on(point: Point, effects: Sequence[int], *, joint: bool = False, beside: Sequence[int] = ()) -> list[str]:
-    """Block through which each of some effects moves things, or "" where it moves measurements alone.
+def acts_on(
+    point: Point, effects: Sequence[int], *, joint: bool = False, beside: Sequence[int] = ()
+) -> list[str]:
+    """Block through which each of some effects moves things, or "" where it moves measurements
+    alone.
 
-    Its column is laid over the columns of each block's latent forces; the block that explains most of it, and at least half, is it.
-    ``point``: with the latent forces' derivatives; ``joint``: consider the torque between vehicle and rope as well; ``beside``: effects
-    that may take any size: what they can stand in for is left out.
-    """
+    Its column is laid over the columns of each block's latent forces; the block that explains most
+    of it, and at least half, is it. ``point``: with the latent forces' derivatives; ``joint``:
+    consider the torque between vehicle and rope as well; ``beside``: effects that may take any
+    size: what they can stand in for is left out."""
     weight = point.noise.scale**-2.0
-    total, by_block = np.zeros(len(effects)), {name: np.zeros(len(effects)) for name in (*LATENT_BLOCKS, JOINT)}
+    total, by_block = (
+        np.zeros(len(effects)),
+        {name: np.zeros(len(effects)) for name in (*LATENT_BLOCKS, JOINT)},
+    )
     for gram, window in zip(point.grams, point.windows):
         inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
         free = np.array([*range(gram.nuisances), *(size + k for k in beside)], dtype=int)
@@ -106,8 +147,12 @@ def acts_on(point: Point, effects: Sequence[int], *, joint: bool = False, beside
         own = _explained(inner[np.ix_(free, free)], inner[np.ix_(free, columns)])
         total += inner[columns, columns] - own
         for block in np.unique(gram.latent_block):
-            with_block = np.concatenate((free, gram.nuisances + np.flatnonzero(gram.latent_block == block)))
-            explained = _explained(inner[np.ix_(with_block, with_block)], inner[np.ix_(with_block, columns)])
+            with_block = np.concatenate(
+                (free, gram.nuisances + np.flatnonzero(gram.latent_block == block))
+            )
+            explained = _explained(
+                inner[np.ix_(with_block, with_block)], inner[np.ix_(with_block, columns)]
+            )
             by_block[LATENT_BLOCKS[block]] += explained - own
         if joint and (torques := joint_torques(gram, window)) is not None:
             move = np.zeros((len(inner), len(free) + torques.shape[1]))
@@ -115,11 +160,16 @@ def acts_on(point: Point, effects: Sequence[int], *, joint: bool = False, beside
             move[gram.nuisances : size, len(free) :] = torques
             by_block[JOINT] += _explained(move.T @ inner @ move, move.T @ inner[:, columns]) - own
     best = [max(by_block, key=lambda name: by_block[name][i]) for i in range(len(effects))]
-    return [name if total[i] > 0.0 and by_block[name][i] > 0.5 * total[i] else "" for i, name in enumerate(best)]
+    return [
+        name if total[i] > 0.0 and by_block[name][i] > 0.5 * total[i] else ""
+        for i, name in enumerate(best)
+    ]
 
 
 def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
-    """Latents of a gram that torques in the rope's joint about each axis at each knot stand for, shape (L, 3k); None without."""
+    """Latents of a gram that torques in the rope's joint about each axis at each knot stand for,
+    shape (L, 3k); None without.
+    """
     known = Known(window.knots)
     if not set(JOINT_NEEDS) <= set(known) or len(np.unique(gram.latent_block)) < len(LATENT_BLOCKS):
         return None
@@ -127,17 +177,27 @@ def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
 
 
 def _explained(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Parts of columns' squares that other columns explain, from these columns' inner products with themselves and with those."""
+    """Parts of columns' squares that other columns explain, from these columns' inner products with
+    themselves and with those.
+    """
     normal = normal + np.diag(1e-9 * np.diag(normal) + 1e-12)
     return np.sum(right * np.linalg.solve(normal, right), axis=0)
 
 
 def too_strong(point: Point, share: float) -> tuple[str, ...]:
-    """Phases in which the latent force on the vehicle exceeds a share of the thrust that carries it."""
+    """Phases in which the latent force on the vehicle exceeds a share of the thrust that carries
+    it.
+    """
     thrusts: dict[str, list[float]] = {}
     for window in point.windows:
         if "thrust" in window.knots and len(window.knots["thrust"]):
-            thrusts.setdefault(window.phase, []).append(float(np.median(np.abs(window.knots["thrust"]))))
+            thrusts.setdefault(window.phase, []).append(
+                float(np.median(np.abs(window.knots["thrust"])))
+            )
     block = LATENT_BLOCKS.index("vehicle force")
     weight = max((float(np.median(v)) for v in thrusts.values()), default=np.inf)
-    return tuple(p for (b, p), level in point.noise.latent_sd.items() if b == block and level > share * weight)
+    return tuple(
+        p
+        for (b, p), level in point.noise.latent_sd.items()
+        if b == block and level > share * weight
+    )

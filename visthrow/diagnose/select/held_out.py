@@ -1,8 +1,9 @@
 """What held-out flights say of the names: they decide.
 
-Each flight is left out in turn, the search repeated on the others by their statistics, and its answer predicts the one left out, with
-gusts integrated out. A set of names is confirmed where the interval of what it brings there excludes nothing; names that the
-searches do not find again are candidates, and all are where that interval holds nothing; names that do harm there are withdrawn.
+Each flight is left out in turn, the search repeated on the others by their statistics, and its
+answer predicts the one left out, with gusts integrated out. A set of names is confirmed where the
+interval of what it brings there excludes nothing; names that the searches do not find again are
+candidates, and all are where that interval holds nothing; names that do harm there are withdrawn.
 """
 
 from collections import Counter
@@ -22,7 +23,14 @@ from visthrow.diagnose.likelihood.evidence import (
     estimate,
     log_evidence,
 )
-from visthrow.diagnose.likelihood.forms import HORIZONS, READABLE, Errors, errors, predicted, unit_of
+from visthrow.diagnose.likelihood.forms import (
+    HORIZONS,
+    READABLE,
+    Errors,
+    errors,
+    predicted,
+    unit_of,
+)
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
@@ -35,10 +43,16 @@ from visthrow.diagnose.select.state import Work
 
 MOST_FOLDS = 12
 PARTS = 3
-"""With fewer flights so many parts of each are left out instead, and the report says so: two sets that were trained on differ."""
+"""With fewer flights so many parts of each are left out instead, and the report says so: two sets
+that were trained on differ.
+"""
 FIRM = 2.0 / 3.0
-"""More of the folds than this share must name a cause, or one of its class: of three folds that leave a flight out, all."""
-TELLING = 0.1  # of what flights promise in the mean, from which one counts among those that can tell
+"""More of the folds than this share must name a cause, or one of its class: of three folds that
+leave a flight out, all.
+"""
+TELLING = (
+    0.1  # of what flights promise in the mean, from which one counts among those that can tell
+)
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 
@@ -55,7 +69,11 @@ class Crossed:
 
 
 def select(
-    information: np.ndarray, score: np.ndarray, priors: Priors, least: float, begin: Sequence[int] = ()
+    information: np.ndarray,
+    score: np.ndarray,
+    priors: Priors,
+    least: float,
+    begin: Sequence[int] = (),
 ) -> list[int]:
     """Forward search with backward elimination by the statistics alone.
 
@@ -85,16 +103,22 @@ def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
         return flights, "flights"
     order = {f: [i for i, g in enumerate(flights) if g == f] for f in set(flights)}
-    return [f * PARTS + PARTS * order[f].index(i) // len(order[f]) for i, f in enumerate(flights)], "parts of flights"
+    return [
+        f * PARTS + PARTS * order[f].index(i) // len(order[f]) for i, f in enumerate(flights)
+    ], "parts of flights"
 
 
 def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
     parts = point.integrals.shares(point.grams, point.noise)
-    return gather([replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta)
+    return gather(
+        [replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta
+    )
 
 
 def crossed(diagnosis: Diagnosis) -> Crossed:
-    """Repeat a search without each of the flights, by statistics; what an effect that varies has of its own there is integrated out."""
+    """Repeat a search without each of the flights, by statistics; what an effect that varies has of
+    its own there is integrated out.
+    """
     work, least = diagnosis.work, diagnosis.threshold
     point, priors = work.after, work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
@@ -108,9 +132,15 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         if not len(rest):
             continue
         information, score = statistics.information[rest].sum(0), statistics.absolute[rest].sum(0)
-        anew, active = (select(information, score, priors, least, begin=begin) for begin in ((), work.active))
-        worth = [log_evidence(information, score, priors, s) - least * len(s) for s in (anew, active)]
-        if worth[0] > worth[1] + STRONG:  # else the rest cannot tell these names from others, and does not deny them
+        anew, active = (
+            select(information, score, priors, least, begin=begin) for begin in ((), work.active)
+        )
+        worth = [
+            log_evidence(information, score, priors, s) - least * len(s) for s in (anew, active)
+        ]
+        if (
+            worth[0] > worth[1] + STRONG
+        ):  # else the rest cannot tell these names from others, and does not deny them
             active = anew
         trained[fold] = estimate(information, score, priors, active)
         named.update(active)
@@ -118,16 +148,21 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     return Crossed(groups, left_out, statistics, folds, trained, shares)
 
 
-def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) -> tuple[float, float, float]:
+def borne_out(
+    statistics: Statistics, trained: np.ndarray, theta: np.ndarray
+) -> tuple[float, float, float]:
     """What names bring to held-out flights, of what they promise there, with a 95 % interval.
 
-    A right size promises theta' I theta / 2 nats with a variance of twice that. The interval is that of the flights' scatter (Student,
-    over flights that can tell), or of this chance where it is wider.
-    ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``: sizes that all flights gave, shape (K,).
-    """
+    A right size promises theta' I theta / 2 nats with a variance of twice that. The interval is
+    that of the flights' scatter (Student, over flights that can tell), or of this chance where it
+    is wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
+    sizes that all flights gave, shape (K,)."""
     promised = 0.5 * np.einsum("i,fij,j->f", theta, statistics.information, theta)
     quadratic = np.einsum("fi,fij,fj->f", trained, statistics.information, trained)
-    came, total = np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic, promised.sum()
+    came, total = (
+        np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic,
+        promised.sum(),
+    )
     if total <= 0.0:
         return 0.0, float("nan"), float("nan")
     value, n = came.sum() / total, int((promised > TELLING * promised.mean()).sum())
@@ -138,16 +173,22 @@ def borne_out(statistics: Statistics, trained: np.ndarray, theta: np.ndarray) ->
     return float(value), float(value - reach), float(value + reach)
 
 
-def channel_gains(work: Work, cross: Crossed, box: np.ndarray | None = None) -> tuple[ChannelGain, ...]:
+def channel_gains(
+    work: Work, cross: Crossed, box: np.ndarray | None = None
+) -> tuple[ChannelGain, ...]:
     """Prediction errors on held-out flights of every measured channel.
 
-    ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C, H).
-    """
+    ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C,
+    H)."""
     before, after, names = work.before, work.after, work.problem.model.channels
-    change = (after.theta - cross.trained)[np.unique(cross.groups, return_inverse=True)[1]] * work.problem.priors.floor
+    change = (after.theta - cross.trained)[
+        np.unique(cross.groups, return_inverse=True)[1]
+    ] * work.problem.priors.floor
     named = [w.residual + w.effects @ own for w, own in zip(after.windows, change)]
     own = errors(after.windows, cross.groups, after.noise, named, len(names))
-    plain = errors(before.windows, cross.groups, after.noise, [w.residual for w in before.windows], len(names))
+    plain = errors(
+        before.windows, cross.groups, after.noise, [w.residual for w in before.windows], len(names)
+    )
     return tuple(
         _channel(name, c, after, own, plain.square[:, c], None if box is None else box[:, c])
         for c, name in enumerate(names)
@@ -155,7 +196,9 @@ def channel_gains(work: Work, cross: Crossed, box: np.ndarray | None = None) -> 
     )
 
 
-def _channel(name: str, c: int, after: Point, own: Errors, before: np.ndarray, box: np.ndarray | None) -> ChannelGain:
+def _channel(
+    name: str, c: int, after: Point, own: Errors, before: np.ndarray, box: np.ndarray | None
+) -> ChannelGain:
     error, count = own.square[:, c], own.count[:, c].sum()
     sigma = after.sigma(c)
 
@@ -165,10 +208,25 @@ def _channel(name: str, c: int, after: Point, own: Errors, before: np.ndarray, b
     value, low, high = jackknifed(before.sum(1), error.sum(1))
     by_horizon = own.count[:, c].sum(0)
     seen = by_horizon > 0
-    curves = [np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen]) for x in (before, error, own.floor[:, c])]
-    horizons = tuple((h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[seen].tolist(), *curves))
-    return ChannelGain(name, unit_of(name), rms(before), rms(error), rms(own.floor[:, c]),
-                       float("nan") if box is None else rms(box), value, low, high, horizons)  # fmt: skip
+    curves = [
+        np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen])
+        for x in (before, error, own.floor[:, c])
+    ]
+    horizons = tuple(
+        (h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[seen].tolist(), *curves)
+    )
+    return ChannelGain(
+        name,
+        unit_of(name),
+        rms(before),
+        rms(error),
+        rms(own.floor[:, c]),
+        float("nan") if box is None else rms(box),
+        value,
+        low,
+        high,
+        horizons,
+    )
 
 
 def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
@@ -186,16 +244,25 @@ def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, flo
         return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
     with np.errstate(divide="ignore", invalid="ignore"):  # one group may hold everything
         without = np.log((after.sum() - after) / (before.sum() - before))
-    reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt((n - 1.0) / n * ((without - without.mean()) ** 2).sum())
+    reach = (
+        0.5
+        * stdtrit(n - 1, 0.975)
+        * np.sqrt((n - 1.0) / n * ((without - without.mean()) ** 2).sum())
+    )
     return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
 
 
 def measure(diagnosis: Diagnosis) -> HeldOut:
     """Ask held-out flights about the names of a search."""
     work, cross = diagnosis.work, crossed(diagnosis)
-    sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects]) / work.problem.priors.floor
+    sizes = (
+        np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects])
+        / work.problem.priors.floor
+    )
     share = borne_out(cross.statistics, cross.trained, sizes)
-    return HeldOut(*share, channel_gains(work, cross), cross.named, len(cross.folds), cross.left_out)
+    return HeldOut(
+        *share, channel_gains(work, cross), cross.named, len(cross.folds), cross.left_out
+    )
 
 
 def judged(diagnosis: Diagnosis) -> Diagnosis:
@@ -209,16 +276,41 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     harmed = [c for c in held.channels if alone and c.high < 0.0]
     if held.share <= 0.0 or harmed:
         how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(held)
-        reason = f"held-out {held.left_out} are explained worse with {', '.join(names)} ({how}); withdrawn"
-        return _unconfirmed(_demoted(diagnosis, names, result.NOT_IDENTIFIABLE, "held-out flights are explained worse with it"),
-                            held, names, reason)  # fmt: skip
+        reason = (
+            f"held-out {held.left_out} are explained worse with {', '.join(names)} ({how});"
+            " withdrawn"
+        )
+        return _unconfirmed(
+            _demoted(
+                diagnosis,
+                names,
+                result.NOT_IDENTIFIABLE,
+                "held-out flights are explained worse with it",
+            ),
+            held,
+            names,
+            reason,
+        )
     shown = not alone or not held.channels or any(c.low > 0.0 for c in held.channels)
     if not (held.low > 0.0 and shown):
         reason = f"held-out {held.left_out} do not confirm {', '.join(names)} ({_share(held)})"
-        return _unconfirmed(_demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"), held, names, reason)
-    alike = {name: (name, *diagnosis[name].partners) for name in names}  # what names one of a class names it
-    unsure = [name for name in names if sum(held.named_in.get(own, 0.0) for own in alike[name]) < FIRM + 1e-9]
-    after = _demoted(diagnosis, unsure, result.CANDIDATE, "not all searches that leave flights out name it")
+        return _unconfirmed(
+            _demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"),
+            held,
+            names,
+            reason,
+        )
+    alike = {
+        name: (name, *diagnosis[name].partners) for name in names
+    }  # what names one of a class names it
+    unsure = [
+        name
+        for name in names
+        if sum(held.named_in.get(own, 0.0) for own in alike[name]) < FIRM + 1e-9
+    ]
+    after = _demoted(
+        diagnosis, unsure, result.CANDIDATE, "not all searches that leave flights out name it"
+    )
     if not after.theta:
         reason = f"searches that leave {held.left_out} out do not agree on a name"
         return _unconfirmed(after, held, names, reason)
@@ -226,11 +318,14 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     after = replace(after, held_out=held)
     if diagnosis.overall == result.UNKNOWN or not left:
         return after
-    return replace(after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in left))
+    return replace(
+        after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in left)
+    )
 
 
 def _innovations(diagnosis: Diagnosis) -> Diagnosis:
-    """A diagnosis without a name: what the model leaves ahead of a window's begin must be near the noise.
+    """A diagnosis without a name: what the model leaves ahead of a window's begin must be near the
+    noise.
 
     Asked where no calm phase tells what gusts are; there the latent forces are compared with those.
     """
@@ -239,53 +334,86 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
         return diagnosis
     groups, left_out = groups_of(point, work.problem.kept)
     names = work.problem.model.channels
-    own = errors(point.windows, groups, point.noise, [w.residual for w in point.windows], len(names))
+    own = errors(
+        point.windows, groups, point.noise, [w.residual for w in point.windows], len(names)
+    )
     error, most = own.square.sum(2), UNKNOWN_RATIO**2 * own.floor.sum(2)
     firm = [name for c, name in enumerate(names) if jackknifed(most[:, c], error[:, c])[2] < 0.0]
     if not firm:
         return diagnosis
-    gains = channel_gains(work, Crossed(groups, left_out, point.statistics, [], np.zeros((len(error), len(point.theta))), {}))
+    gains = channel_gains(
+        work,
+        Crossed(
+            groups, left_out, point.statistics, [], np.zeros((len(error), len(point.theta))), {}
+        ),
+    )
     floors = floors_of(work.problem, point)
-    level = max(diagnosis.levels, key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf), default=None)
+    level = max(
+        diagnosis.levels,
+        key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf),
+        default=None,
+    )
     reasons = tuple(_left(c, work) for c in gains if c.channel in firm)
-    return replace(diagnosis, overall=result.UNKNOWN, block=level.block if level else "", reasons=reasons)
+    return replace(
+        diagnosis, overall=result.UNKNOWN, block=level.block if level else "", reasons=reasons
+    )
 
 
-def _unconfirmed(diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reason: str) -> Diagnosis:
-    """Something is there that no confirmed name explains: in the block of the name that promised most."""
+def _unconfirmed(
+    diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reason: str
+) -> Diagnosis:
+    """Something is there that no confirmed name explains: in the block of the name that promised
+    most.
+    """
     most = max((diagnosis[name] for name in names), key=lambda f: f.nats)
     block = diagnosis.block or most.block
     earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
-    return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *earlier), held_out=held)
+    return replace(
+        diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *earlier), held_out=held
+    )
 
 
 def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str) -> Diagnosis:
-    """Names and the members of their classes with another verdict; what stays named is sized without them."""
+    """Names and the members of their classes with another verdict; what stays named is sized
+    without them.
+    """
     if not names:
         return diagnosis
     gone = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
     kept = {name: size for name, size in diagnosis.theta.items() if name not in names}
     findings = tuple(
-        replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
-        if f.name in gone and f.name not in kept and f.verdict in (result.FOUND, result.CLASS) else f
+        (
+            replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
+            if f.name in gone and f.name not in kept and f.verdict in (result.FOUND, result.CLASS)
+            else f
+        )
         for f in diagnosis.findings
-    )  # fmt: skip
+    )
     work, known = diagnosis.work, [e.name for e in diagnosis.work.problem.effects]
     active = [known.index(name) for name in kept]
     theta, spread, _ = sized(work.problem, work.after, active)
-    work = replace(work, active=tuple(active)) if active else replace(work, after=work.before, active=())
+    work = (
+        replace(work, active=tuple(active))
+        if active
+        else replace(work, after=work.before, active=())
+    )
     return replace(diagnosis, findings=findings, theta=theta, covariance=spread, work=work)
 
 
-def sized(problem: Problem, point: Point, active: Sequence[int]) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], np.ndarray]:
-    """Sizes with which named effects alone explain the flights, and their covariance with what numerics and differences among flights add.
+def sized(
+    problem: Problem, point: Point, active: Sequence[int]
+) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], np.ndarray]:
+    """Sizes with which named effects alone explain the flights, and their covariance with what
+    numerics and differences among flights add.
 
-    Returns both in the effects' units, and the variance that the differences add to each effect, see :func:`differences`, shape (K,).
-    """
+    Returns both in the effects' units, and the variance that the differences add to each effect,
+    see :func:`differences`, shape (K,)."""
     priors, named = problem.priors, list(active)
     theta = estimate(point.information, point.score, priors, named)
     unlike = differences(point.statistics, priors, named, theta)
-    spread = covariance(point.information, priors.deviation(named)) + np.diag(OWN_FLOOR**2 + unlike * allowed(theta) ** 2)
+    spread = covariance(point.information, priors.deviation(named)) + np.diag(
+        OWN_FLOOR**2 + unlike * allowed(theta) ** 2
+    )
     own = spread[np.ix_(named, named)] * np.outer(priors.floor[named], priors.floor[named])
     sizes = {problem.effects[j].name: float(theta[j] * priors.floor[j]) for j in named}
     return sizes, tuple(tuple(map(float, row)) for row in own), unlike
@@ -294,7 +422,10 @@ def sized(problem: Problem, point: Point, active: Sequence[int]) -> tuple[dict[s
 def _share(held: HeldOut) -> str:
     if np.isnan(held.low):
         return "too few of them can tell"
-    return f"they bear out {100 * held.share:.0f} % [{100 * held.low:.0f}, {100 * held.high:.0f}] of what it promises"
+    return (
+        f"they bear out {100 * held.share:.0f} % [{100 * held.low:.0f}, {100 * held.high:.0f}] of"
+        " what it promises"
+    )
 
 
 def _left(c: ChannelGain, work: Work) -> str:
@@ -302,17 +433,25 @@ def _left(c: ChannelGain, work: Work) -> str:
     factor, unit = READABLE.get(c.unit, (1.0, c.unit))
     said = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
     kind = _kind(work, work.problem.model.channels.index(c.channel))
-    return f"{c.channel}: {said} left on held-out flights, noise alone {factor * c.floor:.3g}{f'; {kind}' if kind else ''}"
+    return (
+        f"{c.channel}: {said} left on held-out flights, noise alone"
+        f" {factor * c.floor:.3g}{f'; {kind}' if kind else ''}"
+    )
 
 
 def _kind(work: Work, channel: int) -> str:
-    """Where the error of a channel that is left lies: an axis, a flight, or growing with the time in the flight."""
+    """Where the error of a channel that is left lies: an axis, a flight, or growing with the time
+    in the flight.
+    """
     point = work.after
     by_axis, by_flight, late, spans = np.zeros(3), Counter(), [], {}
     for window in point.windows:
         spans.setdefault(window.flight, []).append(window.time.mean())
     for window in point.windows:
-        rows, (left, _, horizon) = window.channel == channel, predicted(window, point.noise, window.residual)
+        rows, (left, _, horizon) = (
+            window.channel == channel,
+            predicted(window, point.noise, window.residual),
+        )
         if not rows.any():
             continue
         square, times = np.where(horizon < 0, 0.0, left**2)[rows], window.time[rows]
@@ -326,7 +465,13 @@ def _kind(work: Work, channel: int) -> str:
         parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
     if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * total:
         parts.append(f"mostly in flight {max(by_flight, key=by_flight.get)}")
-    halves = [np.sqrt(sum(s for h, s, _ in late if h == half) / max(sum(n for h, _, n in late if h == half), 1)) for half in (0, 1)]
+    halves = [
+        np.sqrt(
+            sum(s for h, s, _ in late if h == half)
+            / max(sum(n for h, _, n in late if h == half), 1)
+        )
+        for half in (0, 1)
+    ]
     if min(halves) > 0.0 and halves[1] > 1.5 * halves[0]:
         parts.append("growing within the flight")
     return ", ".join(parts)

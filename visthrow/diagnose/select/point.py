@@ -1,4 +1,6 @@
-"""The state of a search: the model linearised at some sizes of its effects, with the noise levels that belong there."""
+"""The state of a search: the model linearised at some sizes of its effects, with the noise levels
+that belong there.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,7 +13,14 @@ from visthrow.diagnose.likelihood import noise as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
-from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, Priors, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import (
+    INEXACT,
+    OWN_FLOOR,
+    Priors,
+    covariance,
+    estimate,
+    log_evidence,
+)
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.likelihood.marginal import Gram, Noise, Statistics, gather, rescored
 from visthrow.diagnose.likelihood.threads import beside, each
@@ -19,17 +28,23 @@ from visthrow.diagnose.models.interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
 
 ROUNDS = 3
-"""Gauss-Newton steps between two linearisations, linearisations in a row each where the last led, and rounds of lost windows: each
-round has some tenth of what the one before had to do."""
+"""Gauss-Newton steps between two linearisations, linearisations in a row each where the last led,
+and rounds of lost windows: each round has some tenth of what the one before had to do.
+"""
 
 UNKNOWN_RATIO = 3.0  # what is so many times the noise, or the quietest phase's gusts, is neither
-LOST_SHARE = 0.15  # share of windows that the simulation may lose; where more are so far off, something is missing
+# share of windows that the simulation may lose; where more are so far off, something is missing
+LOST_SHARE = 0.15
 
 SMALL_STEP = 0.5 * OWN_FLOOR
-"""In floors: a step that is not worth a simulation, and the distance at which an estimate lies on its bound."""
+"""In floors: a step that is not worth a simulation, and the distance at which an estimate lies on
+its bound.
+"""
 
 TURNS, TURNED = 8, 0.5
-"""Times that sizes and noise levels are estimated in turn, while the levels leave a step of the sizes worth so many nats."""
+"""Times that sizes and noise levels are estimated in turn, while the levels leave a step of the
+sizes worth so many nats.
+"""
 
 
 @dataclass(frozen=True)
@@ -38,17 +53,27 @@ class Problem:
 
     model: Model
     kept: tuple[int, ...]  # windows that are looked at
-    correlated: Mapping[int, Correlation] = field(default_factory=dict)  # channels whose noise is not white
-    varies: Varies = field(default_factory=Varies)  # effects that differ from flight to flight, or from day to day
-    terms: tuple[TermEffect, ...] = ()  # of laws: further effects, whose columns follow from those of the latent forces
+    correlated: Mapping[int, Correlation] = field(
+        default_factory=dict
+    )  # channels whose noise is not white
+    varies: Varies = field(
+        default_factory=Varies
+    )  # effects that differ from flight to flight, or from day to day
+    terms: tuple[
+        TermEffect, ...
+    ] = ()  # of laws: further effects, whose columns follow from those of the latent forces
     lost: float = 0.0  # share of the commands that did not come
 
     @staticmethod
     def of(model: Model, windows: Sequence[Window], kept: Sequence[int]) -> "Problem":
-        """The problem of some of a model's windows, with the correlation of their channels' noise."""
+        """The problem of some of a model's windows, with the correlation of their
+        channels' noise.
+        """
         plain = Problem(model, tuple(kept), varies=Varies(getattr(model, "days", ())))
         slabs = plain.priors.slab * plain.priors.floor
-        return replace(plain, correlated=correlations([windows[i] for i in kept], slabs, len(model.channels)))
+        return replace(
+            plain, correlated=correlations([windows[i] for i in kept], slabs, len(model.channels))
+        )
 
     @cached_property
     def priors(self) -> Priors:
@@ -70,14 +95,20 @@ class Problem:
         return replace(self, kept=tuple(self.kept[w] for w in windows))
 
     def flown(self, theta: np.ndarray) -> Model | None:
-        """The model with the terms at their sizes as its laws; None where their columns do. ``theta`` is in floors."""
+        """The model with the terms at their sizes as its laws; None where their columns do.
+        ``theta`` is in floors.
+        """
         if not self.terms or not getattr(self.model, "bends", False):
             return None
         sizes = zip(self.terms, theta[-len(self.terms) :])
-        return self.model.with_laws([e.term.law(float(size * e.floor)) for e, size in sizes if size != 0.0])
+        return self.model.with_laws(
+            [e.term.law(float(size * e.floor)) for e, size in sizes if size != 0.0]
+        )
 
     def sizes(self, theta: np.ndarray) -> dict[str, float]:
-        """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in floors."""
+        """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in
+        floors.
+        """
         return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
 
 
@@ -92,8 +123,14 @@ class Point:
     plain: Statistics  # of flights without anything of their own
     varies: Varies  # see :attr:`Problem.varies`
     integrals: stack.Integrals  # of the grams under these noise levels
-    about: Linearised | None  # where the model's derivatives were taken; None: with another kind of block than the residuals
-    commands: Sequence[np.ndarray]  # change of each window by each command that did not come, shape (N, T); none: all came
+    about: (
+        Linearised | None
+        # where the model's derivatives were taken; None: with another kind of block than the
+        # residuals
+    )
+    commands: Sequence[
+        np.ndarray
+    ]  # change of each window by each command that did not come, shape (N, T); none: all came
     device: str  # where the model simulates, and the algebra of all windows with it
 
     @cached_property
@@ -112,7 +149,9 @@ class Point:
         return self.statistics.absolute.sum(0)
 
     def sigma(self, channel: int) -> float:
-        """Median of what the model states as a channel's noise, in its unit; NaN where there is no sample."""
+        """Median of what the model states as a channel's noise, in its unit; NaN where there is no
+        sample.
+        """
         own = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
         return float(np.median(own)) if len(own) else float("nan")
 
@@ -125,14 +164,24 @@ class Point:
 def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
     """The point with changes, and what its windows then say.
 
-    ``integrals``: of the grams under the noise levels, where they are known; ``changes``: fields of the point.
-    """
+    ``integrals``: of the grams under the noise levels, where they are known; ``changes``: fields of
+    the point."""
     changed = replace(point, **changes)
-    integrals = stack.integrals(changed.grams, changed.noise, changed.device) if integrals is None else integrals
-    return replace(changed, integrals=integrals, plain=_statistics(changed.grams, integrals, changed.noise, changed.theta))
+    integrals = (
+        stack.integrals(changed.grams, changed.noise, changed.device)
+        if integrals is None
+        else integrals
+    )
+    return replace(
+        changed,
+        integrals=integrals,
+        plain=_statistics(changed.grams, integrals, changed.noise, changed.theta),
+    )
 
 
-def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray) -> Statistics:
+def _statistics(
+    grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray
+) -> Statistics:
     shares = integrals.shares(grams, noise)
     if integrals.gathered is not None:
         return rescored(integrals.gathered, grams, shares, theta)
@@ -140,20 +189,34 @@ def _statistics(grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise,
     return integrals.gathered
 
 
-def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, windows: Sequence[Window] | None = None) -> Point:
+def linearise(
+    problem: Problem,
+    theta: np.ndarray,
+    start: Noise | None = None,
+    windows: Sequence[Window] | None = None,
+) -> Point:
     """Simulate and linearise at ``theta``, estimate the noise levels, gather.
 
-    ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the model gave there, if it was asked
-    already.
-    """
+    ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
+    model gave there, if it was asked already."""
     sizes, channels = problem.sizes(theta), len(problem.model.channels)
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
     own = with_correlations([windows[i] for i in problem.kept], problem.correlated)
     commands = problem.model.without_commands(sizes, problem.kept) if problem.lost else ()
-    commands = [np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, own)]  # nothing behind replayed samples
-    found = own if not problem.terms else each(lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta), own)
-    found = found if not commands else [_losing(w, c, problem.lost) for w, c in zip(found, commands)]
+    commands = [
+        np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, own)
+    ]  # nothing behind replayed samples
+    found = (
+        own
+        if not problem.terms
+        else each(
+            lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta), own
+        )
+    )
+    found = (
+        found if not commands else [_losing(w, c, problem.lost) for w, c in zip(found, commands)]
+    )
     device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
     first = grams_of(found, floors, channels, device)
     kept = levels.without_outliers(found, first, floors, device)
@@ -162,7 +225,13 @@ def linearise(problem: Problem, theta: np.ndarray, start: Noise | None = None, w
     raw = [again.get(w, gram) for w, gram in enumerate(first)]
     noise, grams = levels.fit(kept, raw, start, device)
     integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
-    about = Linearised(sizes, {i: w if found is own else replace(o, sigma=w.sigma) for i, w, o in zip(problem.kept, kept, own)})
+    about = Linearised(
+        sizes,
+        {
+            i: w if found is own else replace(o, sigma=w.sigma)
+            for i, w, o in zip(problem.kept, kept, own)
+        },
+    )
     said = _statistics(grams, integrals, noise, at)
     return Point(at, kept, grams, noise, said, problem.varies, integrals, about, commands, device)
 
@@ -171,41 +240,65 @@ def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -
     """A window with terms as its last effects, about their sizes at ``theta`` (in floors)."""
     columns = window.latent @ forces(window, terms)
     sizes = theta[-len(terms) :] * [e.floor for e in terms]
-    return replace(window, effects=np.hstack((window.effects, columns)), residual=window.residual - columns @ sizes)
+    return replace(
+        window,
+        effects=np.hstack((window.effects, columns)),
+        residual=window.residual - columns @ sizes,
+    )
 
 
 def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
-    """A window some of whose commands did not come: of each that share, and its deviation among what nobody knows."""
+    """A window some of whose commands did not come: of each that share, and its deviation among
+    what nobody knows.
+    """
     sd = np.append(window.nuisance_sd, np.full(columns.shape[1], np.sqrt(share * (1.0 - share))))
     nuisance = np.hstack((window.nuisance, columns))
-    return replace(window, residual=window.residual - share * columns.sum(1), nuisance=nuisance, nuisance_sd=sd)
+    return replace(
+        window, residual=window.residual - share * columns.sum(1), nuisance=nuisance, nuisance_sd=sd
+    )
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
     """The same of some of its windows, with noise levels estimated from these."""
-    own = {name: [getattr(point, name)[w] for w in windows] for name in ("windows", "grams", "commands") if getattr(point, name)}
-    noise = levels.maximised(own["grams"], levels.only(point.noise, own["grams"], windows), point.device)[0]
+    own = {
+        name: [getattr(point, name)[w] for w in windows]
+        for name in ("windows", "grams", "commands")
+        if getattr(point, name)
+    }
+    noise = levels.maximised(
+        own["grams"], levels.only(point.noise, own["grams"], windows), point.device
+    )[0]
     return regathered(point, noise=noise, **own)
 
 
 def lost(point: Point) -> list[int]:
-    """Numbers of windows that the simulation does not follow, whatever forces act: a crash, a rope that whips beyond prediction.
+    """Numbers of windows that the simulation does not follow, whatever forces act: a crash, a rope
+    that whips beyond prediction.
 
-    What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is lost, but something is missing.
-    """
+    What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
+    lost, but something is missing."""
     shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
-    misfit = [(own.square - log_det) / max(gram.count.sum(), 1.0) for own, log_det, gram in zip(shares, log_dets, point.grams)]
+    misfit = [
+        (own.square - log_det) / max(gram.count.sum(), 1.0)
+        for own, log_det, gram in zip(shares, log_dets, point.grams)
+    ]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
-    most = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)  # what an unknown motion does is no effect's doing
+    most = min(
+        (1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO
+    )  # what an unknown motion does is no effect's doing
     far = np.flatnonzero(np.array(misfit) > np.where(shaken, most, UNKNOWN_RATIO))
     return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
 
 
 def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
-    """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the simulation fails there."""
+    """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the
+    simulation fails there.
+    """
     kinds = problem.switches
     about = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
-    own = len(problem.model.effects)  # a term's column stays that of the place where derivatives were taken
+    own = len(
+        problem.model.effects
+    )  # a term's column stays that of the place where derivatives were taken
     sizes, change = problem.priors.floor * theta, problem.priors.floor * (theta - point.theta)
     if (flown := problem.flown(theta)) is not None:
         found = flown.residuals(problem.sizes(theta), about)
@@ -214,37 +307,63 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
         residuals = [w.residual - w.effects[:, own:] @ change[own:] for w in point.windows]
     else:
         found = problem.model.residuals(problem.sizes(theta), about)
-        residuals = [found[i] - w.effects[:, own:] @ sizes[own:] for i, w in zip(problem.kept, point.windows)]
-        residuals = [r - problem.lost * c.sum(1) for r, c in zip(residuals, point.commands)] if point.commands else residuals
+        residuals = [
+            found[i] - w.effects[:, own:] @ sizes[own:] for i, w in zip(problem.kept, point.windows)
+        ]
+        residuals = (
+            [r - problem.lost * c.sum(1) for r, c in zip(residuals, point.commands)]
+            if point.commands
+            else residuals
+        )
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
-    grams = with_residuals(point.grams, point.windows, problem.priors.floor, residuals, point.device)
-    return regathered(point, point.integrals, theta=np.array(theta, dtype=float), windows=windows, grams=grams, about=about)
+    grams = with_residuals(
+        point.grams, point.windows, problem.priors.floor, residuals, point.device
+    )
+    return regathered(
+        point,
+        point.integrals,
+        theta=np.array(theta, dtype=float),
+        windows=windows,
+        grams=grams,
+        about=about,
+    )
 
 
-def advantage(priors: Priors, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]], switches: np.ndarray) -> float:
-    """Nats by which the first set of effects is ahead, each set at whichever of both points suits it better.
+def advantage(
+    priors: Priors,
+    first: tuple[Point, Sequence[int]],
+    second: tuple[Point, Sequence[int]],
+    switches: np.ndarray,
+) -> float:
+    """Nats by which the first set of effects is ahead, each set at whichever of both points suits
+    it better.
 
-    The noise levels of a point were estimated without the floors; a set may do better with the levels of another set. Between
-    points that fly different kinds of blocks there is no such choice: neither's derivatives hold for the other.
-    ``switches``: which effects are another kind of block, shape (K,), bool.
-    """
+    The noise levels of a point were estimated without the floors; a set may do better with the
+    levels of another set. Between points that fly different kinds of blocks there is no such
+    choice: neither's derivatives hold for the other. ``switches``: which effects are another kind
+    of block, shape (K,), bool."""
     points = first[0], second[0]
     if not np.array_equal(*(point.theta[switches] != 0.0 for point in points)):
         return first[0].evidence(priors, first[1]) - second[0].evidence(priors, second[1])
-    ahead, behind = (max(point.evidence(priors, active) for point in points) for active in (first[1], second[1]))
+    ahead, behind = (
+        max(point.evidence(priors, active) for point in points) for active in (first[1], second[1])
+    )
     return ahead - behind
 
 
 def bend(problem: Problem, origin: Point, there: Point, active: Sequence[int]) -> np.ndarray:
-    """What the simulation's distance from its linearisation would be taken for: sizes of all effects, in floors, shape (K,).
+    """What the simulation's distance from its linearisation would be taken for: sizes of all
+    effects, in floors, shape (K,).
 
-    ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same derivatives; ``active``: effects that
-    are named.
-    """
+    ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same
+    derivatives; ``active``: effects that are named."""
     change = problem.priors.floor * (there.theta - origin.theta)
-    bent = [new.residual - (old.residual - old.effects @ change) for old, new in zip(origin.windows, there.windows)]
+    bent = [
+        new.residual - (old.residual - old.effects @ change)
+        for old, new in zip(origin.windows, there.windows)
+    ]
     grams = with_residuals(there.grams, there.windows, problem.priors.floor, bent, there.device)
     total = sum(share.score for share in there.integrals.shares(grams, there.noise))
     return covariance(there.information, problem.priors.deviation(list(active))) @ total
@@ -263,30 +382,36 @@ def with_fitted_noise(point: Point) -> Point:
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     """The same with the noise levels that remain when every effect may have its linear estimate.
 
-    A large missing effect is taken for noise as long as it is not named; these levels show what may be hidden under it.
-    """
+    A large missing effect is taken for noise as long as it is not named; these levels show what may
+    be hidden under it."""
     visible = np.flatnonzero(problem.priors.visible)
     return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
 
 
 def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
-    """The same with the noise levels that remain when every effect has its most probable size, those not named below their floors.
+    """The same with the noise levels that remain when every effect has its most probable size,
+    those not named below their floors.
 
-    What a dozen effects below their floors leave is no gust, but it is nothing that is missing either; nor is what an effect
-    that varies has of its own in each flight.
-    ``point``: whose derivatives and residuals are taken.
-    """
+    What a dozen effects below their floors leave is no gust, but it is nothing that is missing
+    either; nor is what an effect that varies has of its own in each flight. ``point``: whose
+    derivatives and residuals are taken."""
     theta = covariance(point.information, problem.priors.deviation(list(active))) @ point.score
     return _with_noise_at(point, theta, own_shares(point.plain, theta, point.varies))
 
 
 def with_varying(point: Point, varies: Varies) -> Point:
-    """The same in which other effects differ from flight to flight, with the noise levels that this leaves."""
-    return _with_noise_at(replace(point, varies=varies), point.theta, own_shares(point.plain, point.theta, varies))
+    """The same in which other effects differ from flight to flight, with the noise levels that this
+    leaves.
+    """
+    return _with_noise_at(
+        replace(point, varies=varies), point.theta, own_shares(point.plain, point.theta, varies)
+    )
 
 
 def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = None) -> Point:
-    """The same with noise levels estimated from the residuals at ``theta``, and each flight's ``own`` beside it, shape (F, K)."""
+    """The same with noise levels estimated from the residuals at ``theta``, and each flight's
+    ``own`` beside it, shape (F, K).
+    """
     at = np.tile(theta - point.theta, (len(point.plain.flights), 1)) + (0.0 if own is None else own)
     row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
     moves = [at[row[window.flight]] for window in point.windows]
@@ -303,12 +428,17 @@ def shifted(gram: Gram, change: np.ndarray) -> Gram:
 
 
 def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
-    """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step that does not help is halved.
+    """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step
+    that does not help is halved.
 
-    ``point``: where the derivatives were taken; ``active``: effects that may move; all others go to 0.
-    """
+    ``point``: where the derivatives were taken; ``active``: effects that may move; all others go to
+    0."""
     inside = np.isin(np.arange(len(point.theta)), list(active))
-    best = point if np.all(point.theta[~inside] == 0.0) else moved(problem, point, np.where(inside, point.theta, 0.0))
+    best = (
+        point
+        if np.all(point.theta[~inside] == 0.0)
+        else moved(problem, point, np.where(inside, point.theta, 0.0))
+    )
     if best is None:
         return point
     for _ in range(ROUNDS):
@@ -324,7 +454,9 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
 
 
 def to_gain(problem: Problem, point: Point, active: Sequence[int]) -> float:
-    """Nats that another step of these effects' sizes would bring by the derivatives, no block turned into another."""
+    """Nats that another step of these effects' sizes would bring by the derivatives, no block
+    turned into another.
+    """
     left = estimate(point.information, point.score, problem.priors, active) - point.theta
     left[problem.switches] = 0.0
     return float(0.5 * left @ point.information @ left)
@@ -347,7 +479,8 @@ def _misfit(problem: Problem, point: Point) -> float:
 
 
 def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
-    """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first goes over to the sizes.
+    """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first
+    goes over to the sizes.
 
     ``point``: whose derivatives and noise levels it begins with.
     """
@@ -363,7 +496,9 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
 
 
 def candidates(problem: Problem, point: Point, sets: Sequence[Sequence[int]]) -> list[Point]:
-    """The same of several sets: side by side where they wait for a GPU, but for those that turn on another kind of block."""
+    """The same of several sets: side by side where they wait for a GPU, but for those that turn on
+    another kind of block.
+    """
     if point.device == "cpu":
         return [candidate(problem, point, active) for active in sets]
     turned = [i for i, active in enumerate(sets) if _off(problem, point, active)]

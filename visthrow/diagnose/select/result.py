@@ -1,4 +1,7 @@
-"""What a diagnosis says: one verdict for every effect, one overall, and the way that led there. Plain data, ready for JSON."""
+"""What a diagnosis says: one verdict for every effect, one overall, and the way that led there.
+
+Plain data, ready for JSON.
+"""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -14,7 +17,10 @@ NOT_IDENTIFIABLE, UNOBSERVABLE = "NOT IDENTIFIABLE", "UNOBSERVABLE"
 VERDICTS = {
     FOUND: "the model lacks it, and nothing else in the catalogue says the same",
     CLASS: "this or one of its partners; these flights cannot tell which",
-    CANDIDATE: "the flights ask for it, but held-out flights do not confirm it, or not all searches name it",
+    CANDIDATE: (
+        "the flights ask for it, but held-out flights do not confirm it, or not all searches"
+        " name it"
+    ),
     BOUNDED: "if it is there, then within these limits",
     NOT_IDENTIFIABLE: "these flights say hardly more than was known before",
     UNOBSERVABLE: "a channel is missing that would show it",
@@ -26,7 +32,10 @@ INCONSISTENT, OUT_OF_DOMAIN = "DATA INCONSISTENT", "OUT OF DOMAIN"
 OVERALL = {
     NO_EFFECT: "the model explains the flights",
     KNOWN: "the causes named explain the flights",
-    IN_PART: "the causes named explain a part of the flights, as held-out ones confirm; more is left than noise",
+    IN_PART: (
+        "the causes named explain a part of the flights, as held-out ones confirm; more is left"
+        " than noise"
+    ),
     UNKNOWN: "something is missing that no cause of the catalogue is shown to explain",
     INCONSISTENT: "the channels do not belong together; no cause can be named",
     OUT_OF_DOMAIN: "the simulation cannot follow these flights; no cause can be named",
@@ -43,7 +52,9 @@ class Finding:
     cause: str
     equation: str
     unit: str
-    estimate: float  # size with all other effects free below their floors; of a class's member if it is the cause; else 0 [unit]
+    # size with all other effects free below their floors; of a class's member if it is the cause;
+    # else 0 [unit]
+    estimate: float
     sd: float  # likewise, and what numerics add [unit]
     low: float  # 95 % interval [unit]
     high: float
@@ -58,7 +69,9 @@ class Finding:
 
 @dataclass(frozen=True)
 class Step:
-    """One addition of the search, of one cause or of several at once, or an exchange of all names for a set that says more."""
+    """One addition of the search, of one cause or of several at once, or an exchange of all names
+    for a set that says more.
+    """
 
     named: str  # names of a set with commas between them
     nats: float  # against what was named before
@@ -92,7 +105,9 @@ class Law:
     sd: float
     unit: str
     nats: float  # of evidence, less the log of the number of terms tried
-    covariance: tuple[float, ...] = ()  # of its coefficient with those of all laws of its explanation, in their order
+    covariance: tuple[
+        float, ...
+    ] = ()  # of its coefficient with those of all laws of its explanation, in their order
 
 
 @dataclass(frozen=True)
@@ -108,48 +123,70 @@ class ChannelGain:
     gain: float  # 1 - after / before
     low: float  # 95 % interval of the gain, by bootstrap over flights
     high: float
-    horizons: tuple[tuple[float, float, float, float], ...]  # horizon [s], before, after, floor, in sigmas
+    horizons: tuple[
+        tuple[float, float, float, float], ...
+    ]  # horizon [s], before, after, floor, in sigmas
 
 
 @dataclass(frozen=True)
 class HeldOut:
     """What held-out flights say of a set of names."""
 
-    share: float  # what the names brought there, of the nats that they promise: 1 as promised, 0 nothing
+    # what the names brought there, of the nats that they promise: 1 as promised, 0 nothing
+    share: float
     low: float  # 95 % interval of the share
     high: float
     channels: tuple[ChannelGain, ...]
-    named_in: Mapping[str, float] = field(default_factory=dict)  # effect -> share of folds that named it
+    named_in: Mapping[str, float] = field(
+        default_factory=dict
+    )  # effect -> share of folds that named it
     folds: int = 0
     left_out: str = "flights"  # or "parts of flights"
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer. ``work`` holds what report, gain, plan and blind calculate with, and is not written to JSON."""
+    """The whole answer.
+
+    ``work`` holds what report, gain, plan and blind calculate with, and is not written to JSON.
+    """
 
     overall: str
     block: str  # of an unknown effect, else empty
     reasons: tuple[str, ...]  # for the overall verdict
     findings: tuple[Finding, ...]  # one an effect, in the model's order
-    theta: Mapping[str, float]  # what to set in the model: sizes with which named effects alone, one of each class, explain most
+    theta: Mapping[
+        str, float
+        # what to set in the model: sizes with which named effects alone, one of each class, explain
+        # most
+    ]
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]
     steps: tuple[Step, ...] = ()
-    sets: tuple[tuple[tuple[str, ...], float], ...] = ()  # sets of causes within 3 nats of the best, with their distance
+    sets: tuple[
+        tuple[tuple[str, ...], float], ...
+    ] = ()  # sets of causes within 3 nats of the best, with their distance
     levels: tuple[Level, ...] = ()
     laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
     events: tuple[int, ...] = ()  # flights in which something happened once
-    duplicates: Mapping[int, int] = field(default_factory=dict)  # flight -> the earlier flight that it repeats
-    sensor_scale: Mapping[str, float] = field(default_factory=dict)  # channel -> noise found, in that stated
+    duplicates: Mapping[int, int] = field(
+        default_factory=dict
+    )  # flight -> the earlier flight that it repeats
+    sensor_scale: Mapping[str, float] = field(
+        default_factory=dict
+    )  # channel -> noise found, in that stated
     flights: int = 0
     windows: int = 0
     samples: int = 0
     seconds: float = 0.0
     seed: int = 0
     scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
-    mistakes: tuple[Mistake, ...] = ()  # of the logs' interface, put right before anything was estimated
-    explanations: tuple[tuple[Law, ...], ...] = ()  # terms that belong together, one such set in place of another, best first
+    mistakes: tuple[
+        Mistake, ...
+    ] = ()  # of the logs' interface, put right before anything was estimated
+    explanations: tuple[
+        tuple[Law, ...], ...
+    ] = ()  # terms that belong together, one such set in place of another, best first
     held_out: HeldOut | None = None  # where something was named
     work: Any = field(default=None, repr=False, compare=False)
 

@@ -1,10 +1,12 @@
-"""What varies from flight to flight or from day to day: random effects, each weighed by the same evidence as a name.
+"""What varies from flight to flight or from day to day: random effects, each weighed by the same
+evidence as a name.
 
-A flight, or a day, has its own share of an effect, normal about what all share, with a deviation theta that is looked for. The shares
-are integrated out of the statistics (:func:`freed`), the size that all share may be any that its prior allows, and effects that are
-not named stay below their floors. The evidence of theta against that of none says whether the effect varies, and more evidence for
-shares of days than for shares of flights that it drifts.
-A flight far from the others is simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
+A flight, or a day, has its own share of an effect, normal about what all share, with a deviation
+theta that is looked for. The shares are integrated out of the statistics (:func:`freed`), the size
+that all share may be any that its prior allows, and effects that are not named stay below their
+floors. The evidence of theta against that of none says whether the effect varies, and more evidence
+for shares of days than for shares of flights that it drifts. A flight far from the others is
+simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
 
 Source: Laird and Ware 1982 (random effects).
 """
@@ -17,11 +19,20 @@ from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect, RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, additions, covariance, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import (
+    INEXACT,
+    Priors,
+    additions,
+    covariance,
+    estimate,
+    log_evidence,
+)
 from visthrow.diagnose.likelihood.marginal import Statistics
 
 FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
-FORM = "_by_"  # before these, at the end of the names of effects that differ and are none of the catalogue's random effects
+# before these, at the end of the names of effects that differ and are none of the catalogue's
+# random effects
+FORM = "_by_"
 LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
 REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
 """Deviations that are tried, in their prior's; every which of them, where flights are left out."""
@@ -30,8 +41,9 @@ SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400  # places between them at which a curve is looked at
 CHAIN = 2
-"""More effects that differ, or more names, are a wrong form, which brings one after the other: terms are weighed at once, and in a block
-whose latent forces stay excessive none is told."""
+"""More effects that differ, or more names, are a wrong form, which brings one after the other:
+terms are weighed at once, and in a block whose latent forces stay excessive none is told.
+"""
 
 
 @dataclass(frozen=True)
@@ -57,14 +69,18 @@ class Scatter:
     @property
     def sentence(self) -> str:
         """For people."""
-        size = f"{self.name} = {self.size:.3g} {self.unit} (95 %: {self.low:.3g} to {self.high:.3g})"
+        size = (
+            f"{self.name} = {self.size:.3g} {self.unit} (95 %: {self.low:.3g} to {self.high:.3g})"
+        )
         drifts = "drifts, a value for each day. " if self.by == DAY else ""
         return f"{drifts}{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} {self.by}s."
 
 
 @dataclass(frozen=True)
 class Varies:
-    """Effects that have shares of their own: by the effect's number, the deviation of the shares in its floor."""
+    """Effects that have shares of their own: by the effect's number, the deviation of the shares in
+    its floor.
+    """
 
     days: Sequence[int] = ()  # of each flight, by its number; none where nobody told
     flights: Mapping[int, float] = field(default_factory=dict)  # shares of flights
@@ -80,25 +96,39 @@ class Varies:
 
     @property
     def by_flight(self) -> "Varies":
-        """The same as if every flight were a day: of days of which only some flights are looked at."""
+        """The same as if every flight were a day: of days of which only some flights
+        are looked at.
+        """
         return Varies((), self.effects)
 
     def also(self, at: Sequence[int], size: Mapping[int, float], by: str = FLIGHT) -> "Varies":
         """The same with shares of more effects."""
         new = {j: size[j] for j in at}
-        return replace(self, drifts={**self.drifts, **new}) if by == DAY else replace(self, flights={**self.flights, **new})
+        return (
+            replace(self, drifts={**self.drifts, **new})
+            if by == DAY
+            else replace(self, flights={**self.flights, **new})
+        )
 
     def levels(self, statistics: Statistics) -> tuple[str, ...]:
-        """What may have shares: days too, where there are enough of them, each of several flights."""
+        """What may have shares: days too, where there are enough of them, each of
+        several flights.
+        """
         days = {self.days[f] for f in statistics.flights.tolist()} if self.days else ()
         return (FLIGHT, DAY) if LEAST_FLIGHTS <= len(days) < len(statistics.flights) else (FLIGHT,)
 
 
 def varying(
-    statistics: Statistics, theta: np.ndarray, priors: Priors, names: Sequence[str], least: float,
-    again: Callable[[np.ndarray], Statistics | None] | None = None, others: Sequence[RandomEffect] = (), active: Sequence[int] = (),
+    statistics: Statistics,
+    theta: np.ndarray,
+    priors: Priors,
+    names: Sequence[str],
+    least: float,
+    again: Callable[[np.ndarray], Statistics | None] | None = None,
+    others: Sequence[RandomEffect] = (),
+    active: Sequence[int] = (),
     days: Sequence[int] = (),
-) -> tuple[Scatter, ...]:  # fmt: skip
+) -> tuple[Scatter, ...]:
     """Verdicts on everything that may vary among these flights.
 
     Args:
@@ -111,14 +141,32 @@ def varying(
     """
     known, told, drawn = list(names), {}, Varies(days)
     may_vary = [*(v for v in random_effects() if v.of), *others]
-    at = {v.name: [j for name in v.of if name in known and priors.visible[j := known.index(name)]] for v in may_vary}
-    price = {v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary}  # of all effects, one varies more by chance
+    at = {
+        v.name: [j for name in v.of if name in known and priors.visible[j := known.index(name)]]
+        for v in may_vary
+    }
+    price = {
+        v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary
+    }  # of all effects, one varies more by chance
     for _ in range(CHAIN + 1):
         given = priors, drawn, active
         likely = _likely(freed(statistics, drawn), priors, active, least) if others else ()
-        free = [v for v in may_vary if not (v.name in told and told[v.name].found) and (v not in others or likely[at[v.name]].any())]
-        new = {v: s for v in free if (s := _verdict(v, statistics, at[v.name], price[v], *given)) is not None}
-        found = [v for v, s in new.items() if s.found and not _one_alone(v, statistics, at[v.name], *given)]
+        free = [
+            v
+            for v in may_vary
+            if not (v.name in told and told[v.name].found)
+            and (v not in others or likely[at[v.name]].any())
+        ]
+        new = {
+            v: s
+            for v in free
+            if (s := _verdict(v, statistics, at[v.name], price[v], *given)) is not None
+        }
+        found = [
+            v
+            for v, s in new.items()
+            if s.found and not _one_alone(v, statistics, at[v.name], *given)
+        ]
         told |= {v.name: replace(s, found=False) for v, s in new.items() if v not in others}
         best = max(found, key=lambda v: new[v].nats, default=None)
         if best is None:
@@ -130,24 +178,46 @@ def varying(
             if not told[best.name].found:
                 break
         drawn = drawn.also(at[best.name], told[best.name].size / priors.floor, told[best.name].by)
-    own = {v.name for v in others}  # whose names say what has the shares: the catalogue's random effects need no such
-    return tuple(replace(s, name=f"{s.name}{FORM}{s.by}") if s.name in own else s for s in told.values())
+    own = {
+        v.name for v in others
+    }  # whose names say what has the shares: the catalogue's random effects need no such
+    return tuple(
+        replace(s, name=f"{s.name}{FORM}{s.by}") if s.name in own else s for s in told.values()
+    )
 
 
 def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
-    """Every effect as one that differs from flight to flight, but for those of the catalogue's random effects."""
+    """Every effect as one that differs from flight to flight, but for those of the catalogue's
+    random effects.
+    """
     known = {name for v in random_effects() for name in v.of}
     return tuple(
-        RandomEffect(e.name, f"{e.cause}, now more, now less", f"{e.name} ~ N({e.name}, theta^2) in each flight",
-                     (e.name,), e.unit, e.block, e.prior_sd, e.floor, e.source, manoeuvres=tuple(e.manoeuvres))
-        for e in effects if e.name not in known
-    )  # fmt: skip
+        RandomEffect(
+            e.name,
+            f"{e.cause}, now more, now less",
+            f"{e.name} ~ N({e.name}, theta^2) in each flight",
+            (e.name,),
+            e.unit,
+            e.block,
+            e.prior_sd,
+            e.floor,
+            e.source,
+            manoeuvres=tuple(e.manoeuvres),
+        )
+        for e in effects
+        if e.name not in known
+    )
 
 
 def straightened(
-    statistics: Statistics, theta: np.ndarray, priors: Priors, j: int, again: Callable[[np.ndarray], Statistics | None]
+    statistics: Statistics,
+    theta: np.ndarray,
+    priors: Priors,
+    j: int,
+    again: Callable[[np.ndarray], Statistics | None],
 ) -> Statistics:
-    """Statistics whose scores are those about the size of one effect at which each flight fits best by itself.
+    """Statistics whose scores are those about the size of one effect at which each flight fits best
+    by itself.
 
     ``theta``: sizes found, in floors; ``again``: see :func:`varying`.
     """
@@ -157,25 +227,41 @@ def straightened(
     if reach < FAR:
         return statistics
     sizes, found = [], []
-    for size in np.unique(np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j]) - theta[j]):
+    for size in np.unique(
+        np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j]) - theta[j]
+    ):
         there = again(np.where(np.arange(len(theta)) == j, theta + size, theta))
         if there is not None:
             sizes, found = [*sizes, size], [*found, there]
     if len(sizes) < len(SIZES) // 2:
         return statistics
     squares = np.array([there.square for there in found])
-    curve, best, scores = CubicSpline(sizes, squares), np.argmin(squares, axis=0), statistics.score.copy()
+    curve, best, scores = (
+        CubicSpline(sizes, squares),
+        np.argmin(squares, axis=0),
+        statistics.score.copy(),
+    )
     for f in np.flatnonzero(own > 0.0):
-        near = np.linspace(sizes[max(best[f] - 1, 0)], sizes[min(best[f] + 1, len(sizes) - 1)], FINE)
+        near = np.linspace(
+            sizes[max(best[f] - 1, 0)], sizes[min(best[f] + 1, len(sizes) - 1)], FINE
+        )
         at = np.where(np.arange(len(theta)) == j, theta + near[np.argmin(curve(near)[:, f])], theta)
         information, left = statistics.information[f], found[best[f]].score[f]
-        scores[f] = left - information[:, j] * left[j] / own[f] + information @ (at - statistics.theta)
+        scores[f] = (
+            left - information[:, j] * left[j] / own[f] + information @ (at - statistics.theta)
+        )
     return replace(statistics, score=scores)
 
 
-def _likely(statistics: Statistics, priors: Priors, active: Sequence[int], least: float) -> np.ndarray:
-    """Which effects may vary by more than ``least`` nats, as if there were no other that could in their stead, shape (K,)."""
-    theta = covariance(statistics.information.sum(0), priors.deviation(list(active))) @ statistics.absolute.sum(0)
+def _likely(
+    statistics: Statistics, priors: Priors, active: Sequence[int], least: float
+) -> np.ndarray:
+    """Which effects may vary by more than ``least`` nats, as if there were no other that could in
+    their stead, shape (K,).
+    """
+    theta = covariance(
+        statistics.information.sum(0), priors.deviation(list(active))
+    ) @ statistics.absolute.sum(0)
     own = np.maximum(np.diagonal(statistics.information, axis1=1, axis2=2), 1e-12)
     square = (statistics.absolute - statistics.information @ theta) ** 2 / own
     part = own * (REACH[::LOOK, None, None] * priors.slab) ** 2
@@ -183,19 +269,43 @@ def _likely(statistics: Statistics, priors: Priors, active: Sequence[int], least
 
 
 def _verdict(
-    v: RandomEffect, statistics: Statistics, at: Sequence[int], least: float, priors: Priors, drawn: Varies, active: Sequence[int],
-) -> Scatter | None:  # fmt: skip
-    """The verdict on one quantity, at the level that says more; None where too few flights say something of it."""
+    v: RandomEffect,
+    statistics: Statistics,
+    at: Sequence[int],
+    least: float,
+    priors: Priors,
+    drawn: Varies,
+    active: Sequence[int],
+) -> Scatter | None:
+    """The verdict on one quantity, at the level that says more; None where too few flights say
+    something of it.
+    """
     reach, found = REACH * v.prior_sd, []
     for by in drawn.levels(statistics):
         groups = by_day(statistics, drawn.days) if by == DAY else statistics
         seen = np.count_nonzero((groups.information[:, at, at] > 0.0).any(axis=1))
         if seen >= LEAST_FLIGHTS:
-            found.append(judged(v, reach, _ahead(statistics, at, reach, priors, drawn, active, by), least, int(seen), by))
+            found.append(
+                judged(
+                    v,
+                    reach,
+                    _ahead(statistics, at, reach, priors, drawn, active, by),
+                    least,
+                    int(seen),
+                    by,
+                )
+            )
     return max(found, key=lambda s: s.nats, default=None)
 
 
-def judged(v: RandomEffect, reach: np.ndarray, nats: np.ndarray, least: float, flights: int, by: str = FLIGHT) -> Scatter:
+def judged(
+    v: RandomEffect,
+    reach: np.ndarray,
+    nats: np.ndarray,
+    least: float,
+    flights: int,
+    by: str = FLIGHT,
+) -> Scatter:
     """The verdict on a quantity by the evidence of its sizes.
 
     Args:
@@ -208,35 +318,78 @@ def judged(v: RandomEffect, reach: np.ndarray, nats: np.ndarray, least: float, f
     size = np.append(0.0, np.geomspace(reach[0], reach[-1], FINE))
     ahead = CubicSpline(np.log(reach), nats)
     value = np.append(0.0, ahead(np.log(size[1:])))
-    weight = np.gradient(size) * np.sqrt(2.0 / np.pi) / v.prior_sd * np.exp(-0.5 * (size / v.prior_sd) ** 2)
+    weight = (
+        np.gradient(size)
+        * np.sqrt(2.0 / np.pi)
+        / v.prior_sd
+        * np.exp(-0.5 * (size / v.prior_sd) ** 2)
+    )
     best = value.max()
     density = np.exp(value - best) * weight
     share = np.cumsum(density) / density.sum()
     low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
-    nats, most = float(np.log(density.sum()) + best), float(size[np.argmax(density / np.gradient(size))])
-    return Scatter(v.name, v.cause, v.equation, v.block, v.unit, tuple(v.of), nats > least and most > v.floor, most, low, high,
-                   v.floor, nats, flights, v.manoeuvres, by)  # fmt: skip
+    nats, most = (
+        float(np.log(density.sum()) + best),
+        float(size[np.argmax(density / np.gradient(size))]),
+    )
+    return Scatter(
+        v.name,
+        v.cause,
+        v.equation,
+        v.block,
+        v.unit,
+        tuple(v.of),
+        nats > least and most > v.floor,
+        most,
+        low,
+        high,
+        v.floor,
+        nats,
+        flights,
+        v.manoeuvres,
+        by,
+    )
 
 
 def _ahead(
-    statistics: Statistics, at: Sequence[int], sizes: np.ndarray, priors: Priors, drawn: Varies, active: Sequence[int],
+    statistics: Statistics,
+    at: Sequence[int],
+    sizes: np.ndarray,
+    priors: Priors,
+    drawn: Varies,
+    active: Sequence[int],
     by: str = FLIGHT,
-) -> np.ndarray:  # fmt: skip
-    """Nats of deviations of some effects against none, beside what varies already; all flights may share any size of these effects."""
+) -> np.ndarray:
+    """Nats of deviations of some effects against none, beside what varies already; all flights may
+    share any size of these effects.
+    """
     named = sorted({*active, *at})
     nothing = _evidence(freed(statistics, drawn), priors, named)
-    return np.array([_evidence(freed(statistics, drawn.also(at, size / priors.floor, by)), priors, named) - nothing for size in sizes])
+    return np.array(
+        [
+            _evidence(freed(statistics, drawn.also(at, size / priors.floor, by)), priors, named)
+            - nothing
+            for size in sizes
+        ]
+    )
 
 
 def disagreement(
-    statistics: Statistics, priors: Priors, drawn: Varies, active: Sequence[int], j: int, least: float, share: float = INEXACT
+    statistics: Statistics,
+    priors: Priors,
+    drawn: Varies,
+    active: Sequence[int],
+    j: int,
+    least: float,
+    share: float = INEXACT,
 ) -> tuple[int | None] | None:
-    """Whether flights disagree on an effect of a set: shares of their own say more than a floor and a part of the effect's size would.
+    """Whether flights disagree on an effect of a set: shares of their own say more than a floor and
+    a part of the effect's size would.
 
-    ``least``: nats that a finding needs; ``share``: of the effect, by which flights may differ for its form alone.
-    Returns the flight that alone disagrees, or None in its place where all do; None where they agree, too few can say, or other effects
-    that are still missing may be why they differ.
-    """
+    ``least``: nats that a finding needs; ``share``: of the effect, by which flights may differ for
+    its form alone. Returns the flight that alone disagrees, or None in its place where all do; None
+    where they agree, too few can say, or other effects that are still missing may be why they
+    differ."""
     if np.count_nonzero(statistics.information[:, j, j] > 0.0) < LEAST_FLIGHTS:
         return None
 
@@ -244,11 +397,15 @@ def disagreement(
         left = freed(statistics, drawn)
         size = estimate(left.information.sum(0), left.absolute.sum(0), priors, active)[j]
         least_sd = max(allowed(size, share), drawn.effects.get(j, 0.0))
-        reach = least_sd * np.geomspace(1.0, max(REACH[-1] * priors.slab[j] / least_sd, 2.0), len(REACH[::LOOK]))
+        reach = least_sd * np.geomspace(
+            1.0, max(REACH[-1] * priors.slab[j] / least_sd, 2.0), len(REACH[::LOOK])
+        )
         nats = _ahead(statistics, [j], reach * priors.floor[j], priors, drawn, active)
         return bool(nats.max() - nats[0] > least)
 
-    if not all(apart(statistics, named) for named in (active, np.flatnonzero(priors.visible).tolist())):
+    if not all(
+        apart(statistics, named) for named in (active, np.flatnonzero(priors.visible).tolist())
+    ):
         return None
     rest = [k for k in active if k != j]
     for f in range(len(statistics.flights)):
@@ -261,23 +418,32 @@ def disagreement(
 
 
 def allowed(size: np.ndarray | float, share: float = INEXACT) -> np.ndarray | float:
-    """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in floors."""
+    """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
+    floors.
+    """
     return np.hypot(1.0, share * size)
 
 
-def differences(statistics: Statistics, priors: Priors, active: Sequence[int], theta: np.ndarray) -> np.ndarray:
-    """Variance that differences among flights add to the estimates of effects, in that which is :func:`allowed`, shape (K,).
+def differences(
+    statistics: Statistics, priors: Priors, active: Sequence[int], theta: np.ndarray
+) -> np.ndarray:
+    """Variance that differences among flights add to the estimates of effects, in that which is
+    :func:`allowed`, shape (K,).
 
-    In each flight a name may have a share of its own, whose deviation is u times what is allowed. What the flights say of u, which is
-    half normal before, is integrated over: one flight alone says nothing of it, and many that agree leave little. Where nothing is
-    named, nothing is added.
+    In each flight a name may have a share of its own, whose deviation is u times what is allowed.
+    What the flights say of u, which is half normal before, is integrated over: one flight alone
+    says nothing of it, and many that agree leave little. Where nothing is named, nothing is added.
     ``theta``: their sizes, in floors.
 
     Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
     """
     own = statistics.information.diagonal(axis1=1, axis2=2)
-    alone = ((own / np.maximum(own.sum(0), 1e-300)) ** 2).sum(0)  # 1 for one flight, 1 / F for F that say as much
-    apart = [freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH]
+    alone = ((own / np.maximum(own.sum(0), 1e-300)) ** 2).sum(
+        0
+    )  # 1 for one flight, 1 / F for F that say as much
+    apart = [
+        freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH
+    ]
     value = np.array([_evidence(each, priors, active) for each in apart])
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
     return weight @ REACH**2 / weight.sum() * alone * bool(active)
@@ -291,11 +457,15 @@ def _evidence(statistics: Statistics, priors: Priors, named: Sequence[int]) -> f
 def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *given) -> bool:
     """Whether it is one flight alone that differs: that is an event there."""
     flights = np.arange(len(statistics.flights))
-    return any(_ahead(statistics.only(flights != f), at, REACH[::LOOK] * v.prior_sd, *given).max() <= 0.0 for f in flights)
+    return any(
+        _ahead(statistics.only(flights != f), at, REACH[::LOOK] * v.prior_sd, *given).max() <= 0.0
+        for f in flights
+    )
 
 
 def freed(statistics: Statistics, varies: Varies) -> Statistics:
-    """Statistics of what flights, or days, share: the shares that each has of its own are integrated out.
+    """Statistics of what flights, or days, share: the shares that each has of its own are
+    integrated out.
 
     ``varies``: effects that have such shares. Where days have some, what is returned is of days.
     """
@@ -306,10 +476,11 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
 def freed_beside(
     own: np.ndarray, score: np.ndarray, cross: np.ndarray, statistics: Statistics, varies: Varies
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of candidates that are no effects yet, each alone beside the effects, summed over flights.
+    """The same of candidates that are no effects yet, each alone beside the effects, summed over
+    flights.
 
-    ``own``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``: information with the effects, shape (F, T, K).
-    """
+    ``own``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``:
+    information with the effects, shape (F, T, K)."""
     rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
     for shares in (varies.flights, varies.drifts):
         if shares is varies.drifts and shares:
@@ -334,13 +505,19 @@ def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
     names, member = _members(statistics, days)
     return replace(
-        statistics, flights=names, information=np.tensordot(member, statistics.information, 1), score=member @ statistics.score,
-        square=member @ statistics.square, samples=member @ statistics.samples,
-    )  # fmt: skip
+        statistics,
+        flights=names,
+        information=np.tensordot(member, statistics.information, 1),
+        score=member @ statistics.score,
+        square=member @ statistics.square,
+        samples=member @ statistics.samples,
+    )
 
 
 def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:
-    """Statistics without the shares that each row has of some effects; ``deviation`` is theirs, in floors."""
+    """Statistics without the shares that each row has of some effects; ``deviation`` is theirs, in
+    floors.
+    """
     for j, size in deviation.items():
         column, score = statistics.information[:, :, j], statistics.score
         own = column[:, j]
@@ -356,11 +533,11 @@ def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Stati
 
 
 def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.ndarray:
-    """Most probable share of each flight of the effects that vary, beside the sizes of all, in floors, shape (F, K).
+    """Most probable share of each flight of the effects that vary, beside the sizes of all, in
+    floors, shape (F, K).
 
-    ``theta``: sizes that all flights share, in floors; ``varies``: effects that have shares. Those of days come first, and flights share
-    what is left of them.
-    """
+    ``theta``: sizes that all flights share, in floors; ``varies``: effects that have shares. Those
+    of days come first, and flights share what is left of them."""
     at = np.tile(theta, (len(statistics.flights), 1))
     if varies.drifts:
         left = by_day(_integrated(statistics, varies.flights), varies.days)
@@ -369,25 +546,38 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
     return at + _shares(statistics, at, varies.flights) - theta
 
 
-def _shares(statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]) -> np.ndarray:
+def _shares(
+    statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]
+) -> np.ndarray:
     """Most probable shares of each row, beside its sizes ``theta`` (F, K)."""
     own, at = np.zeros(statistics.score.shape), list(deviation)
     if at:
-        left = (statistics.score - np.einsum("fij,fj->fi", statistics.information, theta - statistics.theta))[:, at]
-        inside = statistics.information[:, at][:, :, at] + np.diag([size**-2.0 for size in deviation.values()])
+        left = (
+            statistics.score
+            - np.einsum("fij,fj->fi", statistics.information, theta - statistics.theta)
+        )[:, at]
+        inside = statistics.information[:, at][:, :, at] + np.diag(
+            [size**-2.0 for size in deviation.values()]
+        )
         own[:, at] = np.linalg.solve(inside, left[..., None])[..., 0]
     return own
 
 
-def deviations(scatter: Sequence[Scatter], priors: Priors, names: Sequence[str], days: Sequence[int]) -> Varies:
+def deviations(
+    scatter: Sequence[Scatter], priors: Priors, names: Sequence[str], days: Sequence[int]
+) -> Varies:
     """What was found to vary, of effects of these names; ``days`` are the flights'."""
     known, found = list(names), Varies(days)
     for s in scatter:
         if s.found:
-            found = found.also([known.index(name) for name in s.of if name in known], s.size / priors.floor, s.by)
+            found = found.also(
+                [known.index(name) for name in s.of if name in known], s.size / priors.floor, s.by
+            )
     return found
 
 
 def variances(scatter: Sequence[Mapping]) -> dict[str, float]:
-    """Variance of each effect among flights, from the scatter that a diagnosis' JSON tells was found."""
+    """Variance of each effect among flights, from the scatter that a diagnosis' JSON tells was
+    found.
+    """
     return {name: float(s["size"]) ** 2 for s in scatter if s["found"] for name in s["of"]}

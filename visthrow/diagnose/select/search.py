@@ -23,14 +23,19 @@ from visthrow.logs.flightlog import FlightLog
 
 
 def explain(
-    model: Model, *, seed: int = 0, without: Sequence[int] = (), laws: bool = True, progress: Callable[[str], None] | None = None
+    model: Model,
+    *,
+    seed: int = 0,
+    without: Sequence[int] = (),
+    laws: bool = True,
+    progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Say what the model gets wrong about its flights.
 
-    ``model``: a simulation of measured flights with its catalogue of effects; ``seed``: of the null worlds that the threshold is calibrated
-    on; ``laws``: whether to look for laws outside the catalogue where it does not suffice. Returns one verdict for every effect, and one
-    overall. Raises DiagnoseError: the model gives no window, or contradicts itself.
-    """
+    ``model``: a simulation of measured flights with its catalogue of effects; ``seed``: of the null
+    worlds that the threshold is calibrated on; ``laws``: whether to look for laws outside the
+    catalogue where it does not suffice. Returns one verdict for every effect, and one overall.
+    Raises DiagnoseError: the model gives no window, or contradicts itself."""
     begun, say = time.monotonic(), progress or (lambda _: None)
     keep()
     windows = model.windows({})
@@ -43,7 +48,10 @@ def explain(
     problem = Problem.of(model, windows, kept)
     priors = problem.priors
     for c, own in problem.correlated.items():
-        say(f"noise of {model.channels[c]} is correlated over {1e3 * own.time:.0f} ms, for {own.share:.1%} of its variance")
+        say(
+            f"noise of {model.channels[c]} is correlated over {1e3 * own.time:.0f} ms, for"
+            f" {own.share:.1%} of its variance"
+        )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     for _ in range(ROUNDS):  # the worst hide others
         if not (gone := lost(nominal)):
@@ -51,7 +59,9 @@ def explain(
         problem, nominal = _left_out(problem, nominal, gone, say)
     least = _least(nominal, priors, seed, say)
     search = Selector(problem, nominal, least, say, laws)
-    for further in range(ROUNDS - 1, -1, -1):  # where the causes are in the simulation, it may lose windows that it followed without
+    for further in range(
+        ROUNDS - 1, -1, -1
+    ):  # where the causes are in the simulation, it may lose windows that it followed without
         search.run(follow=not further)
         gone = lost(search.point) if further and not search.events else []
         if not gone:
@@ -67,7 +77,8 @@ def explain(
 def put_right(
     logs: Sequence[FlightLog], plant: PlantParams, build: Callable[[Sequence[FlightLog]], Model]
 ) -> tuple[Model, list[FlightLog]]:
-    """A model of logs whose commands are as the simulation takes them: without each suspected mistake that does not earn its price.
+    """A model of logs whose commands are as the simulation takes them: without each suspected
+    mistake that does not earn its price.
 
     ``plant``: that the commands are for; ``build``: makes a model of logs.
     Returns the model, which names what was put right as its ``mistakes``, and its logs.
@@ -98,23 +109,33 @@ def put_right(
 
 
 def ahead(model: Model, other: Model) -> float:
-    """Nats by which a model explains the windows that it shares with another better, nothing named in either."""
+    """Nats by which a model explains the windows that it shares with another better, nothing named
+    in either.
+    """
     windows = [m.windows({}) for m in (model, other)]
-    at = [{(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(own) if finite(w)} for own in windows]
+    at = [
+        {(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(own) if finite(w)}
+        for own in windows
+    ]
     shared = sorted(at[0].keys() & at[1].keys())
     if 2 * len(at[1]) < len(windows[1]) or not shared:  # the other fails in most
         return np.inf if 2 * len(at[0]) >= len(windows[0]) else -np.inf
     value = []
     for m, own, number in zip((model, other), windows, at):
         problem = Problem.of(m, own, [number[key] for key in shared])
-        value.append(linearise(problem, np.zeros(len(m.effects)), windows=own).evidence(problem.priors, ()))
+        value.append(
+            linearise(problem, np.zeros(len(m.effects)), windows=own).evidence(problem.priors, ())
+        )
     return value[0] - value[1]
 
 
 def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:
     """The threshold [nats]."""
     least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
-    say(f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights; a cause needs {least:.1f} nats")
+    say(
+        f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights; a cause needs"
+        f" {least:.1f} nats"
+    )
     return least
 
 

@@ -1,8 +1,10 @@
-"""The selector: one loop that adds, drops, exchanges and pairs candidates until set and sizes repeat.
+"""The selector: one loop that adds, drops, exchanges and pairs candidates until set and sizes
+repeat.
 
-A candidate is a column of the linearised model with a prior and a price: an effect, another kind of block, a term of a law (see
-:mod:`visthrow.diagnose.select.terms`). The value of a set is its marginal likelihood less what its names cost. Moves are listed by batched
-evidence; the simulation is run again where they lead, and the set that is worth most there is kept.
+A candidate is a column of the linearised model with a prior and a price: an effect, another kind of
+block, a term of a law (see :mod:`visthrow.diagnose.select.terms`). The value of a set is its
+marginal likelihood less what its names cost. Moves are listed by batched evidence; the simulation
+is run again where they lead, and the set that is worth most there is kept.
 
 Source: stepwise selection with exchanges (Fedorov 1972; Miller 2002) by marginal likelihood.
 """
@@ -13,7 +15,14 @@ from itertools import combinations
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import INEXACT, STRONG, additions, estimate, log_evidence, pair_additions
+from visthrow.diagnose.likelihood.evidence import (
+    INEXACT,
+    STRONG,
+    additions,
+    estimate,
+    log_evidence,
+    pair_additions,
+)
 from visthrow.diagnose.select import dropped, terms
 from visthrow.diagnose.select.excess import compares_phases, levels
 from visthrow.diagnose.select.point import (
@@ -35,17 +44,25 @@ from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
 from visthrow.diagnose.select.state import Move, SearchState
 
 MOST_NAMES = 3 * CHAIN  # a longer list of causes is a wrong form, not a finding
-SHORTLIST = 3  # sets of a kind whose simulation is run again in each round, of exchanges twice as many
+SHORTLIST = (
+    3  # sets of a kind whose simulation is run again in each round, of exchanges twice as many
+)
 
 DOUBT = 15.0
-"""Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to ``STRONG`` it counts as possible."""
+"""Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to
+``STRONG`` it counts as possible.
+"""
 
-AHEAD = 1.0  # nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and Raftery 1995)
+# nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and
+# Raftery 1995)
+AHEAD = 1.0
 SHOWN = 10  # sets that a step keeps for the report
 
 HOPELESS = 0.5
-"""Of what the best or what stands there brings, by the linear statistics, that another must bring to be simulated. Of three laws that
-the catalogue does not hold the true term brought 1.9, 7 and 107 times as much as the names that stood for it."""
+"""Of what the best or what stands there brings, by the linear statistics, that another must bring
+to be simulated. Of three laws that the catalogue does not hold the true term brought 1.9, 7 and 107
+times as much as the names that stood for it.
+"""
 
 
 class Selector(SearchState):
@@ -54,16 +71,17 @@ class Selector(SearchState):
     def run(self, follow: bool = True) -> None:
         """Move until nothing is worth more.
 
-        ``follow``: go on also where the simulation loses windows with the names that were found; else it ends there, and they may be
-        left out.
-        """
+        ``follow``: go on also where the simulation loses windows with the names that were found;
+        else it ends there, and they may be left out."""
         if self.point is None:
             self.point = self.origin = self.nominal
         while True:
             self.visited.add(frozenset(self.active))
             if self._drop():
                 continue
-            if self.terms:  # names that were there before may not be needed any more, and what its form leaves over is no cause
+            # names that were there before may not be needed any more, and what its form leaves over
+            # is no cause
+            if self.terms:
                 if self._exchange() or self._propose():
                     continue
                 return
@@ -80,7 +98,9 @@ class Selector(SearchState):
             return
 
     def _loses(self) -> bool:
-        """Whether the simulation follows some windows no more, and no flight was left out for it."""
+        """Whether the simulation follows some windows no more, and no flight was left
+        out for it.
+        """
         return not self.events and bool(lost(self.point))
 
     def _usable(self) -> np.ndarray:
@@ -94,16 +114,26 @@ class Selector(SearchState):
         """Add the best candidate; False where none is good enough."""
         free, usable = with_all_effects_noise(self.problem, self.point), self._usable()
         screened, under_free = (self._additions(point, usable) for point in (self.point, free))
-        worth = self.least - STRONG * ~self.problem.switches  # columns of other kinds of blocks are differences of simulations already
+        worth = (
+            self.least - STRONG * ~self.problem.switches
+        )  # columns of other kinds of blocks are differences of simulations already
         hope = np.maximum(worth, HOPELESS * under_free.max())
-        best = [(gain, least, usable[np.argsort(-gain[usable])][:SHORTLIST]) for gain, least in ((under_free, hope), (screened, worth))]
-        short = list(dict.fromkeys(int(j) for gain, least, own in best for j in own if gain[j] > least[j]))
+        best = [
+            (gain, least, usable[np.argsort(-gain[usable])][:SHORTLIST])
+            for gain, least in ((under_free, hope), (screened, worth))
+        ]
+        short = list(
+            dict.fromkeys(int(j) for gain, least, own in best for j in own if gain[j] > least[j])
+        )
         if not short:
             return False
         alike = self._alike(short[int(np.argmax(under_free[short]))])
         short += [j for j in alike if np.isfinite(screened[j]) and j not in short]
         short = [j for j in short if frozenset([*self.active, j]) not in self.visited]
-        listed = {(*self.active, j): float(max(screened[j], under_free[j])) for j in np.argsort(-under_free)[:SHOWN].tolist()}
+        listed = {
+            (*self.active, j): float(max(screened[j], under_free[j]))
+            for j in np.argsort(-under_free)[:SHOWN].tolist()
+        }
         several = self._several(free, usable)
         for move in several:
             listed[move.active] = self.linear(move.active, free) - self.linear(self.active, free)
@@ -114,25 +144,36 @@ class Selector(SearchState):
             return True
         return bool(tried) and self._closer(max(tried, key=lambda move: move.nats), listed)
 
-    def _additions(self, point: Point, usable: np.ndarray, active: Sequence[int] | None = None) -> np.ndarray:
+    def _additions(
+        self, point: Point, usable: np.ndarray, active: Sequence[int] | None = None
+    ) -> np.ndarray:
         gain = np.full(len(self.priors.floor), -np.inf)
-        gain[usable] = additions(point.information, point.score, self.priors, self.active if active is None else active)[usable]
+        gain[usable] = additions(
+            point.information, point.score, self.priors, self.active if active is None else active
+        )[usable]
         return gain - (self.prices - self.least)
 
     def _several(self, free: Point, usable: np.ndarray) -> list[Move]:
-        """The additions that forward selection comes to, where there are several, simulated at once.
+        """The additions that forward selection comes to, where there are several, simulated at
+        once.
 
-        Those are left out that the distance from the linearisation would be taken for. Where a law may be missing there are none: names
-        take a part of it each. ``free``: the point by whose statistics alone they are selected.
-        """
+        Those are left out that the distance from the linearisation would be taken for. Where a law
+        may be missing there are none: names take a part of it each. ``free``: the point by whose
+        statistics alone they are selected."""
         if self.problem.terms:
             return []
         active, plain = tuple(self.active), usable[~self.problem.switches[usable]]
-        while len(active) < MOST_NAMES and (gain := self._additions(free, plain, active)).max() > self.least:
+        while (
+            len(active) < MOST_NAMES
+            and (gain := self._additions(free, plain, active)).max() > self.least
+        ):
             active = (*active, int(np.argmax(gain)))
         while len(active) > len(self.active) + 1 and frozenset(active) not in self.visited:
-            move, = self._tried(free, [active])
-            sizes, faked = np.abs(move.point.theta), np.abs(bend(self.problem, self.origin, move.point, active))
+            (move,) = self._tried(free, [active])
+            sizes, faked = (
+                np.abs(move.point.theta),
+                np.abs(bend(self.problem, self.origin, move.point, active)),
+            )
             held = tuple(j for j in active if j in self.active or faked[j] <= INEXACT * sizes[j])
             if held == active:
                 return [move]
@@ -140,7 +181,9 @@ class Selector(SearchState):
         return []
 
     def _alike(self, j: int) -> list[int]:
-        """What the catalogue says looks like an effect: where a rope whips, derivatives may promise far too little."""
+        """What the catalogue says looks like an effect: where a rope whips, derivatives may promise
+        far too little.
+        """
         names = self.problem.effects[j].confused_with
         return [k for k in np.flatnonzero(~self.problem.switches).tolist() if self.name(k) in names]
 
@@ -149,10 +192,11 @@ class Selector(SearchState):
         return max(0.0, 0.5 * max(self.refused.values(), default=0.0) - self.least)
 
     def _closer(self, move: Move, listed: Mapping[tuple[int, ...], float]) -> bool:
-        """An addition with derivatives and initial states of its own, where it leads: those of the model as it is may fall short.
+        """An addition with derivatives and initial states of its own, where it leads: those of the
+        model as it is may fall short.
 
-        A rope that whips forgets its initial state within a window; what was fitted for another rope explains nothing.
-        """
+        A rope that whips forgets its initial state within a window; what was fitted for another
+        rope explains nothing."""
         j, origin, point = move.active[-1], self.origin, move.point
         if self.problem.switches[j]:  # it was linearised where it leads already
             return False
@@ -162,20 +206,30 @@ class Selector(SearchState):
             point = fitted(self.problem, linearise(self.problem, goal, point.noise), move.active)
         if self.sure(point, move.active, j):
             point = self.settle(point, move.active, j)
-        alike = candidate(self.problem, point, self.active)  # begins as it does: new states alone are no gain
-        nats = min(self.ahead((point, move.active), other) for other in ((self.point, self.active), (alike, self.active)))
+        alike = candidate(
+            self.problem, point, self.active
+        )  # begins as it does: new states alone are no gain
+        nats = min(
+            self.ahead((point, move.active), other)
+            for other in ((self.point, self.active), (alike, self.active))
+        )
         if self._best([Move(move.active, nats, point)], listed, self._contradicted()):
             return True
         self.origin = origin
         return False
 
     def _drop(self) -> bool:
-        """Drop the name that is worth least, if it is not worth its price or hardly has any size."""
+        """Drop the name that is worth least, if it is not worth its price or hardly has
+        any size.
+        """
         if len(self.active) < 2:
             return False
         worth = self.worth()
         unsure = [j for j in self.active if not self.sure(self.point, self.active, j)]
-        saved = {j: self.price(self.active) - self.price([k for k in self.active if k != j]) for j in self.active}
+        saved = {
+            j: self.price(self.active) - self.price([k for k in self.active if k != j])
+            for j in self.active
+        }
         weakest = min(unsure or worth, key=lambda j: worth[j] - saved[j])
         if worth[weakest] > saved[weakest] and not unsure:
             return False
@@ -189,7 +243,9 @@ class Selector(SearchState):
         return True
 
     def _exchange(self) -> bool:
-        """Simulate all sets that may be worth as much, and go over to the best of them; what is left is possible as well."""
+        """Simulate all sets that may be worth as much, and go over to the best of them; what is
+        left is possible as well.
+        """
         if self.rivalled is self.point:
             return False
         visited = self.visited | {frozenset(self.active)}
@@ -198,7 +254,10 @@ class Selector(SearchState):
         listed = {move.active: move.nats for move in ranked}
         if self._best(tried, listed, AHEAD):
             return True
-        self.sets = [Move(tuple(self.active), 0.0), *(move for move in tried if -STRONG < move.nats <= AHEAD)]
+        self.sets = [
+            Move(tuple(self.active), 0.0),
+            *(move for move in tried if -STRONG < move.nats <= AHEAD),
+        ]
         self.rivalled = self.point
         return False
 
@@ -210,43 +269,75 @@ class Selector(SearchState):
             known = self.point.information, self.point.score, self.priors, rest
             base, alone = self.linear(rest, self.point) - own, additions(*known)
             singles[rest] = base
-            new = usable if len(rest) < len(active) else usable[self.term_columns[usable]]  # other additions were tried already
+            new = (
+                usable if len(rest) < len(active) else usable[self.term_columns[usable]]
+            )  # other additions were tried already
             singles |= {(*rest, k): base + alone[k] - self.prices[k] for k in new.tolist()}
             plain = usable[~self.problem.switches[usable]]
             gain, each = pair_additions(*known)[np.ix_(plain, plain)], alone[plain]
-            reached = np.triu(gain - np.maximum.outer(each, each) > self.least - STRONG)  # worth a name beside the other
+            reached = np.triu(
+                gain - np.maximum.outer(each, each) > self.least - STRONG
+            )  # worth a name beside the other
             gain += base - np.add.outer(self.prices[plain], self.prices[plain])
             near = reached & (gain > (-DOUBT if len(rest) + 2 == len(active) else -STRONG))
-            pairs |= {(*rest, int(plain[a]), int(plain[b])): float(gain[a, b]) for a, b in np.argwhere(near)}
-        if active:  # far from nothing, derivatives there may tell too little of what has no share of it
-            alone = additions(self.nominal.information, self.nominal.score, self.priors, ()) - self.prices
+            pairs |= {
+                (*rest, int(plain[a]), int(plain[b])): float(gain[a, b])
+                for a, b in np.argwhere(near)
+            }
+        if (
+            active
+        ):  # far from nothing, derivatives there may tell too little of what has no share of it
+            alone = (
+                additions(self.nominal.information, self.nominal.score, self.priors, ())
+                - self.prices
+            )
             alone += self.linear((), self.nominal) - self.linear(active, self.nominal)
             singles |= {(k,): max(singles.get((k,), -np.inf), alone[k]) for k in usable.tolist()}
         ranked = _ranked(singles, DOUBT)
         ranked = [m for i, m in enumerate(ranked) if i < 2 * SHORTLIST or abs(m.nats) < STRONG]
-        alone = [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]  # not to be told from here
-        return [*ranked, *_ranked(pairs, DOUBT)[:SHORTLIST], *(m for m in alone if m.active not in [r.active for r in ranked])]
+        alone = (
+            [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]
+        )  # not to be told from here
+        return [
+            *ranked,
+            *_ranked(pairs, DOUBT)[:SHORTLIST],
+            *(m for m in alone if m.active not in [r.active for r in ranked]),
+        ]
 
     def _rests(self) -> Iterator[tuple[int, ...]]:
-        """The set, it without one or two of its names, and without those that act in a law's block."""
+        """The set, it without one or two of its names, and without those that act in a
+        law's block.
+        """
         lawful = np.flatnonzero(self.term_columns).tolist()
         blocks = {self.problem.effects[j].block: j for j in lawful}
-        yield from {(*(j for j in self.names if not self._acts_beside(j, [k])), *self.terms) for k in blocks.values()}
+        yield from {
+            (*(j for j in self.names if not self._acts_beside(j, [k])), *self.terms)
+            for k in blocks.values()
+        }
         for gone in range(min(2, len(self.active)) + 1):
             yield from combinations(self.active, len(self.active) - gone)
 
     def _tried(self, point: Point, sets: Sequence[Sequence[int]]) -> list[Move]:
         """Simulate sets from a point."""
         here = self.point, self.active
-        moves = [Move(tuple(s), self.ahead((there, s), here), there) for s, there in zip(sets, candidates(self.problem, point, sets))]
-        bare = [i for i, s in enumerate(sets) if all(map(self.is_term, s))]  # where the names are, or where the model stands alone
+        moves = [
+            Move(tuple(s), self.ahead((there, s), here), there)
+            for s, there in zip(sets, candidates(self.problem, point, sets))
+        ]
+        bare = [
+            i for i, s in enumerate(sets) if all(map(self.is_term, s))
+        ]  # where the names are, or where the model stands alone
         for i, there in zip(bare, candidates(self.problem, self.nominal, [sets[i] for i in bare])):
             nats = self.ahead((there, sets[i]), here)
             moves[i] = max(moves[i], Move(tuple(sets[i]), nats, there), key=lambda move: move.nats)
         return moves
 
-    def _best(self, tried: Sequence[Move], listed: Mapping[tuple[int, ...], float], enough: float) -> bool:
-        """Go over to the best of some sets that may be named; False where none is worth enough more."""
+    def _best(
+        self, tried: Sequence[Move], listed: Mapping[tuple[int, ...], float], enough: float
+    ) -> bool:
+        """Go over to the best of some sets that may be named; False where none is worth enough
+        more.
+        """
         for move in sorted(tried, key=lambda move: -move.nats):
             new = [j for j in move.active if j not in self.active]
             joins = any(map(self.is_term, new)) and set(self.active) < set(move.active)
@@ -254,20 +345,39 @@ class Selector(SearchState):
                 continue
             if any(map(self.is_term, new)) and self.nearer():
                 return True
-            if len(new) == 1 and len(move.active) > len(self.active) and (done := self._differing(move, new[0])):
+            if (
+                len(new) == 1
+                and len(move.active) > len(self.active)
+                and (done := self._differing(move, new[0]))
+            ):
                 return done
             together = self._together(new)
             grown = len(move.active) > len(self.active)
-            self.progress(f"{together} named, {move.nats:.1f} nats above the next simpler model" if grown
-                          else f"exchanged for {self._together(move.active)}")  # fmt: skip
-            tell = (lambda s: self._together([j for j in s if j not in self.active])) if len(new) == 1 and grown else self._together
+            self.progress(
+                f"{together} named, {move.nats:.1f} nats above the next simpler model"
+                if grown
+                else f"exchanged for {self._together(move.active)}"
+            )
+            tell = (
+                (lambda s: self._together([j for j in s if j not in self.active]))
+                if len(new) == 1 and grown
+                else self._together
+            )
             again = {tell(m.active): m.nats for m in sorted(tried, key=lambda m: -m.nats)}
-            shown = {tell(s): float(n) for s, n in sorted(listed.items(), key=lambda item: -again.get(tell(item[0]), -np.inf))[:SHOWN]}
+            shown = {
+                tell(s): float(n)
+                for s, n in sorted(
+                    listed.items(), key=lambda item: -again.get(tell(item[0]), -np.inf)
+                )[:SHOWN]
+            }
             self.steps.append(Step(tell(move.active), move.nats, enough, shown, again))
-            self.origin = self.nominal if all(map(self.is_term, move.active)) and move.active else self.origin
+            self.origin = (
+                self.nominal if all(map(self.is_term, move.active)) and move.active else self.origin
+            )
             self.active = list(move.active)
             self.point = self.settle(move.point, self.active)
-            self.refused.clear()  # what differed from flight to flight may have been this one's share
+            # what differed from flight to flight may have been this one's share
+            self.refused.clear()
             return True
         return False
 
@@ -276,29 +386,45 @@ class Selector(SearchState):
         return ", ".join(map(self.name, active)) or "nothing"
 
     def _believed(self, move: Move) -> bool:
-        """Whether the new names of a set could be named: two at once if they leave nothing to explain.
+        """Whether the new names of a set could be named: two at once if they leave nothing to
+        explain.
 
-        Where a law is missing that the catalogue lacks, pairs that hide each other take a part of it each. Without a calm phase to
-        compare with, a vehicle that is a little off in many ways asks for a law beside its names: there one stands in place of all.
-        """
-        if 0 < sum(map(self.is_term, move.active)) < len(move.active) and not compares_phases(self.nominal):
+        Where a law is missing that the catalogue lacks, pairs that hide each other take a part of
+        it each. Without a calm phase to compare with, a vehicle that is a little off in many ways
+        asks for a law beside its names: there one stands in place of all."""
+        if 0 < sum(map(self.is_term, move.active)) < len(move.active) and not compares_phases(
+            self.nominal
+        ):
             return False
         new = [j for j in move.active if j not in self.active]
         if not all(self.stands(move.point, move.active, j) for j in new):
             return False
         if any(self.is_term(j) for j in new):
             return all(self._lawful(move.point, move.active, j) for j in new if self.is_term(j))
-        alone = len(move.active) > len(self.active) and len(new) == 1  # of which :meth:`_differing` asks
+        alone = (
+            len(move.active) > len(self.active) and len(new) == 1
+        )  # of which :meth:`_differing` asks
         if not alone and any(self.disagreement_on(move.point, move.active, j) for j in new):
             return False
         if len(new) < 2:
             return True
-        left = levels(self.problem, self.nominal, with_floors_noise(self.problem, move.point, move.active), self.least)
+        left = levels(
+            self.problem,
+            self.nominal,
+            with_floors_noise(self.problem, move.point, move.active),
+            self.least,
+        )
         return not any(level.excessive for level in left)
 
     def _differing(self, move: Move, j: int) -> bool:
-        """Whether flights disagree on an addition, which is then refused, or is an event of the one flight that is left out."""
-        verdict, origin, point = self.disagreement_on(move.point, move.active, j), self.origin, move.point
+        """Whether flights disagree on an addition, which is then refused, or is an event of the one
+        flight that is left out.
+        """
+        verdict, origin, point = (
+            self.disagreement_on(move.point, move.active, j),
+            self.origin,
+            move.point,
+        )
         if verdict is not None:
             point = self.settle(point, move.active)
             if point is not move.point:
@@ -310,33 +436,52 @@ class Selector(SearchState):
             self.progress(f"{self.name(j)} is not the same in all flights; it is no cause")
             self.refused[j] = move.nats + self.least
             return True
-        self.progress(f"event in flight {verdict[0]}: something happened there that the other flights deny")
+        self.progress(
+            f"event in flight {verdict[0]}: something happened there that the other flights deny"
+        )
         self.events.append(verdict[0])
         left = [i for i, window in enumerate(self.point.windows) if window.flight != verdict[0]]
         self.problem = self.problem.only(left)
-        self.nominal, self.origin, self.point = (only(p, left) for p in (self.nominal, self.origin, self.point))
+        self.nominal, self.origin, self.point = (
+            only(p, left) for p in (self.nominal, self.origin, self.point)
+        )
         return True
 
-    def stands_without(self, gone: Sequence[int], problem: Problem, nominal: Point, least: float) -> bool:
-        """Leave windows out, and say whether each name is still worth the threshold, so that the search may go on from there."""
+    def stands_without(
+        self, gone: Sequence[int], problem: Problem, nominal: Point, least: float
+    ) -> bool:
+        """Leave windows out, and say whether each name is still worth the threshold, so that the
+        search may go on from there.
+        """
         if self.terms or self.dropped is not None:
             return False
         left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
-        origin, point = (only(terms.bare(self.problem, p)[1], left) for p in (self.origin, self.point))
+        origin, point = (
+            only(terms.bare(self.problem, p)[1], left) for p in (self.origin, self.point)
+        )
         self.problem, self.nominal, self.least = problem, nominal, least
         self.origin, self.point = origin, candidate(problem, point, self.active)
         self.refused, self.visited, self.proposed = {}, set(), set()
         worth = self.worth()
-        return bool(worth) and all(nats > least and self.stands(self.point, self.active, j) for j, nats in worth.items())
+        return bool(worth) and all(
+            nats > least and self.stands(self.point, self.active, j) for j, nats in worth.items()
+        )
 
     def _vary(self, last: bool = False) -> bool:
-        """Let effects differ from flight to flight, where that says more than any name; False where nothing new does.
+        """Let effects differ from flight to flight, where that says more than any name; False where
+        nothing new does.
 
-        ``last``: there is no name any more: any effect may be what varies, if no law is why flights differ.
-        """
+        ``last``: there is no name any more: any effect may be what varies, if no law is why flights
+        differ."""
         scatter = [s for s in self.scatter(self.active, every=last) if s.found]
-        varies = deviations(scatter, self.priors, [e.name for e in self.problem.effects], self.problem.varies.days)
-        new = [s for s in scatter if not {self.name(j) for j in self.problem.varies.effects} & set(s.of)]
+        varies = deviations(
+            scatter, self.priors, [e.name for e in self.problem.effects], self.problem.varies.days
+        )
+        new = [
+            s
+            for s in scatter
+            if not {self.name(j) for j in self.problem.varies.effects} & set(s.of)
+        ]
         most = max((s.nats for s in new), default=0.0)
         best = 0.0 if last else max(self._additions(self.point, self._usable()).max(), 0.0)
         rival = max(most, best, *self.refused.values())
@@ -349,64 +494,102 @@ class Selector(SearchState):
         if last and self._propose() and (self._add() or self._exchange()):
             return True
         for s in new:
-            self.progress(f"{', '.join(s.of)} differs from {s.by} to {s.by}: {s.size:.3g} {s.unit}, {s.nats:.1f} nats")
+            self.progress(
+                f"{', '.join(s.of)} differs from {s.by} to {s.by}: {s.size:.3g} {s.unit},"
+                f" {s.nats:.1f} nats"
+            )
         self.problem = replace(self.problem, varies=varies)
-        self.nominal, self.origin, self.point = (with_varying(p, varies) for p in (self.nominal, self.origin, self.point))
+        self.nominal, self.origin, self.point = (
+            with_varying(p, varies) for p in (self.nominal, self.origin, self.point)
+        )
         self.refused.clear()
         self.visited = {frozenset(self.active)}
         return True
 
     def _lose_commands(self, rival: float) -> bool:
-        """Let commands have got lost, if that says more than what varies and than any name; False where it does not.
+        """Let commands have got lost, if that says more than what varies and than any name; False
+        where it does not.
 
         It is asked before anything is named, and where the search would end.
         ``rival``: nats of what says most beside it.
         """
         if self.dropped is not None or self.terms or self.came is self.point:
             return False
-        found, self.came = dropped.verdict(*terms.bare(self.problem, self.point), self.active, self.least), self.point
-        if found is None or not found.found or found.nats <= max(rival, *self.refused.values(), 0.0) + self.varying_brings():
+        found, self.came = (
+            dropped.verdict(*terms.bare(self.problem, self.point), self.active, self.least),
+            self.point,
+        )
+        if (
+            found is None
+            or not found.found
+            or found.nats <= max(rival, *self.refused.values(), 0.0) + self.varying_brings()
+        ):
             return False
         problem, point = terms.bare(self.problem, self.point)
         self.progress(f"commands got lost: {found.size:.1%} of them, {found.nats:.1f} nats")
         self.problem = replace(problem, lost=found.size, varies=Varies(problem.varies.days))
         self.nominal = linearise(self.problem, np.zeros_like(point.theta), point.noise)
-        self.origin = linearise(self.problem, point.theta, point.noise) if self.active else self.nominal
+        self.origin = (
+            linearise(self.problem, point.theta, point.noise) if self.active else self.nominal
+        )
         self.point = candidate(self.problem, self.origin, self.active)
         self.dropped = dropped.sized(self.problem, self.nominal, found)
         self.refused, self.visited, self.proposed = {}, {frozenset(self.active)}, set()
         return True
 
     def _propose(self) -> bool:
-        """Make the terms that say most candidates, beside the set and instead of its names; False where that brings no new one."""
-        strongest, here = terms.strongest_forces(self.nominal) if self.laws else {}, frozenset(self.active)
+        """Make the terms that say most candidates, beside the set and instead of its names; False
+        where that brings no new one.
+        """
+        strongest, here = (
+            terms.strongest_forces(self.nominal) if self.laws else {},
+            frozenset(self.active),
+        )
         if not strongest or here in self.proposed or len(self.terms) > 1:
             return False
         self.proposed.add(here)
         short = terms.shortlist(self.problem, self.point, self.active, strongest, self.least)
         instead = [(self.nominal, self.terms)] if self.names else []
         for point, rest in [*instead, *([(self.point, self.names)] if self.terms else [])]:
-            stead = [log_evidence(point.information, point.score, self.priors, s) for s in (self.active, rest)]
+            stead = [
+                log_evidence(point.information, point.score, self.priors, s)
+                for s in (self.active, rest)
+            ]
             enough = max(self.least, HOPELESS * (stead[0] - stead[1]))
-            short += terms.shortlist(self.problem, point, rest, strongest, enough, [j for j in self.names if j not in rest])
+            short += terms.shortlist(
+                self.problem,
+                point,
+                rest,
+                strongest,
+                enough,
+                [j for j in self.names if j not in rest],
+            )
         short = list({effect.term: effect for effect in reversed(short)}.values())
         if not short:
             return False
         points = {id(p): p for p in (self.nominal, self.origin, self.point)}
         self.problem, wide = terms.extended(self.problem, list(points.values()), short)
         at = dict(zip(points, wide))
-        self.nominal, self.origin, self.point = (at[id(p)] for p in (self.nominal, self.origin, self.point))
+        self.nominal, self.origin, self.point = (
+            at[id(p)] for p in (self.nominal, self.origin, self.point)
+        )
         return True
 
     def _lawful(self, point: Point, active: Sequence[int], j: int) -> bool:
-        """Whether a term of a set may be told: it matters, flights agree on it, and no name has its form."""
+        """Whether a term of a set may be told: it matters, flights agree on it, and no name has its
+        form.
+        """
         if self.disagreement_on(point, active, j, 1.0):
             return False
         if any(terms.beyond(point, self.priors, active, j, k) < terms.LAW for k in self.names):
             return False
-        return terms.matters(self.problem, point, j, float(self.sizes(active, point)[j] * self.priors.floor[j]))
+        return terms.matters(
+            self.problem, point, j, float(self.sizes(active, point)[j] * self.priors.floor[j])
+        )
 
 
 def _ranked(sets: Mapping[tuple[int, ...], float], doubt: float) -> list[Move]:
     """Best first, of those that are not too far behind."""
-    return sorted((Move(s, float(v)) for s, v in sets.items() if v > -doubt), key=lambda move: -move.nats)
+    return sorted(
+        (Move(s, float(v)) for s, v in sets.items() if v > -doubt), key=lambda move: -move.nats
+    )

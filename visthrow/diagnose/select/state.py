@@ -1,4 +1,6 @@
-"""The state of a search: the set that it has come to, where it stands, what that is worth, and what every move asks of it."""
+"""The state of a search: the set that it has come to, where it stands, what that is worth, and what
+every move asks of it.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -7,11 +9,28 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.evidence import INEXACT, OWN_FLOOR, SPIKE, Priors, certainty, estimate, log_evidence
+from visthrow.diagnose.likelihood.evidence import (
+    INEXACT,
+    OWN_FLOOR,
+    SPIKE,
+    Priors,
+    certainty,
+    estimate,
+    log_evidence,
+)
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.excess import acts_on
-from visthrow.diagnose.select.point import ROUNDS, Point, Problem, advantage, curvature, fitted, linearise, moved
+from visthrow.diagnose.select.point import (
+    ROUNDS,
+    Point,
+    Problem,
+    advantage,
+    curvature,
+    fitted,
+    linearise,
+    moved,
+)
 from visthrow.diagnose.select.result import Law, Step
 from visthrow.diagnose.select.scatter import (
     Scatter,
@@ -26,7 +45,9 @@ from visthrow.diagnose.select.scatter import (
 
 @dataclass(frozen=True)
 class Work:
-    """What a diagnosis leaves behind for gain, report, plan and blind: the search's problem, its first and its last point."""
+    """What a diagnosis leaves behind for gain, report, plan and blind: the search's problem, its
+    first and its last point.
+    """
 
     problem: Problem
     before: Point
@@ -45,7 +66,9 @@ class Move:
 
 @dataclass
 class SearchState:
-    """A search: the set that it has come to, the point where it stands, and what was said on the way."""
+    """A search: the set that it has come to, the point where it stands, and what was said on the
+    way.
+    """
 
     problem: Problem
     nominal: Point
@@ -56,14 +79,22 @@ class SearchState:
     point: Point | None = None
     origin: Point | None = None  # where the derivatives were taken last
     steps: list[Step] = field(default_factory=list)
-    refused: dict[int, float] = field(default_factory=dict)  # effects that are not the same in all flights, with their nats
+    refused: dict[int, float] = field(
+        default_factory=dict
+    )  # effects that are not the same in all flights, with their nats
     events: list[int] = field(default_factory=list)
     sets: list[Move] = field(default_factory=list)  # that are possible as well
     rivalled: Point | None = None  # where all sets were simulated that may be worth as much
-    proposed: set[frozenset[int]] = field(default_factory=set)  # sets beside which terms were looked for
-    linearised: set[frozenset[int]] = field(default_factory=set)  # sets at whose sizes derivatives were taken for laws' sake
+    proposed: set[frozenset[int]] = field(
+        default_factory=set
+    )  # sets beside which terms were looked for
+    linearised: set[frozenset[int]] = field(
+        default_factory=set
+    )  # sets at whose sizes derivatives were taken for laws' sake
     visited: set[frozenset[int]] = field(default_factory=set)
-    acting: dict[int, tuple[str, str]] = field(default_factory=dict)  # blocks that effects act in, without the joint and with it
+    acting: dict[int, tuple[str, str]] = field(
+        default_factory=dict
+    )  # blocks that effects act in, without the joint and with it
     work: Point | None = None  # what is left for report and plan: without laws
     varied: Any = None  # of :meth:`scatter`, and what it was asked about
     dropped: Scatter | None = None  # the verdict on lost commands, where the model has them
@@ -96,24 +127,35 @@ class SearchState:
     def price(self, active: Sequence[int], beside: bool = True) -> float:
         """Return what the names of a set cost [nats].
 
-        ``beside``: whether those that act in a law's block, and may be a part of its form, cost more.
-        """
+        ``beside``: whether those that act in a law's block, and may be a part of its form, cost
+        more."""
         prices, lawful = self.prices, [j for j in active if self.is_term(j)] if beside else []
         more = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
-        return float(prices[list(active)].sum() + len(more) * max((terms.LAW + prices[j] for j in lawful), default=0.0))
+        return float(
+            prices[list(active)].sum()
+            + len(more) * max((terms.LAW + prices[j] for j in lawful), default=0.0)
+        )
 
     def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
         """Whether an effect acts in the block of one of some laws."""
         blocks = {self.problem.effects[k].block for k in laws}
         if blocks and not self.acting:
             every = range(len(self.problem.model.effects))
-            self.acting = dict(enumerate(zip(acts_on(self.nominal, every), acts_on(self.nominal, every, joint=True))))
+            self.acting = dict(
+                enumerate(
+                    zip(acts_on(self.nominal, every), acts_on(self.nominal, every, joint=True))
+                )
+            )
         return bool(blocks) and self.acting[j][grammar.JOINT in blocks] in blocks
 
-    def ahead(self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]) -> float:
+    def ahead(
+        self, first: tuple[Point, Sequence[int]], second: tuple[Point, Sequence[int]]
+    ) -> float:
         """Return the nats by which a set at its point is worth more than another at its own."""
         evidence = advantage(self.priors, first, second, self.problem.switches)
-        beside = all(any(map(self.is_term, active)) for _, active in (first, second))  # law against law
+        beside = all(
+            any(map(self.is_term, active)) for _, active in (first, second)
+        )  # law against law
         return float(evidence - self.price(first[1], beside) + self.price(second[1], beside))
 
     def is_term(self, j: int) -> bool:
@@ -127,16 +169,25 @@ class SearchState:
 
     def linear(self, active: Sequence[int], point: Point) -> float:
         """Return what a set is worth by the statistics of a point alone."""
-        return log_evidence(point.information, point.score, self.priors, list(active)) - self.price(active, bool(self.terms))
+        return log_evidence(point.information, point.score, self.priors, list(active)) - self.price(
+            active, bool(self.terms)
+        )
 
     def worth(self, active: Sequence[int] | None = None) -> dict[int, float]:
-        """Return what each name of a set, by default that of the search, adds to the others, in nats."""
+        """Return what each name of a set, by default that of the search, adds to the others, in
+        nats.
+        """
         active = self.active if active is None else active
         whole = self.point.evidence(self.priors, active)
-        return {j: whole - self.point.evidence(self.priors, [k for k in active if k != j]) for j in active}
+        return {
+            j: whole - self.point.evidence(self.priors, [k for k in active if k != j])
+            for j in active
+        }
 
     def sizes(self, active: Sequence[int], point: Point | None = None) -> np.ndarray:
-        """Return the most probable sizes of a set of effects at a point, by default the search's, in floors, shape (K,)."""
+        """Return the most probable sizes of a set of effects at a point, by default the search's,
+        in floors, shape (K,).
+        """
         point = self.point if point is None else point
         return estimate(point.information, point.score, self.priors, list(active))
 
@@ -145,7 +196,8 @@ class SearchState:
         return None if there is None else there.plain
 
     def about_means(self, active: Sequence[int], varies: Varies) -> Statistics:
-        """Return what the flights say of the means of effects that vary; flights far from the mean are simulated again at their own size.
+        """Return what the flights say of the means of effects that vary; flights far from the mean
+        are simulated again at their own size.
 
         ``varies``: what differs among flights.
         """
@@ -155,87 +207,155 @@ class SearchState:
         return freed(statistics, varies)
 
     def scatter(self, active: Sequence[int], *, every: bool = False) -> tuple[Scatter, ...]:
-        """Return the verdicts on what varies from flight to flight about the sizes of a set of effects.
+        """Return the verdicts on what varies from flight to flight about the sizes of a set of
+        effects.
 
-        ``every``: ask about all effects, not only those of the catalogue's random effects and those that are known to vary.
-        """
+        ``every``: ask about all effects, not only those of the catalogue's random effects and those
+        that are known to vary."""
         asked = self.point, tuple(active), every
-        if self.varied is None or self.varied[0][0] is not self.point or self.varied[0][1:] != asked[1:]:
+        if (
+            self.varied is None
+            or self.varied[0][0] is not self.point
+            or self.varied[0][1:] != asked[1:]
+        ):
             effects, about = self.problem.effects, self.sizes(active)
-            others = by_flight([e for j, e in enumerate(effects)
-                                if j in self.problem.varies.effects or (every and not e.switch and not self.is_term(j))])  # fmt: skip
-            self.varied = asked, varying(self.point.plain, about, self.priors, [e.name for e in effects], self.least, self._again,
-                                         others, active, self.problem.varies.days)  # fmt: skip
+            others = by_flight(
+                [
+                    e
+                    for j, e in enumerate(effects)
+                    if j in self.problem.varies.effects
+                    or (every and not e.switch and not self.is_term(j))
+                ]
+            )
+            self.varied = (
+                asked,
+                varying(
+                    self.point.plain,
+                    about,
+                    self.priors,
+                    [e.name for e in effects],
+                    self.least,
+                    self._again,
+                    others,
+                    active,
+                    self.problem.varies.days,
+                ),
+            )
         return self.varied[1]
 
     def varying_brings(self) -> float:
         """Return the nats that what varies from flight to flight brings to the set."""
         same = replace(self.point, varies=Varies())
-        return max(self.point.evidence(self.priors, self.active) - same.evidence(self.priors, self.active), 0.0)
+        return max(
+            self.point.evidence(self.priors, self.active) - same.evidence(self.priors, self.active),
+            0.0,
+        )
 
     def stands(self, point: Point, active: Sequence[int], j: int) -> bool:
         """Tell whether a candidate of a set could be named at all, however many nats it brings."""
         if self.problem.switches[j]:
-            share = estimate(point.information, point.score, self.priors, list(active))[j] * self.priors.floor[j]
-            if share < 1.0 - INEXACT:  # of one that is not there, whose state has more freedom, a part is taken
-                self.progress(f"{self.name(j)} is there or not, and these flights ask for a part of it; it is not named")
+            share = (
+                estimate(point.information, point.score, self.priors, list(active))[j]
+                * self.priors.floor[j]
+            )
+            if (
+                share < 1.0 - INEXACT
+            ):  # of one that is not there, whose state has more freedom, a part is taken
+                self.progress(
+                    f"{self.name(j)} is there or not, and these flights ask for a part of it; it is"
+                    " not named"
+                )
                 return False
         if not self.sure(point, active, j):
-            self.progress(f"{self.name(j)} would be no larger than what it cannot be told from; it is not named")
+            self.progress(
+                f"{self.name(j)} would be no larger than what it cannot be told from; it is not"
+                " named"
+            )
             return False
         return True
 
     def sure(self, point: Point, active: Sequence[int], j: int) -> bool:
         """Tell whether an effect of a set is surely not 0, whatever half a floor of it is."""
-        return bool(certainty(point.information, point.theta, self.priors, active)[list(active).index(j)] > 1.0)
+        return bool(
+            certainty(point.information, point.theta, self.priors, active)[list(active).index(j)]
+            > 1.0
+        )
 
-    def disagreement_on(self, point: Point, active: Sequence[int], j: int, share: float = INEXACT) -> tuple[int | None] | None:
-        """Return whether flights disagree on an effect of a set: see :func:`visthrow.diagnose.select.scatter.disagreement`."""
+    def disagreement_on(
+        self, point: Point, active: Sequence[int], j: int, share: float = INEXACT
+    ) -> tuple[int | None] | None:
+        """Return whether flights disagree on an effect of a set: see
+        :func:`visthrow.diagnose.select.scatter.disagreement`.
+        """
         return disagreement(point.plain, self.priors, point.varies, active, j, self.least, share)
 
     def settle(self, point: Point, active: Sequence[int], doubted: int | None = None) -> Point:
-        """Linearise where the search stands, unless the last derivatives still hold, and step on where that moved the optimum.
+        """Linearise where the search stands, unless the last derivatives still hold, and step on
+        where that moved the optimum.
 
-        ``doubted``: an effect of it without which the point is of no use, so that it ends where this one is not sure.
-        """
+        ``doubted``: an effect of it without which the point is of no use, so that it ends where
+        this one is not sure."""
         kinds = self.problem.switches
         same = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
-        silent = self.priors.visible & (np.diag(self.origin.information) <= 0.0)  # such as wind without drag: it may show elsewhere
+        silent = self.priors.visible & (
+            np.diag(self.origin.information) <= 0.0
+        )  # such as wind without drag: it may show elsewhere
         anew = getattr(self.problem.model, "cheap", False) and np.any(silent)
-        if same and not anew and curvature(self.problem, self.origin, point) < SPIKE:  # what it would fake may go unnamed
+        if (
+            same and not anew and curvature(self.problem, self.origin, point) < SPIKE
+        ):  # what it would fake may go unnamed
             return point
         for _ in range(ROUNDS):
             self.origin = linearise(self.problem, point.theta, point.noise)
             before, point = point, fitted(self.problem, self.origin, active)
             if doubted is not None and not self.sure(point, active, doubted):
                 break
-            if np.abs(point.theta - before.theta).max() <= 0.5 or curvature(self.problem, self.origin, point) <= SPIKE:
+            if (
+                np.abs(point.theta - before.theta).max() <= 0.5
+                or curvature(self.problem, self.origin, point) <= SPIKE
+            ):
                 break
         return point
 
     def nearer(self) -> bool:
-        """Linearise where the search stands; False where that was done. Before a law is believed: it may explain what bends do."""
+        """Linearise where the search stands; False where that was done. Before a law is believed:
+        it may explain what bends do.
+        """
         here = frozenset(self.active)
-        if here in self.linearised or np.abs(self.origin.theta - self.point.theta)[~self.term_columns].max(initial=0.0) <= OWN_FLOOR:
+        if (
+            here in self.linearised
+            or np.abs(self.origin.theta - self.point.theta)[~self.term_columns].max(initial=0.0)
+            <= OWN_FLOOR
+        ):
             return False
         self.linearised.add(here)
-        self.progress("derivatives are taken where the causes are, for a law may explain what they lack")
+        self.progress(
+            "derivatives are taken where the causes are, for a law may explain what they lack"
+        )
         self.origin = linearise(self.problem, self.point.theta, self.point.noise)
         self.point = fitted(self.problem, self.origin, self.active)
         return True
 
     def law(self) -> tuple[set[int], str]:
-        """Return the names that are not told beside the set's laws, and why there are laws in words.
+        """Return the names that are not told beside the set's laws, and why there are laws in
+        words.
 
-        Names that act in a law's block may be a part of its form. A name acts there by its column or by what the other names cannot
-        stand in for, as two delays that differ by a force. What is worth nothing without those is not told either.
-        """
+        Names that act in a law's block may be a part of its form. A name acts there by its column
+        or by what the other names cannot stand in for, as two delays that differ by a force. What
+        is worth nothing without those is not told either."""
         effects, names = self.problem.effects, self.names
         blocks = {effects[j].block for j in self.terms}
         joint = grammar.JOINT in blocks
-        near = {j for j, block in zip(names, acts_on(self.point, names, joint=joint)) if block in blocks}
-        near |= {j for j in set(names) - near if len(names) > 1
-                 and acts_on(self.point, [j], joint=joint, beside=[k for k in names if k != j])[0] in blocks}  # fmt: skip
+        near = {
+            j for j, block in zip(names, acts_on(self.point, names, joint=joint)) if block in blocks
+        }
+        near |= {
+            j
+            for j in set(names) - near
+            if len(names) > 1
+            and acts_on(self.point, [j], joint=joint, beside=[k for k in names if k != j])[0]
+            in blocks
+        }
         left = [j for j in self.active if j not in near]
         while near and (worth := {j: w for j, w in self.worth(left).items() if j in names}):
             weakest = min(worth, key=worth.get)
@@ -243,15 +363,29 @@ class SearchState:
                 break
             left.remove(weakest)
         told = terms.laws(self.problem, self.point, self.active, 0.0)
-        text = " and ".join(f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in told)
+        text = " and ".join(
+            f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in told
+        )
         return set(names) - set(left), f"{text} explains what no cause of the catalogue does"
 
     def explanations(self) -> list[tuple[Law, ...]]:
         """Return the laws of the set, then others one by one in their place, best first."""
         if not self.terms:
             return []
-        point, found = self.point, [(*self.names, j) for j in np.flatnonzero(self.term_columns).tolist()]
-        value = {s: point.evidence(self.priors, s) - self.price(s) for s in {*found, tuple(self.active)}}
+        point, found = (
+            self.point,
+            [(*self.names, j) for j in np.flatnonzero(self.term_columns).tolist()],
+        )
+        value = {
+            s: point.evidence(self.priors, s) - self.price(s) for s in {*found, tuple(self.active)}
+        }
         without = point.evidence(self.priors, self.names) - self.price(self.names)
-        best = [tuple(self.active), *sorted((s for s in found if set(s) != set(self.active)), key=value.get, reverse=True)]
-        return [terms.laws(self.problem, point, s, value[s] - without) for s in best if s == best[0] or value[s] > without]
+        best = [
+            tuple(self.active),
+            *sorted((s for s in found if set(s) != set(self.active)), key=value.get, reverse=True),
+        ]
+        return [
+            terms.laws(self.problem, point, s, value[s] - without)
+            for s in best
+            if s == best[0] or value[s] > without
+        ]

@@ -1,10 +1,11 @@
 """Terms of laws outside the catalogue, as further effects of a model.
 
-The column of a term is G A v: G are the derivatives by the latent forces, A the latent forces that anything exerted at the knots
-stands for, v the term's values there. So thousands of terms are screened at once without a simulation: a window needs A' G' V^-1 G A
-alone, with V as in :mod:`visthrow.diagnose.likelihood.marginal`, and all terms are a product of tables. The best become effects of
-the problem (:attr:`visthrow.diagnose.select.point.Problem.terms`) and are weighed like any other.
-"""
+The column of a term is G A v: G are the derivatives by the latent forces, A the latent forces that
+anything exerted at the knots stands for, v the term's values there. So thousands of terms are
+screened at once without a simulation: a window needs A' G' V^-1 G A alone, with V as in
+:mod:`visthrow.diagnose.likelihood.marginal`, and all terms are a product of tables. The best become
+effects of the problem (:attr:`visthrow.diagnose.select.point.Problem.terms`) and are weighed like
+any other."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,12 +30,17 @@ from visthrow.diagnose.select.result import Law
 from visthrow.diagnose.select.scatter import freed_beside
 
 LAW = 2.0 * STRONG
-"""Nats by which a term must be ahead where it takes the place of no name, and which a name costs more where a law acts."""
+"""Nats by which a term must be ahead where it takes the place of no name, and which a name costs
+more where a law acts.
+"""
 
 NARROW = 1e-3
-"""Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a name in that of one of any size."""
+"""Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a
+name in that of one of any size.
+"""
 
-WEIGHED = 6  # terms that become effects to be weighed: as many as other sets that are simulated in their place
+# terms that become effects to be weighed: as many as other sets that are simulated in their place
+WEIGHED = 6
 
 
 @lru_cache(maxsize=32)
@@ -60,24 +66,33 @@ def felt(block: str) -> str:
 
 
 def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
-    """The lower median of a block's levels; the least of a phase with few windows may be anything."""
+    """The lower median of a block's levels; the least of a phase with few windows may
+    be anything.
+    """
     own = sorted(level for (b, _), level in levels.items() if b == block)
     return own[(len(own) - 1) // 2]
 
 
 def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
-    """The point as if no phase were much rougher than is usual in its block, and the statistics of its windows.
+    """The point as if no phase were much rougher than is usual in its block, and the statistics of
+    its windows.
 
-    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of it would stand out.
-    """
+    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of
+    it would stand out."""
     levels = point.noise.latent_sd
-    limits = {block: UNKNOWN_RATIO * usual(levels, block) for block in {block for block, _ in levels}}
-    noise = replace(point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()})
+    limits = {
+        block: UNKNOWN_RATIO * usual(levels, block) for block in {block for block, _ in levels}
+    }
+    noise = replace(
+        point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()}
+    )
     parts = statistics(point.grams, noise, point.device)
     return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts
 
 
-def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[Known]) -> Screen | None:
+def screen(
+    point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[Known]
+) -> Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
     through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
     names = [set(point.windows[w].knots) for w in through]
@@ -88,12 +103,25 @@ def screen(point: Point, parts: Sequence[WindowStatistics], block: str, known: S
     own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
 
     ends = np.cumsum([len(known[w]["time"]) for w in through])[:-1]
-    factors = zip(*(np.split(values, ends) for values in layout.factors(joined([known[w] for w in through], shared))))
+    factors = zip(
+        *(
+            np.split(values, ends)
+            for values in layout.factors(joined([known[w] for w in through], shared))
+        )
+    )
     exerted = each(lambda w: _exerted(point, parts[w], w, block, known[w], own), through)
     told = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
     flights = np.searchsorted(point.plain.flights, [point.windows[w].flight for w in through])
-    rows = [np.flatnonzero(flights == f) for f in range(len(point.plain.flights))] if point.varies else [np.arange(len(told))]
-    batches = [[told[i] for i in own_rows[first : first + size]] for own_rows in rows for first in range(0, len(own_rows), size)]
+    rows = (
+        [np.flatnonzero(flights == f) for f in range(len(point.plain.flights))]
+        if point.varies
+        else [np.arange(len(told))]
+    )
+    batches = [
+        [told[i] for i in own_rows[first : first + size]]
+        for own_rows in rows
+        for first in range(0, len(own_rows), size)
+    ]
     of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
     shares = zip(*each(lambda batch: _products(batch, layout, point.device), batches))
     square, information, score, cross = (_summed(values, of, len(rows)) for values in shares)
@@ -109,15 +137,26 @@ def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarr
     return out
 
 
-def _exerted(point: Point, part: WindowStatistics, w: int, block: str, known: Known, own: int) -> tuple[np.ndarray, ...]:
-    """Of what is exerted at a window's knots: square and information, score and cross information."""
+def _exerted(
+    point: Point, part: WindowStatistics, w: int, block: str, known: Known, own: int
+) -> tuple[np.ndarray, ...]:
+    """Of what is exerted at a window's knots: square and information, score and cross
+    information.
+    """
     through = through_latents(point.windows[w], known, block)
     here = through[point.grams[w].latent_block == own]
     score = part.latent_score + part.latent_effects @ point.theta
-    return here.T @ here, through.T @ part.latent_information @ through, through.T @ score, through.T @ part.latent_effects
+    return (
+        here.T @ here,
+        through.T @ part.latent_information @ through,
+        through.T @ score,
+        through.T @ part.latent_effects,
+    )
 
 
-def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: Layout, device: str) -> tuple[np.ndarray, ...]:
+def _products(
+    windows: Sequence[tuple[np.ndarray, ...]], layout: Layout, device: str
+) -> tuple[np.ndarray, ...]:
     """Square, information, score and cross information of all terms, of these windows together.
 
     ``windows``: of each, what is exerted at its knots, and the scalars and vectors there.
@@ -125,7 +164,9 @@ def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: Layout, device:
     longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
     square, information, score, cross, scalars, vectors = (
         _padded(arrays, axes, longest, device)
-        for arrays, axes in zip(zip(*windows), ((3, 3), (3, 3), (3,), (3, None), (1, None), (1, None, None)))
+        for arrays, axes in zip(
+            zip(*windows), ((3, 3), (3, 3), (3,), (3, None), (1, None), (1, None, None))
+        )
     )
     values = vectors[..., torch.from_numpy(layout.vector).to(device)]
     for which in layout.scalar:
@@ -136,14 +177,24 @@ def _products(windows: Sequence[tuple[np.ndarray, ...]], layout: Layout, device:
     return tuple(all_to_host((*squares, score.reshape(-1) @ flat, flat.T @ cross)))
 
 
-def _padded(arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int, device: str) -> torch.Tensor:
-    """Arrays side by side, with zeros up to so many knots along each axis that has some entries a knot."""
-    shape = tuple(size if per is None else per * longest for size, per in zip(arrays[0].shape, axes))
+def _padded(
+    arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int, device: str
+) -> torch.Tensor:
+    """Arrays side by side, with zeros up to so many knots along each axis that has some entries a
+    knot.
+    """
+    shape = tuple(
+        size if per is None else per * longest for size, per in zip(arrays[0].shape, axes)
+    )
     return side_by_side([[array] for array in arrays], shape, device)
 
 
-def gains(point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach`` strong at the knots."""
+def gains(
+    point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach``
+    strong at the knots.
+    """
     own, score = _beside(point, priors.deviation(list(active)), of)
     prior = reach / np.maximum(of.size, 1e-12 * of.size.max() + 1e-300)
     gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
@@ -154,12 +205,18 @@ def gains(point: Point, priors: Priors, active: Sequence[int], of: Screen, reach
 def _beside(point: Point, deviation: np.ndarray, of: Screen) -> tuple[np.ndarray, np.ndarray]:
     """Information and score of each term, of what effects of these prior deviations leave."""
     sigma = covariance(point.information, deviation)
-    own = np.maximum(of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0)
+    own = np.maximum(
+        of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0
+    )
     return own, of.score - of.cross @ (sigma @ point.score)
 
 
-def _unsaid(point: Point, priors: Priors, active: Sequence[int], of: Screen, name: int) -> np.ndarray:
-    """Nats of each screened term that a name, whatever its size, does not explain, shape (T,); see :func:`beyond`."""
+def _unsaid(
+    point: Point, priors: Priors, active: Sequence[int], of: Screen, name: int
+) -> np.ndarray:
+    """Nats of each screened term that a name, whatever its size, does not explain, shape (T,); see
+    :func:`beyond`.
+    """
     deviation = priors.deviation(list(active))
     deviation[name] = priors.slab[name] / NARROW
     own, score = _beside(point, deviation, of)
@@ -178,8 +235,12 @@ def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
     return kept
 
 
-def extended(problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]) -> tuple[Problem, list[Point]]:
-    """The problem and points of it with more terms as effects, at 0; nothing is simulated again, and the same derivatives are laid once."""
+def extended(
+    problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]
+) -> tuple[Problem, list[Point]]:
+    """The problem and points of it with more terms as effects, at 0; nothing is simulated again,
+    and the same derivatives are laid once.
+    """
     wide = replace(problem, terms=(*problem.terms, *terms))
 
     def laid(window: Window, gram: Gram) -> tuple[np.ndarray, ...]:
@@ -191,13 +252,30 @@ def extended(problem: Problem, points: Sequence[Point], terms: Sequence[TermEffe
     known: dict[Same, list[tuple[np.ndarray, ...]]] = {}
     found = []
     for point in points:
-        there = Same([a for w, gram in zip(point.windows, point.grams) for a in (w.effects, gram.inner)])
+        there = Same(
+            [a for w, gram in zip(point.windows, point.grams) for a in (w.effects, gram.inner)]
+        )
         if there not in known:
             known[there] = each(lambda pair: laid(*pair), zip(point.windows, point.grams))
-        windows = [replace(w, effects=effects) for w, (effects, _, _) in zip(point.windows, known[there])]
-        grams = [replace(gram, inner=inner, cross=np.concatenate((gram.cross, gram.cross[:, _latents(gram)] @ own), axis=1))
-                 for gram, (_, inner, own) in zip(point.grams, known[there])]  # fmt: skip
-        found.append(regathered(point, theta=np.append(point.theta, np.zeros(len(terms))), windows=windows, grams=grams))
+        windows = [
+            replace(w, effects=effects) for w, (effects, _, _) in zip(point.windows, known[there])
+        ]
+        grams = [
+            replace(
+                gram,
+                inner=inner,
+                cross=np.concatenate((gram.cross, gram.cross[:, _latents(gram)] @ own), axis=1),
+            )
+            for gram, (_, inner, own) in zip(point.grams, known[there])
+        ]
+        found.append(
+            regathered(
+                point,
+                theta=np.append(point.theta, np.zeros(len(terms))),
+                windows=windows,
+                grams=grams,
+            )
+        )
     return wide, found
 
 
@@ -206,37 +284,54 @@ def _latents(gram: Gram) -> slice:
 
 
 def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
-    """A gram's inner products with G columns as further effects; ``columns`` are in the gram's own latents, shape (L, T)."""
+    """A gram's inner products with G columns as further effects; ``columns`` are in the gram's own
+    latents, shape (L, T).
+    """
     part, size, count = _latents(gram), gram.inner.shape[1], columns.shape[1]
     along = gram.inner[:, :, part] @ columns
     inner = np.empty((len(along), size + count, size + count))
-    inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = gram.inner, along, along.transpose(0, 2, 1)
+    inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = (
+        gram.inner,
+        along,
+        along.transpose(0, 2, 1),
+    )
     inner[:, size:, size:] = columns.T @ along[:, part]
     return inner
 
 
 def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
-    """The problem and a point of it without its terms, whose shares are left out of the residuals where they are not 0."""
+    """The problem and a point of it without its terms, whose shares are left out of the residuals
+    where they are not 0.
+    """
     if not problem.terms:
         return problem, point
     own, count = replace(problem, terms=()), len(problem.model.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
     more = len(problem.terms)
-    grams = [replace(g, inner=g.inner[:, :-more, :-more], cross=g.cross[:, :-more]) for g in point.grams]
+    grams = [
+        replace(g, inner=g.inner[:, :-more, :-more], cross=g.cross[:, :-more]) for g in point.grams
+    ]
     return own, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
 def shortlist(
-    problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float], least: float, names: Sequence[int] = ()
+    problem: Problem,
+    point: Point,
+    active: Sequence[int],
+    strongest: Mapping[str, float],
+    least: float,
+    names: Sequence[int] = (),
 ) -> list[TermEffect]:
     """The terms that say most beside a set of names, by the linear statistics.
 
-    ``strongest``: latent force of each block where the model stood alone [N or N m]; ``least``: nats that a term must bring beyond its
-    price; ``names``: that are not in the set: a term that one of these says as well is none.
-    """
+    ``strongest``: latent force of each block where the model stood alone [N or N m]; ``least``:
+    nats that a term must bring beyond its price; ``names``: that are not in the set: a term that
+    one of these says as well is none."""
     calm, parts = calmed(point)
     known = [Known(window.knots) for window in point.windows]
-    screens = {block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None}
+    screens = {
+        block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None
+    }
     depths = [term.depth for of in screens.values() for term in of.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
     found: list[tuple[float, Term, float]] = []
@@ -245,20 +340,40 @@ def shortlist(
         gain -= [price[term.depth] for term in of.terms]
         said = [_unsaid(calm, problem.priors, active, of, name) < LAW for name in names]
         gain[np.any(said, axis=0)] = -np.inf
-        found += [(float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)]
+        found += [
+            (float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)
+        ]
     there = {e.term for e in problem.effects if isinstance(e, TermEffect)}
-    best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[:WEIGHED]
+    best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[
+        :WEIGHED
+    ]
     return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
 
 def as_effect(term: Term, prior: float, price: float) -> TermEffect:
-    """A term as an effect, with the prior deviation of its coefficient and what it costs beyond the threshold [nats]."""
-    return TermEffect(term.formula, "a law that the catalogue does not hold", term.formula, term.unit, term.block, (-np.inf, np.inf),
-                      prior, NARROW * prior, (), "grammar", term=term, price=price)  # fmt: skip
+    """A term as an effect, with the prior deviation of its coefficient and what it costs beyond the
+    threshold [nats].
+    """
+    return TermEffect(
+        term.formula,
+        "a law that the catalogue does not hold",
+        term.formula,
+        term.unit,
+        term.block,
+        (-np.inf, np.inf),
+        prior,
+        NARROW * prior,
+        (),
+        "grammar",
+        term=term,
+        price=price,
+    )
 
 
 def strongest_forces(point: Point) -> dict[str, float]:
-    """Latent force of each block in the phase where it is strongest [N or N m]; none where a window has no knots."""
+    """Latent force of each block in the phase where it is strongest [N or N m]; none where a window
+    has no knots.
+    """
     strongest: dict[str, float] = {}
     for (block, _), level in point.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
@@ -269,7 +384,8 @@ def strongest_forces(point: Point) -> dict[str, float]:
 
 
 def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
-    """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts in.
+    """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts
+    in.
 
     ``j``: number of the term among the effects.
     """
@@ -280,9 +396,14 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
         if carries(gram.latent_block, term.block):
             own = Known(window.knots)
             for block, values in loads(term.block, own, layout.table(own)).items():
-                square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(float((values**2).sum((1, 2)).mean()))
+                square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(
+                    float((values**2).sum((1, 2)).mean())
+                )
     floors = floors_of(problem, point)
-    return any(abs(size) * np.sqrt(np.mean(values)) > floors.get(key, 0.0) for key, values in square.items())
+    return any(
+        abs(size) * np.sqrt(np.mean(values)) > floors.get(key, 0.0)
+        for key, values in square.items()
+    )
 
 
 def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
@@ -293,21 +414,33 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
     floor = np.array([effects[j].floor for j in told])
     spread = sigma[np.ix_(told, told)] * np.outer(floor, floor)
     return tuple(
-        Law(t.formula, t.block, t.factors, t.vector, float(mean[j] * floor[i]), float(np.sqrt(spread[i, i])), t.unit, float(nats),
-            tuple(spread[i].tolist()))
+        Law(
+            t.formula,
+            t.block,
+            t.factors,
+            t.vector,
+            float(mean[j] * floor[i]),
+            float(np.sqrt(spread[i, i])),
+            t.unit,
+            float(nats),
+            tuple(spread[i].tolist()),
+        )
         for i, (j, t) in enumerate((j, effects[j].term) for j in told)
-    )  # fmt: skip
+    )
 
 
 def beyond(point: Point, priors: Priors, active: Sequence[int], term: int, name: int) -> float:
-    """Nats that a term explains and a name, whatever its size, does not; none where both are the same form.
+    """Nats that a term explains and a name, whatever its size, does not; none where both are the
+    same form.
 
-    A term has neither bounds nor a usual size. It must not take the place of a name that says the same only because the name lies
-    at its bound, or is larger than was expected.
-    """
+    A term has neither bounds nor a usual size. It must not take the place of a name that says the
+    same only because the name lies at its bound, or is larger than was expected."""
     deviation = priors.deviation([k for k in active if k != term])
     deviation[[name, term]] = priors.slab[name] / NARROW, 0.0
     information, score = point.information, point.score
     known = covariance(information, deviation) @ np.column_stack((information[:, term], score))
-    own, left = information[term, term] - information[term] @ known[:, 0], score[term] - information[term] @ known[:, 1]
+    own, left = (
+        information[term, term] - information[term] @ known[:, 0],
+        score[term] - information[term] @ known[:, 1],
+    )
     return float(0.5 * left**2 / max(own, 1e-300))

@@ -13,9 +13,13 @@ LEAST = 0.25  # of a window [s]
 BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
-LATE = 0.1  # by which the release may lag more than expected, before a payload counts as free where the rope was slack [s]
+# by which the release may lag more than expected, before a payload counts as free where the rope
+# was slack [s]
+LATE = 0.1
 LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
-RINGING = 1.5  # that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows may
+# that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows
+# may
+RINGING = 1.5
 MOST = 400  # windows; of longer flights these are spread evenly over all
 POSES_LEAST = 8  # measured poses without which a window says nothing
 
@@ -56,15 +60,18 @@ def payload_down(flight: Recorded, landing_height: float) -> float:
         return flight.landing
     after = flight.payload.time > flight.latch
     low = after & (flight.payload.values[:, 2] < landing_height + GROUND_MARGIN)
-    return min(flight.landing, float(flight.payload.time[low][0])) if np.any(low) else flight.landing
+    return (
+        min(flight.landing, float(flight.payload.time[low][0])) if np.any(low) else flight.landing
+    )
 
 
-def cut(flight: Recorded, number: int, lag: float, landing_height: float, carries: bool) -> list[Cut]:
+def cut(
+    flight: Recorded, number: int, lag: float, landing_height: float, carries: bool
+) -> list[Cut]:
     """Cut one flight.
 
-    ``lag``: of the release, as far as known [s]; ``landing_height``: of the payload's centre [m]; ``carries``: whether the flight carries a
-    payload.
-    """
+    ``lag``: of the release, as far as known [s]; ``landing_height``: of the payload's centre [m];
+    ``carries``: whether the flight carries a payload."""
     first, last = flight.start, flight.end
     separation = flight.latch + lag
     hanging = ATTACHED if carries else NO_PAYLOAD
@@ -79,12 +86,18 @@ def cut(flight: Recorded, number: int, lag: float, landing_height: float, carrie
         spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
     cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
-    until = [cuts[max(i - 1, 0)].phase for i in range(len(cuts))]  # the first window's own: nothing is known of before
-    return [replace(c, at_rest=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)]
+    until = [
+        cuts[max(i - 1, 0)].phase for i in range(len(cuts))
+    ]  # the first window's own: nothing is known of before
+    return [
+        replace(c, at_rest=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)
+    ]
 
 
 def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
-    """Of hours of flight, all throws and what follows them, and so many of the other windows that ``most`` are left."""
+    """Of hours of flight, all throws and what follows them, and so many of the other windows that
+    ``most`` are left.
+    """
     plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
     room = max(most - len(cuts) + len(plain), most // 4)
     if len(plain) <= room:
@@ -96,15 +109,22 @@ def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:
     """A window cut about the time in which the rope was slack: that is only flown through.
 
-    ``first, last``: of that time [s]; ``separation``: of the payload [s]; a rope that comes taut no sooner leaves a window of the flight
-    after it.
-    """
+    ``first, last``: of that time [s]; ``separation``: of the payload [s]; a rope that comes taut no
+    sooner leaves a window of the flight after it."""
     free = c.start < separation < min(last + LEAST_TAUT, c.end)
     last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)
-    rest = replace(c, start=last, payload=LOOSE, phase="ballistic") if free else replace(c, start=last, after_slack=True)
+    rest = (
+        replace(c, start=last, payload=LOOSE, phase="ballistic")
+        if free
+        else replace(c, start=last, after_slack=True)
+    )
     before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
     pieces = [before, replace(c, start=first, end=last, retained=False), rest]
-    return [replace(p, retained=p.retained and p.end - p.start > LEAST) for p in pieces if p.end - p.start > 1e-6]
+    return [
+        replace(p, retained=p.retained and p.end - p.start > LEAST)
+        for p in pieces
+        if p.end - p.start > 1e-6
+    ]
 
 
 def _seen(flight: Recorded, c: Cut) -> bool:

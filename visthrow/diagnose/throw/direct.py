@@ -1,8 +1,9 @@
-"""Measurements that are predicted without a simulation: where payloads landed, and what a camera saw.
+"""Measurements that are predicted without a simulation: where payloads landed, and what a camera
+saw.
 
-Each kind predicts its samples from what motion capture saw, taken back through the setting's delays, frame and markers, so that
-it depends on sensors, camera and landing plane alone. Its samples stand behind the simulated ones of their window.
-"""
+Each kind predicts its samples from what motion capture saw, taken back through the setting's
+delays, frame and markers, so that it depends on sensors, camera and landing plane alone. Its
+samples stand behind the simulated ones of their window."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,14 +24,25 @@ from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
 
 LANDING, KEYPOINTS = "landing", "keypoints"
-LANDING_SIGMA = 2e-3  # of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart
+# of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart
+LANDING_SIGMA = 2e-3
 GRID = 0.02  # between the smoothed poses that a camera's views are predicted from [s]
-NEAR = 0.025  # reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late
-SHORT = 1e-3  # over which the speed of a keypoint is taken [s]: its row differs from the others' by a few milliseconds at most
+# reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late
+NEAR = 0.025
+# over which the speed of a keypoint is taken [s]: its row differs from the others' by a few
+# milliseconds at most
+SHORT = 1e-3
 LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
 MEASURED = np.array([(1, 1)] * 4 + [(1, 0), (0, 1), (1, 0), (0, 1)], dtype=bool)
-"""Coordinates (8, 2) that a detector measures: corners, and where each side of a box is; the rest are middles of sides."""
-ACTS_ON = ("camera.", "plant.release.landing_height", "plant.rope.payload_radius", "sensing.camera_")
+"""Coordinates (8, 2) that a detector measures: corners, and where each side of a box is; the rest
+are middles of sides.
+"""
+ACTS_ON = (
+    "camera.",
+    "plant.release.landing_height",
+    "plant.rope.payload_radius",
+    "sensing.camera_",
+)
 """Numbers that nothing but these samples depends on: their effects need no simulation."""
 
 
@@ -49,10 +61,14 @@ class DirectMeasurement(Protocol):
         ...
 
 
-def channels_of(logs: Sequence[FlightLog], flights: Sequence[Recorded], camera: CameraParams | None) -> list[str]:
+def channels_of(
+    logs: Sequence[FlightLog], flights: Sequence[Recorded], camera: CameraParams | None
+) -> list[str]:
     """Channels of the direct measurements that the logs hold."""
     landed = any(f.landing_point is not None and f.latch != NEVER for f in flights)
-    looked = camera is not None and any(seen_by_camera(log) and f.payload is not None for log, f in zip(logs, flights))
+    looked = camera is not None and any(
+        seen_by_camera(log) and f.payload is not None for log, f in zip(logs, flights)
+    )
     return [LANDING] * landed + [KEYPOINTS] * looked
 
 
@@ -71,7 +87,9 @@ def needs_no_flight(e: SettingEffect) -> bool:
 
 
 def seen_by_camera(log: FlightLog) -> bool:
-    """Whether a log holds keypoints that a camera saw: those that a policy's pilot projected from poses say nothing about it."""
+    """Whether a log holds keypoints that a camera saw: those that a policy's pilot projected from
+    poses say nothing about it.
+    """
     config = log.meta.get("config")
     made = config.get("keypoints", "") if isinstance(config, dict) else ""
     seen = made == "detector" or (made == "" and "policy" not in log.meta)
@@ -79,7 +97,12 @@ def seen_by_camera(log: FlightLog) -> bool:
 
 
 def with_direct(
-    window: Window, number: int, kinds: Sequence[DirectMeasurement], channels: Sequence[str], settings: Sequence[Setting], steps: np.ndarray
+    window: Window,
+    number: int,
+    kinds: Sequence[DirectMeasurement],
+    channels: Sequence[str],
+    settings: Sequence[Setting],
+    steps: np.ndarray,
 ) -> Window:
     """A window with its direct measurements behind the simulated samples.
 
@@ -95,14 +118,22 @@ def with_direct(
         columns = np.zeros((len(time), len(steps)))
         for k in np.flatnonzero(steps):
             other = settings[1 + k]
-            if other.sensing != settings[0].sensing or other.camera != settings[0].camera or kind.channel == LANDING:
+            if (
+                other.sensing != settings[0].sensing
+                or other.camera != settings[0].camera
+                or kind.channel == LANDING
+            ):
                 columns[:, k] = (kind.predicted(number, other) - plain) / steps[k]
         window = replace(
-            window, time=np.append(window.time, time), residual=np.append(window.residual, values - plain),
+            window,
+            time=np.append(window.time, time),
+            residual=np.append(window.residual, values - plain),
             channel=np.append(window.channel, np.full(len(time), channels.index(kind.channel))),
-            sigma=np.append(window.sigma, np.full(len(time), sigma)), effects=np.vstack((window.effects, columns)),
-            nuisance=_longer(window.nuisance, len(time)), latent=_longer(window.latent, len(time)),
-        )  # fmt: skip
+            sigma=np.append(window.sigma, np.full(len(time), sigma)),
+            effects=np.vstack((window.effects, columns)),
+            nuisance=_longer(window.nuisance, len(time)),
+            latent=_longer(window.latent, len(time)),
+        )
     return window
 
 
@@ -138,23 +169,37 @@ class LandingHeight:
         x, point = setting.sensing, self.windows[window][1]
         there = _origin(x, point[None])[0] - np.array(x.payload_offset)
         there[2] = setting.plant.release.landing_height
-        seen = Rotation.from_rotvec(x.frame_tilt).apply(there + np.array(x.payload_offset)) * (1.0 + x.scale)
+        seen = Rotation.from_rotvec(x.frame_tilt).apply(there + np.array(x.payload_offset)) * (
+            1.0 + x.scale
+        )
         return seen[2:]
 
 
 class CameraView:
-    """Keypoints that a camera saw, normalised: payload's box, and the goal's corners where the log knows the goal."""
+    """Keypoints that a camera saw, normalised: payload's box, and the goal's corners where the log
+    knows the goal.
+    """
 
     channel = KEYPOINTS
 
-    def __init__(self, logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting):
+    def __init__(
+        self,
+        logs: Sequence[FlightLog],
+        flights: Sequence[Recorded],
+        cuts: Sequence[Cut],
+        setting: Setting,
+    ):
         """Smooth the poses about each view.
 
-        ``logs``: flights. flights: the same as the replay takes them. cuts: windows. setting: the diagnosed one.
-        """
+        ``logs``: flights. flights: the same as the replay takes them. cuts: windows. setting: the
+        diagnosed one."""
         self._nominal, self.windows = setting, {}
         for w, c in enumerate(cuts):
-            if c.retained and seen_by_camera(logs[c.flight]) and flights[c.flight].payload is not None:
+            if (
+                c.retained
+                and seen_by_camera(logs[c.flight])
+                and flights[c.flight].payload is not None
+            ):
                 view = _view(logs[c.flight], flights[c.flight], c, setting.sensing)
                 if view is not None:
                     self.windows[w] = view
@@ -186,11 +231,15 @@ def _reach(camera) -> np.ndarray:
     """Pixels of 1 in normalised coordinates along x and y."""
     from camera.fisheye import Fisheye
 
-    return np.array([camera.fisheye.fx, camera.fisheye.fy]) * float(Fisheye(camera.fisheye).edge_radius)
+    return np.array([camera.fisheye.fx, camera.fisheye.fy]) * float(
+        Fisheye(camera.fisheye).edge_radius
+    )
 
 
 def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | None:
-    """Views of one window: stamps, points, what is valid of them, goal, and smoothed poses on a grid about them."""
+    """Views of one window: stamps, points, what is valid of them, goal, and smoothed poses on a
+    grid about them.
+    """
     channel = measured(log, KEYPOINTS)
     inside = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
     inside &= (channel.time > flight.payload.time[0]) & (channel.time < flight.payload.time[-1])
@@ -200,24 +249,41 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     stamps, kept = channel.time[inside], np.flatnonzero(inside)
     at = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
     points = np.asarray(channel.values, dtype=float)
-    goal = np.asarray(log["goal_w"].values, dtype=float)[0] if "goal_w" in log else log.meta.get("goal_w")
+    goal = (
+        np.asarray(log["goal_w"].values, dtype=float)[0]
+        if "goal_w" in log
+        else log.meta.get("goal_w")
+    )
     seen = valid[np.minimum(at, len(valid) - 1)]
     if goal is None:
         seen[:, :4] = False
     grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
-    tracks = {"vehicle": (flight.vehicle, x.vehicle_delay), "attitude": (flight.attitude, x.vehicle_delay),
-              "payload": (flight.payload, x.payload_delay)}  # fmt: skip
-    sources = {name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()}  # at the times that they show
+    tracks = {
+        "vehicle": (flight.vehicle, x.vehicle_delay),
+        "attitude": (flight.attitude, x.vehicle_delay),
+        "payload": (flight.payload, x.payload_delay),
+    }
+    sources = {
+        name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()
+    }  # at the times that they show
     table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in sources.items()}
     if any(row is None for rows in table.values() for row in rows):
         return None
     seen = seen[..., None] & MEASURED
     if not np.any(seen):
         return None
-    view = {"time": stamps, "points": points[kept], "valid": seen, "grid": grid,
-            "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
-            "sigma": max(_noise(points[kept], seen), LEAST_KEYPOINT_SIGMA)}  # fmt: skip
-    return view | {name: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])) for name, rows in table.items()}
+    view = {
+        "time": stamps,
+        "points": points[kept],
+        "valid": seen,
+        "grid": grid,
+        "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
+        "sigma": max(_noise(points[kept], seen), LEAST_KEYPOINT_SIGMA),
+    }
+    return view | {
+        name: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows]))
+        for name, rows in table.items()
+    }
 
 
 def _noise(points: np.ndarray, seen: np.ndarray) -> float:
@@ -235,15 +301,26 @@ def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     s = (h / GRID)[:, None]
     turns = name == "attitude"
     here = Rotation.from_quat(values[k]) if turns else None
-    chord = (here.inv() * Rotation.from_quat(values[k + 1])).as_rotvec() if turns else values[k + 1] - values[k]
-    # A cubic that meets both ends: a jump there, divided by a small delay, would pass for an effect of that delay.
-    bend = s * (1.0 - s) * ((1.0 - s) * (GRID * slopes[k] - chord) - s * (GRID * slopes[k + 1] - chord))
+    chord = (
+        (here.inv() * Rotation.from_quat(values[k + 1])).as_rotvec()
+        if turns
+        else values[k + 1] - values[k]
+    )
+    # A cubic that meets both ends: a jump there, divided by a small delay, would pass for an effect
+    # of that delay.
+    bend = (
+        s
+        * (1.0 - s)
+        * ((1.0 - s) * (GRID * slopes[k] - chord) - s * (GRID * slopes[k + 1] - chord))
+    )
     way = s * chord + bend
     return (here * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
 
 
 def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> np.ndarray:
-    """Keypoints that the setting's camera sees at times, in the nominal lens's normalised coordinates, shape (T, 8, 2)."""
+    """Keypoints that the setting's camera sees at times, in the nominal lens's normalised
+    coordinates, shape (T, 8, 2).
+    """
     import torch
 
     from camera.keypoints import KeypointCamera, keypoints
@@ -252,15 +329,20 @@ def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> n
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
     turned = frame.inv() * Rotation.from_quat(_at(view, "attitude", vehicle)) * marker.inv()
-    # The mount is stated from the centre of mass as it was believed: where the weight really lies moves no lens.
+    # The mount is stated from the centre of mass as it was believed: where the weight really lies
+    # moves no lens.
     off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
     pos = _origin(x, _at(view, "vehicle", vehicle)) - turned.apply(off)
-    ball = _origin(x, _at(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))) - np.array(x.payload_offset)
+    ball = _origin(
+        x, _at(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))
+    ) - np.array(x.payload_offset)
     # Smooth past the edge too: what was seen counts also where this predicts it out of view.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
     lens = KeypointCamera(smooth, dtype=torch.float64)
     arrays = pos, turned.as_matrix(), np.tile(view["goal"], (len(time), 1)), ball
-    points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[0].numpy()
+    points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[
+        0
+    ].numpy()
     own, other = camera.fisheye, nominal.camera.fisheye
     pixel = points * _reach(camera) + np.array([own.cx, own.cy])
     return (pixel - np.array([other.cx, other.cy])) / _reach(nominal.camera)

@@ -1,8 +1,9 @@
-"""Commands that did not come: what a window would have shown had the command before stayed for one period more.
+"""Commands that did not come: what a window would have shown had the command before stayed for one
+period more.
 
-A radio link loses commands or brings them late, and the vehicle goes on with what it has; the log holds what was sent. Each window
-is flown once for each of its commands, with the one before in its place.
-"""
+A radio link loses commands or brings them late, and the vehicle goes on with what it has; the log
+holds what was sent. Each window is flown once for each of its commands, with the one before in its
+place."""
 
 from collections.abc import Sequence
 
@@ -18,14 +19,16 @@ def without_each_command(
 ) -> list[np.ndarray]:
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
-    ``windows``: their numbers; ``known``: delay of the commands by which those that act in a window are told [s]: their number is the same
-    in all settings; ``simulation``: of one setting.
-    Returns for each of these windows, shape (N, T), with the T commands that differ from the one before.
+    ``windows``: their numbers; ``known``: delay of the commands by which those that act in a window
+    are told [s]: their number is the same in all settings; ``simulation``: of one setting. Returns
+    for each of these windows, shape (N, T), with the T commands that differ from the one before.
     """
     commands = [_acting(flights, w, known) for w in windows]
     found, first = [], 0
     while first < len(windows):
-        fits = int(np.searchsorted(np.cumsum([1 + len(own) for own in commands[first:]]), BATCH, "right"))
+        fits = int(
+            np.searchsorted(np.cumsum([1 + len(own) for own in commands[first:]]), BATCH, "right")
+        )
         part = slice(first, first + max(fits, 1))
         found += _flown(flights, windows[part], commands[part], simulation, states)
         first = part.stop
@@ -42,18 +45,29 @@ def _acting(flights: Flights, w: int, delay: float) -> np.ndarray:
 
 
 def _flown(
-    flights: Flights, windows: Sequence[int], commands: Sequence[np.ndarray], simulation: Simulation, states: States
+    flights: Flights,
+    windows: Sequence[int],
+    commands: Sequence[np.ndarray],
+    simulation: Simulation,
+    states: States,
 ) -> list[np.ndarray]:
-    """Of a few windows: a lane with all commands, then one without each of them, which leaves the first at the knot before."""
+    """Of a few windows: a lane with all commands, then one without each of them, which leaves the
+    first at the knot before.
+    """
     lanes, times, sent, run, kept = [], [], [], [], 0
     for w, own in zip(windows, commands):
         f = flights.flights[flights.cuts[w].flight]
         part = slice(max(own.min(initial=1) - 1, 0), own.max(initial=len(f.command_time) - 2) + 2)
         acts = f.command_time[own] + simulation.settings[0].plant.vehicle.queue.delay
-        knots = np.clip((acts - flights.cuts[w].start) // KNOT_SPACING, 0, flights.knots[w] - 2).astype(int)  # the last is the end
+        knots = np.clip(
+            (acts - flights.cuts[w].start) // KNOT_SPACING, 0, flights.knots[w] - 2
+        ).astype(int)  # the last is the end
         whole = len(lanes)
         run.append(Lane(whole, 0, w, keep=kept, rough=True))
-        run += [Lane(whole + 1 + i, 0, w, resume=kept + int(knot), parent=whole, rough=True) for i, knot in enumerate(knots)]
+        run += [
+            Lane(whole + 1 + i, 0, w, resume=kept + int(knot), parent=whole, rough=True)
+            for i, knot in enumerate(knots)
+        ]
         kept += int(flights.knots[w])
         for k in (None, *own.tolist()):
             flown = f.command[part].copy()
@@ -65,7 +79,10 @@ def _flown(
     ends, at = np.cumsum([len(own) for own in times]), np.array(lanes)
     fields = {name: values[at] for name, values in flights.recording.windows.items()}
     fields |= {"command_first": np.append(0, ends[:-1]), "command_last": ends}
-    data = flights.recording.data | {"command_time": np.concatenate(times), "command": np.concatenate(sent)}
+    data = flights.recording.data | {
+        "command_time": np.concatenate(times),
+        "command": np.concatenate(sent),
+    }
     seen = flights.repeated(at).fly(simulation, states, run, Recording(fields, data)).seen
     found, first = [], 0
     for w, own in zip(windows, commands):

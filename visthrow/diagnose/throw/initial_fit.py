@@ -1,8 +1,9 @@
-"""Initial states of replay windows fitted to their samples by Levenberg and Marquardt, all windows at once.
+"""Initial states of replay windows fitted to their samples by Levenberg and Marquardt, all windows
+at once.
 
-A simulation of every direction costs some thirty times one of the state itself. So derivatives are used for several steps, as
-long as each brings what it promised, and may come from another setting whose states were fitted before.
-"""
+A simulation of every direction costs some thirty times one of the state itself. So derivatives are
+used for several steps, as long as each brings what it promised, and may come from another setting
+whose states were fitted before."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,29 +15,57 @@ from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.likelihood.threads import each
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.replay import Flights, Lane, Simulation
-from visthrow.diagnose.throw.states import MOVED, Direction, States, concerns, directions, moved_along, rows_of, stacked
+from visthrow.diagnose.throw.states import (
+    MOVED,
+    Direction,
+    States,
+    concerns,
+    directions,
+    moved_along,
+    rows_of,
+    stacked,
+)
 
-DAMPING, DAMPING_MOST = 1e-3, 1e5  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
+DAMPING, DAMPING_MOST = (
+    1e-3,
+    1e5,
+)  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
 ROUNDS = 25
 LADDER = np.array([1.0, 10.0, 100.0, 1000.0])
-"""Dampings that are tried at once, in the one at hand, for windows whose last step did not bring what it promised."""
+"""Dampings that are tried at once, in the one at hand, for windows whose last step did not bring
+what it promised.
+"""
 DRIFT = 0.02, 0.02, 0.02, 0.04
-"""Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m], rate [rad/s]. Fitted as though
-there were none, states took their place: bends of the rope of ten times their prior, after twenty steps."""
+"""Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m],
+rate [rad/s]. Fitted as though there were none, states took their place: bends of the rope of ten
+times their prior, after twenty steps.
+"""
 CALMER = tuple(0.5**k for k in range(1, 11))  # of that, which windows may turn out to have had
-GROWTH = 1.5, 1.0, 1.5, 0.5  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
+GROWTH = (
+    1.5,
+    1.0,
+    1.5,
+    0.5,
+)  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 1.0, 0.01  # fall of the cost, and relative one, below which an initial state is settled
 SHRINKING = 0.1
-"""Of what the next step promises against what the last one did, below which derivatives from elsewhere lead to the goal."""
+"""Of what the next step promises against what the last one did, below which derivatives from
+elsewhere lead to the goal.
+"""
 TRUE, WHOLE = 0.5, 0.8
-"""Of what a step promised, that it must bring, and of what the least damped one promised, for derivatives to be used further."""
+"""Of what a step promised, that it must bring, and of what the least damped one promised, for
+derivatives to be used further.
+"""
 ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
 SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
 TRUSTED = ("motor_speed",)
-"""Fields that are linearised about where the commands left them. Fitted without gusts they would take the gusts' place: rotors
-far from their commands at the start of a window, and with them a law of the thrust's slope that is none."""
+"""Fields that are linearised about where the commands left them.
+
+Fitted without gusts they would take the gusts' place: rotors far from their commands at the start
+of a window, and with them a law of the thrust's slope that is none.
+"""
 
 
 @dataclass(frozen=True)
@@ -55,27 +84,45 @@ class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
     def __init__(self, flights: Flights, retained: np.ndarray, simulation: Simulation, lag: float):
-        """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far as known [s]."""
+        """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far
+        as known [s].
+        """
         self.flights, self.retained, self.simulation = flights, retained, simulation
         self.directions = directions(simulation.settings[0].plant)
-        self.slopes: dict[int, np.ndarray] = {}  # of windows' samples by their states, where they were taken last
+        self.slopes: dict[
+            int, np.ndarray
+        ] = {}  # of windows' samples by their states, where they were taken last
         self._free = [
-            [d for d, x in enumerate(self.directions) if concerns(x, cut) and x.field not in TRUSTED] for cut in flights.cuts
+            [
+                d
+                for d, x in enumerate(self.directions)
+                if concerns(x, cut) and x.field not in TRUSTED
+            ]
+            for cut in flights.cuts
         ]  # directions in which windows' initial states are fitted
         self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
-        self._gusts = np.ones(len(flights.cuts))  # of each window, against the drift that is thought possible
-        # deviation of each window's samples from a flight without gusts: noise, and how far gusts may have led by then
+        self._gusts = np.ones(
+            len(flights.cuts)
+        )  # of each window, against the drift that is thought possible
+        # deviation of each window's samples from a flight without gusts: noise, and how far gusts
+        # may have led by then
         self._spreads = [np.hypot(flights.sigma[w], own) for w, own in enumerate(self._drift)]
-        self._scales: dict[int, tuple] = {}  # the last slopes and deviations of a window, and what comes of them
-        self._sensitive, ends = zip(*[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))])
+        self._scales: dict[
+            int, tuple
+        ] = {}  # the last slopes and deviations of a window, and what comes of them
+        self._sensitive, ends = zip(
+            *[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))]
+        )
         self._shortened = flights.ended(ends)
 
-    def fit(self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None) -> States:
+    def fit(
+        self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None
+    ) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
-        ``starts``: states to begin with, each window with the best of its own, and how far they were moved before; those that do not count
-        keep the last; ``slopes``: of windows' samples by their states, as :attr:`slopes` of another fit has them.
-        """
+        ``starts``: states to begin with, each window with the best of its own, and how far they
+        were moved before; those that do not count keep the last; ``slopes``: of windows' samples by
+        their states, as :attr:`slopes` of another fit has them."""
         count = len(self.flights.cuts)
         damping, left, promised = np.full(count, DAMPING), self.retained, np.full(count, np.inf)
         self.slopes |= slopes or {}
@@ -88,7 +135,11 @@ class InitialFit:
             trial = self._tried(states, left, residuals, damping, doubtful)
             helps = trial.cost < cost[left]
             tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
-            tried[left], hoped[left], whole[left] = trial.cost, np.where(helps, trial.hoped, trial.whole), trial.whole
+            tried[left], hoped[left], whole[left] = (
+                trial.cost,
+                np.where(helps, trial.hoped, trial.whole),
+                trial.whole,
+            )
             damping[left] = np.where(helps, trial.damping, damping[left])
             better, rows = tried < cost, np.flatnonzero(helps)
             residuals |= {left[row]: trial.residuals[row] for row in rows}
@@ -98,7 +149,9 @@ class InitialFit:
             fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
             enough = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
             little = better & (fall < enough)
-            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < enough) & (damping <= DAMPING)
+            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < enough) & (
+                damping <= DAMPING
+            )
             true = (fall > TRUE * hoped) & (hoped > WHOLE * whole)
             stale = np.where(better, ~settled & (little | ~true), aged & ~settled)
             raised = damping * np.where(doubtful, 10.0 * LADDER[-1], 10.0)
@@ -116,26 +169,48 @@ class InitialFit:
         return states
 
     def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray], np.ndarray]:
-        """The best of each window's states, what they leave, and its cost, shape (W,); all are flown at once."""
+        """The best of each window's states, what they leave, and its cost, shape (W,); all are
+        flown at once.
+        """
         retained, count = self.retained, len(self.retained)
-        seen = self._residuals(stacked([rows_of(states, retained) for states in starts]), np.tile(retained, len(starts)))
-        tried = np.reshape([self._cost(w, residual) for w, residual in zip(np.tile(retained, len(starts)), seen)], (len(starts), count))
+        seen = self._residuals(
+            stacked([rows_of(states, retained) for states in starts]),
+            np.tile(retained, len(starts)),
+        )
+        tried = np.reshape(
+            [self._cost(w, residual) for w, residual in zip(np.tile(retained, len(starts)), seen)],
+            (len(starts), count),
+        )
         which, cost = tried.argmin(axis=0), np.full(len(self.flights.cuts), np.inf)
         cost[retained] = tried.min(axis=0)
         best = {name: value.copy() for name, value in starts[-1].items()}
         for name, value in best.items():
-            value[retained] = np.stack([states[name][retained] for states in starts])[which, np.arange(count)]
-        return best, {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))}, cost
+            value[retained] = np.stack([states[name][retained] for states in starts])[
+                which, np.arange(count)
+            ]
+        return (
+            best,
+            {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))},
+            cost,
+        )
 
     def _tried(
-        self, states: States, left: np.ndarray, residuals: Mapping[int, np.ndarray], damping: np.ndarray, doubtful: np.ndarray,
-    ) -> _Trial:  # fmt: skip
+        self,
+        states: States,
+        left: np.ndarray,
+        residuals: Mapping[int, np.ndarray],
+        damping: np.ndarray,
+        doubtful: np.ndarray,
+    ) -> _Trial:
         """The next step of each window that is left, or the best of several."""
         rungs = np.where(doubtful[left], len(LADDER), 1)
         which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
         dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
         each(self._scaled, left)
-        found = [self._increments(w, residuals[w], states[MOVED][w], its) for w, its in zip(left, dampings)]
+        found = [
+            self._increments(w, residuals[w], states[MOVED][w], its)
+            for w, its in zip(left, dampings)
+        ]
         tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*found))
         there = moved_along(rows_of(states, which), self.directions, steps)
         there[MOVED] = there[MOVED] + steps
@@ -143,10 +218,14 @@ class InitialFit:
         cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
         best = np.array([at + cost[at : at + n].argmin() for at, n in zip(first, rungs)])
         rest = [seen[lane] for lane in best]
-        return _Trial(rows_of(there, best), tries[best], hoped[best], hoped[first], cost[best], rest)
+        return _Trial(
+            rows_of(there, best), tries[best], hoped[best], hoped[first], cost[best], rest
+        )
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
-        """Residuals of windows, of what depends on their initial states; a row of the states for each."""
+        """Residuals of windows, of what depends on their initial states; a row of the states for
+        each.
+        """
         f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
         seen = f.fly(self.simulation, states, lanes, self._shortened).seen
         return [self._sensitive[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
@@ -158,10 +237,16 @@ class InitialFit:
         return cost if np.isfinite(cost) else np.inf
 
     def _lower_gusts(self, w: int, residual: np.ndarray) -> bool:
-        """Take a window's gusts for as strong as what is left of it says, if that is much less than was thought."""
+        """Take a window's gusts for as strong as what is left of it says, if that is much less than
+        was thought.
+        """
         square, noise, drift = residual**2, self.flights.sigma[w] ** 2, self._drift[w] ** 2
         samples = np.count_nonzero(self._sensitive[w])
-        calmer = [g for g in CALMER if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < samples]
+        calmer = [
+            g
+            for g in CALMER
+            if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < samples
+        ]
         if not calmer:
             return False
         self._gusts[w] = min(calmer)
@@ -176,7 +261,10 @@ class InitialFit:
         ways = {d: 1 + at for at, d in enumerate(sorted({d for w in which for d in self._free[w]}))}
         for row, w in enumerate(which):
             first.append(len(lanes))
-            lanes += [Lane(w, 0, row, rough=True), *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]]]
+            lanes += [
+                Lane(w, 0, row, rough=True),
+                *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]],
+            ]
         there = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
         seen = self.flights.fly(self.simulation, there, lanes, self._shortened).seen
         slopes = {}
@@ -188,7 +276,9 @@ class InitialFit:
         return slopes
 
     def _scaled(self, w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Prior deviations of a window's state, its derivatives in these and the samples' deviations, and their inner products."""
+        """Prior deviations of a window's state, its derivatives in these and the samples'
+        deviations, and their inner products.
+        """
         slopes, spread = self.slopes[w], self._spreads[w]
         known = self._scales.get(w)
         if known is None or known[0] is not slopes or known[1] is not spread:
@@ -199,12 +289,12 @@ class InitialFit:
 
     def _increments(
         self, w: int, residual: np.ndarray, done: np.ndarray, dampings: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that they promise.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that
+        they promise.
 
-        ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape (T,).
-        Returns steps, shape (T, directions); falls of the cost, shape (T,).
-        """
+        ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape
+        (T,). Returns steps, shape (T, directions); falls of the cost, shape (T,)."""
         ds, (sd, scaled, bend) = self._free[w], self._scaled(w)
         off = residual / self._spreads[w]
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
@@ -228,8 +318,8 @@ def drift(flights: Flights, w: int) -> np.ndarray:
 def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, float]:
     """Which samples tell of a window's start, and how long it is flown for their sake [s].
 
-    They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where few are left.
-    """
+    They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
+    few are left."""
     c, time = flights.cuts[w], flights.time[w]
     left = flights.flights[c.flight].latch + lag - EARLIER
     if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
@@ -238,13 +328,15 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
 
 
 def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
-    """How a window's initial state follows its effects: so that the flight stays as near to where it was as it can.
+    """How a window's initial state follows its effects: so that the flight stays as near to where
+    it was as it can.
 
-    ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as known [s].
-    Returns changes in the state's units by the effects' sizes, shape (D, K).
-    """
+    ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as
+    known [s]. Returns changes in the state's units by the effects' sizes, shape (D, K)."""
     samples = len(flights.time[w])  # and those of a camera, which tell nothing of states
-    weight = (sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma[w], drift(flights, w)))[:, None]
+    weight = (
+        sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma[w], drift(flights, w))
+    )[:, None]
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight
     by_effect = (by_state * weight).T @ window.effects[:samples]

@@ -1,9 +1,11 @@
-"""Mistakes between a log and the simulation that are either there or not: axes, signs and units of the commands.
+"""Mistakes between a log and the simulation that are either there or not: axes, signs and units of
+the commands.
 
-Here they are suspected, from how measured rates follow commanded ones and from the weight that commands carry. They are candidates of
-the selection like any other: :func:`visthrow.diagnose.select.search.put_right` simulates the flights with and without each, and keeps
-what raises the evidence by more than it costs. (Commands that bear the time of their arrival are no gross mistake: they show as the
-effect ``cmd_delay`` on its bound, the link's delay less.)
+Here they are suspected, from how measured rates follow commanded ones and from the weight that
+commands carry. They are candidates of the selection like any other:
+:func:`visthrow.diagnose.select.search.put_right` simulates the flights with and without each, and
+keeps what raises the evidence by more than it costs. (Commands that bear the time of their arrival
+are no gross mistake: they show as the effect ``cmd_delay`` on its bound, the link's delay less.)
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +19,16 @@ from visthrow.logs.axes import EVERY, matrix_of
 from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
-FOLLOWS = 0.8  # correlation of commanded and measured rates, with whichever axes, from which a log tells of its commands
+# correlation of commanded and measured rates, with whichever axes, from which a log tells of its
+# commands
+FOLLOWS = 0.8
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
-VARIED, LATE, SLOPES = 0.05, 0.05, (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
+VARIED, LATE, SLOPES = (
+    0.05,
+    0.05,
+    (0.3, 2.0),
+)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
 
 
 @dataclass(frozen=True)
@@ -33,12 +41,17 @@ class Mistake:
     nats: float  # by which it beats the log as it stands
     logs: int  # that can tell
     ways: int = 1  # that commands may be wrong in so: their logarithm is the price
-    change: tuple[tuple[float, ...], ...] = ()  # of the command (thrust and rates), shape (4, 4); none where it was made anew
+    change: tuple[
+        tuple[float, ...], ...
+    ] = ()  # of the command (thrust and rates), shape (4, 4); none where it was made anew
 
     @property
     def sentence(self) -> str:
         """For people."""
-        return f"{self.cause}: {self.name}, {self.equation}; {self.nats:.0f} nats from {self.logs} logs. It was put right."
+        return (
+            f"{self.cause}: {self.name}, {self.equation}; {self.nats:.0f} nats from {self.logs}"
+            " logs. It was put right."
+        )
 
     def mended(self, log: FlightLog) -> FlightLog:
         """The log with the commands that were meant."""
@@ -46,11 +59,15 @@ class Mistake:
             return log
         c = log["command"]
         values = np.asarray(c.values, dtype=float) @ np.array(self.change).T
-        return FlightLog({**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta)
+        return FlightLog(
+            {**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta
+        )
 
 
 def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
-    """What may be wrong with the commands of all logs, in the order in which it is put right; not weighed yet."""
+    """What may be wrong with the commands of all logs, in the order in which it is put right; not
+    weighed yet.
+    """
     found: list[Mistake] = []
     for look in (_axes, _rate_unit):
         relation = [r for log in logs if (r := _followed(log)) is not None]
@@ -63,12 +80,15 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     return found if mistake is None else [*found, mistake]
 
 
-def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
-    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly, and what was made.
+def commanded(
+    logs: Sequence[FlightLog], plant: PlantParams
+) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
+    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly,
+    and what was made.
 
-    Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share h of full throttle. The slope
-    s is fitted where an accelerometer tells the force and the throttle varies enough, else it is 1.
-    """
+    Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share
+    h of full throttle. The slope s is fitted where an accelerometer tells the force and the
+    throttle varies enough, else it is 1."""
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     made, shares = list(logs), []
     for i, log in enumerate(logs):
@@ -84,7 +104,10 @@ def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
         values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
         command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
         channels = {**log.channels, "command": command}
-        made[i] = FlightLog({name: c.only((c.time >= start) & (c.time <= end)) for name, c in channels.items()}, log.meta)
+        made[i] = FlightLog(
+            {name: c.only((c.time >= start) & (c.time <= end)) for name, c in channels.items()},
+            log.meta,
+        )
         shares.append((hover, slope))
     if not shares:
         return made, ()
@@ -95,10 +118,16 @@ def commanded(logs: Sequence[FlightLog], plant: PlantParams) -> tuple[list[Fligh
 
 
 def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
-    """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None where nothing flies."""
+    """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None
+    where nothing flies.
+    """
     channel = log["throttle"]
     time, share = channel.time[channel.valid], channel.values[channel.valid].astype(float)
-    flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else np.zeros(len(share), bool)
+    flies = (
+        share > 0.5 * np.percentile(share, 75)
+        if np.any(share > 0.0)
+        else np.zeros(len(share), bool)
+    )
     place = measured(log, "pos_w")
     if place is not None:
         height = np.interp(time, place.time[place.valid], place.values[place.valid][:, 2])
@@ -112,7 +141,12 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
         return hover, 1.0, start, end
     acc = log["acc_b"]
     grid = time[inside][(time[inside] > acc.time[0] + 0.2) & (time[inside] < acc.time[-1] - 0.2)]
-    felt = relations.mean_over(acc.time[acc.valid], acc.values[acc.valid].astype(float)[:, 2:3], grid + LATE, 0.1)[:, 0] / GRAVITY
+    felt = (
+        relations.mean_over(
+            acc.time[acc.valid], acc.values[acc.valid].astype(float)[:, 2:3], grid + LATE, 0.1
+        )[:, 0]
+        / GRAVITY
+    )
     asked = relations.mean_over(time, share[:, None], grid, 0.1)[:, 0] / hover
     slope, level = np.polyfit(asked, felt, 1)
     if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
@@ -135,34 +169,68 @@ def _followed(log: FlightLog) -> relations.Relation | None:
 
 
 def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
-    """Exchanged or turned axes of the commanded rates, where all logs that say so say the same, and they are most."""
+    """Exchanged or turned axes of the commanded rates, where all logs that say so say the same, and
+    they are most.
+    """
     clear = [r for r in relation if r.nats > 0.0]
     if len({r.axes for r in clear}) != 1 or 2 * len(clear) < len(relation):
         return None
     text = clear[0].axes
     axes = [axis[-1] for axis in text.split(",")]
     turned = sorted(axes) == axes
-    name, cause = ("rate_sign", "A commanded rate has the other sign") if turned else ("rate_axes", "Commanded rates are exchanged")
+    name, cause = (
+        ("rate_sign", "A commanded rate has the other sign")
+        if turned
+        else ("rate_axes", "Commanded rates are exchanged")
+    )
     change = np.eye(4)
     change[1:, 1:] = matrix_of(text)
     nats = sum(r.nats for r in clear)
-    return Mistake(name, cause, f"x, y, z of the vehicle are ({text}) of the command", nats, len(clear), len(EVERY), _rows(change))
+    return Mistake(
+        name,
+        cause,
+        f"x, y, z of the vehicle are ({text}) of the command",
+        nats,
+        len(clear),
+        len(EVERY),
+        _rows(change),
+    )
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     """Degrees for radians, or radians for degrees, in the commanded rates."""
     gain = float(np.median([r.scale for r in relation if r.correlation > FOLLOWS] or [1.0]))
-    words = {1.0: "", np.pi / 180.0: "degrees a second", 180.0 / np.pi: "radians that were converted twice"}
+    words = {
+        1.0: "",
+        np.pi / 180.0: "degrees a second",
+        180.0 / np.pi: "radians that were converted twice",
+    }
     factor = min(words, key=lambda f: abs(np.log(gain / f))) if gain > 0.0 else 1.0
     if factor == 1.0:
         return None
     change, equation = np.diag([1.0, factor, factor, factor]), f"rates times {factor:.5g}"
-    return Mistake("rate_unit", f"Commanded rates are in {words[factor]}", equation, 0.0, len(relation), len(words), _rows(change))
+    return Mistake(
+        "rate_unit",
+        f"Commanded rates are in {words[factor]}",
+        equation,
+        0.0,
+        len(relation),
+        len(words),
+        _rows(change),
+    )
 
 
-def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]) -> Mistake | None:
-    """Another unit of the commanded thrust: that in which its median comes nearest to the weight that it carries [N]."""
-    medians = [float(np.median(c.values[c.valid, 0])) for log in logs if "command" in log and np.any((c := log["command"]).valid)]
+def _thrust_unit(
+    logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]
+) -> Mistake | None:
+    """Another unit of the commanded thrust: that in which its median comes nearest to the weight
+    that it carries [N].
+    """
+    medians = [
+        float(np.median(c.values[c.valid, 0]))
+        for log in logs
+        if "command" in log and np.any((c := log["command"]).valid)
+    ]
     ratio = float(np.median(medians)) / weight if medians else 0.0
     if not 0.0 < ratio < np.inf:
         return None
@@ -171,7 +239,15 @@ def _thrust_unit(logs: Sequence[FlightLog], weight: float, units: Mapping[str, f
         return None
     change = np.diag([units[unit], 1.0, 1.0, 1.0])
     equation = f"thrust times {units[unit]:.5g}"
-    return Mistake("thrust_unit", f"Commanded thrust is in {unit}", equation, 0.0, len(medians), len(units), _rows(change))
+    return Mistake(
+        "thrust_unit",
+        f"Commanded thrust is in {unit}",
+        equation,
+        0.0,
+        len(medians),
+        len(units),
+        _rows(change),
+    )
 
 
 def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:

@@ -1,9 +1,10 @@
-"""Where throws come down: simulated open loop from before the throw, against where the payload was seen to land.
+"""Where throws come down: simulated open loop from before the throw, against where the payload was
+seen to land.
 
-A second before the separation the initial state is fitted to 0.4 s of measurements; from there on nothing but the recorded
-commands is used, so that the landing is predicted through the throw, the release and the ballistic flight. Beside it stands the
-prediction from a state that is fitted up to the separation: what is then left comes from release and flight alone.
-"""
+A second before the separation the initial state is fitted to 0.4 s of measurements; from there on
+nothing but the recorded commands is used, so that the landing is predicted through the throw, the
+release and the ballistic flight. Beside it stands the prediction from a state that is fitted up to
+the separation: what is then left comes from release and flight alone."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +13,14 @@ from typing import Any
 import numpy as np
 
 from sim.kernels.replay.kernel import ATTACHED
-from visthrow.diagnose.throw.cutting import BEFORE, GROUND_MARGIN, LEAST, LEAST_TAUT, Cut, payload_down
+from visthrow.diagnose.throw.cutting import (
+    BEFORE,
+    GROUND_MARGIN,
+    LEAST,
+    LEAST_TAUT,
+    Cut,
+    payload_down,
+)
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
 from visthrow.diagnose.throw.replay import Flights, Lane
 
@@ -26,16 +34,22 @@ TICK = 5e-3  # between the points of a simulated path [s]; a chord is 0.03 mm of
 
 @dataclass(frozen=True)
 class Landings:
-    """Throws of which the landing was seen; points [m] on the plane of the landing, in the measured frame."""
+    """Throws of which the landing was seen; points [m] on the plane of the landing, in the measured
+    frame.
+    """
 
     flights: np.ndarray  # their numbers, shape (F,)
     measured: np.ndarray  # shape (F, 3)
-    predicted: np.ndarray  # open loop from before the throw, shape (F, 3); NaN where it never comes down
+    predicted: (
+        np.ndarray
+    )  # open loop from before the throw, shape (F, 3); NaN where it never comes down
     released: np.ndarray  # from a state fitted up to the separation, shape (F, 3)
 
     @property
     def errors(self) -> np.ndarray:
-        """Horizontal distance of the open-loop prediction from the measured landing [m], shape (F,)."""
+        """Horizontal distance of the open-loop prediction from the measured landing [m], shape
+        (F,).
+        """
         return np.linalg.norm((self.predicted - self.measured)[:, :2], axis=1)
 
     @property
@@ -47,8 +61,8 @@ class Landings:
 def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | None:
     """Time [s] and point [m] at which a payload came down; None where nobody saw it.
 
-    Without a logged landing the track just above the ground is carried on to ``height`` by a parabola.
-    """
+    Without a logged landing the track just above the ground is carried on to ``height`` by a
+    parabola."""
     if flight.latch == NEVER:
         return None
     if flight.landing_point is not None:
@@ -57,8 +71,16 @@ def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | 
         return None
     track = flight.payload
     down = payload_down(flight, height)
-    above = (track.time > max(down - TRACK, flight.latch)) & (track.time < down + TICK) & (track.values[:, 2] > height)
-    if down == NEVER or np.count_nonzero(above) < LEAST_TRACK or track.values[above][-1, 2] > height + 2.0 * GROUND_MARGIN:
+    above = (
+        (track.time > max(down - TRACK, flight.latch))
+        & (track.time < down + TICK)
+        & (track.values[:, 2] > height)
+    )
+    if (
+        down == NEVER
+        or np.count_nonzero(above) < LEAST_TRACK
+        or track.values[above][-1, 2] > height + 2.0 * GROUND_MARGIN
+    ):
         return None
     time = track.time[above] - down
     fit = np.polynomial.polynomial.polyfit(time, track.values[above], 2)
@@ -70,14 +92,21 @@ def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | 
     return down + float(late.min()), np.polynomial.polynomial.polyval(float(late.min()), fit)
 
 
-def landings(model: Any, theta: Mapping[str, float], flights: Iterable[int] | None = None) -> Landings:
-    """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel` with effects at ``theta``.
+def landings(
+    model: Any, theta: Mapping[str, float], flights: Iterable[int] | None = None
+) -> Landings:
+    """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel`
+    with effects at ``theta``.
 
-    ``theta``: sizes of effects in their units; those not named at 0; ``flights``: numbers of flights to look at; default all.
-    """
+    ``theta``: sizes of effects in their units; those not named at 0; ``flights``: numbers of
+    flights to look at; default all."""
     plane = model.setting.plant.release.landing_height
     numbers = range(len(model.flights.flights)) if flights is None else flights
-    known = {n: seen for n in numbers if (seen := seen_landing(model.flights.flights[n], plane)) is not None}
+    known = {
+        n: seen
+        for n in numbers
+        if (seen := seen_landing(model.flights.flights[n], plane)) is not None
+    }
     spans = {n: found for n in known if (found := _spans(model, n)) is not None}
     if not spans:
         return Landings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
@@ -87,22 +116,36 @@ def landings(model: Any, theta: Mapping[str, float], flights: Iterable[int] | No
 
 
 def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Where a throw's state is fitted [s]: before the open loop, and up to the separation; both outside of a slack rope."""
+    """Where a throw's state is fitted [s]: before the open loop, and up to the separation; both
+    outside of a slack rope.
+    """
     flight = model.flights.flights[number]
     separation = flight.latch + model.setting.plant.release.lag
     own = [c for c in model.flights.cuts if c.flight == number and c.start < separation]
     if not own:
         return None
     slack = [(c.start, c.end) for c in own if not c.retained]
-    end = min([separation - LEAD + HEAD, *[first for first, last in slack if last > separation - LEAD]])
+    end = min(
+        [separation - LEAD + HEAD, *[first for first, last in slack if last > separation - LEAD]]
+    )
     last = max([separation - BEFORE, own[0].start, *[last for _, last in slack]])
     head = max(end - HEAD, own[0].start), end
-    return (head, (last, separation)) if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT else None
+    return (
+        (head, (last, separation))
+        if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT
+        else None
+    )
 
 
-def _fly(model: Any, theta: Mapping[str, float], spans: Mapping[int, tuple[float, float]],
-         ends: Mapping[int, float]) -> np.ndarray:  # fmt: skip
-    """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``, shape (F, 3)."""
+def _fly(
+    model: Any,
+    theta: Mapping[str, float],
+    spans: Mapping[int, tuple[float, float]],
+    ends: Mapping[int, float],
+) -> np.ndarray:
+    """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``,
+    shape (F, 3).
+    """
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
     setting, states = model.beside(cuts).begun(theta)
     release, x = setting.plant.release, model.setting.sensing
@@ -114,14 +157,21 @@ def _fly(model: Any, theta: Mapping[str, float], spans: Mapping[int, tuple[float
     seen = onward.fly(model.simulation(setting), states, lanes).seen
     out = np.full((len(flown), 3), np.nan)
     for i, c in enumerate(flown):
-        first, count = 2 * int(onward.windows["vehicle_count"][i]), int(onward.windows["payload_count"][i])
+        first, count = (
+            2 * int(onward.windows["vehicle_count"][i]),
+            int(onward.windows["payload_count"][i]),
+        )
         time, path = onward.samples["payload"][i].time, seen[first : first + count, i]
-        out[i] = _crossing(path[time > looked[c.flight].latch + release.lag], release.landing_height)
+        out[i] = _crossing(
+            path[time > looked[c.flight].latch + release.lag], release.landing_height
+        )
     return out
 
 
 def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
-    """A flight's windows before ``begin``, only flown through, and the one that its state is fitted over."""
+    """A flight's windows before ``begin``, only flown through, and the one that its state is fitted
+    over.
+    """
     before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
     through = [replace(c, end=min(c.end, begin), retained=False) for c in before]
     return [*through, Cut(number, "throw", begin, end, ATTACHED)]

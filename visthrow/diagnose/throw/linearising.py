@@ -1,7 +1,8 @@
-"""Derivatives of windows' samples by effects, initial states and latent forces: which lanes are flown, and what comes of them.
+"""Derivatives of windows' samples by effects, initial states and latent forces: which lanes are
+flown, and what comes of them.
 
-A derivative is a difference of two lanes of the same steps. Steps of twice the length, with a nominal lane of their own, tell most
-of them as well; residuals always come from the nominal steps.
+A derivative is a difference of two lanes of the same steps. Steps of twice the length, with a
+nominal lane of their own, tell most of them as well; residuals always come from the nominal steps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,15 +21,22 @@ from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Flights, Lane
 from visthrow.diagnose.throw.states import Direction, concerns
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
-"""Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N]. Small, for a steady torque is controlled
-away and leaves nothing in a window: with a hundred times as much its second order was left, alike for all axes."""
+"""Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N].
+
+Small, for a steady torque is controlled away and leaves nothing in a window: with a hundred times
+as much its second order was left, alike for all axes.
+"""
 EXACT = ("plant.vehicle.controller.gyro_time_constant", "plant.rope.payload_inertia", "step_square")
-"""Numbers by which derivatives take the nominal steps: with twice as long ones they differ by more than a fifth. In throws, where
-a rope whips, those by all effects and states do; latent forces there differ by 2 %."""
+"""Numbers by which derivatives take the nominal steps: with twice as long ones they differ by more
+than a fifth. In throws, where a rope whips, those by all effects and states do; latent forces there
+differ by 2 %.
+"""
 
 STILL = 0.1
-"""Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the air's own doing: rooms have
-draughts of that speed, and a gust brings a hovering vehicle a velocity that goes with it, as if drag were negative."""
+"""Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the
+air's own doing: rooms have draughts of that speed, and a gust brings a hovering vehicle a velocity
+that goes with it, as if drag were negative.
+"""
 AERODYNAMIC = "aerodynamics"  # block whose effects go with that velocity
 
 
@@ -38,15 +46,22 @@ def exact(e: SettingEffect) -> bool:
 
 
 def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:
-    """A window in which vehicle and air hardly move against each other, without what speeds would tell there; others as they are.
+    """A window in which vehicle and air hardly move against each other, without what speeds would
+    tell there; others as they are.
 
     ``window``: with all columns; ``wind_w``: of the setting [m/s].
     """
     knots = window.knots
-    if "vel_w" not in knots or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > STILL:
+    if (
+        "vel_w" not in knots
+        or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > STILL
+    ):
         return window
     calm = {"vel_w": np.zeros_like(knots["vel_w"])}
-    if "payload_vel_w" in knots and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < STILL:
+    if (
+        "payload_vel_w" in knots
+        and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < STILL
+    ):
         calm["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
     unaffected = np.array([block != AERODYNAMIC for block in blocks])
     return replace(window, effects=window.effects * unaffected, knots={**knots, **calm})
@@ -54,7 +69,9 @@ def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Win
 
 @dataclass(frozen=True)
 class Plan:
-    """The lanes of one window in a run: nominal, those that ride along, those of nominal steps; rough nominal, the others."""
+    """The lanes of one window in a run: nominal, those that ride along, those of nominal steps;
+    rough nominal, the others.
+    """
 
     window: int
     first: int  # lane
@@ -64,41 +81,79 @@ class Plan:
     nuisances: tuple[int, ...]  # directions of the initial state
     latents: tuple[tuple[int, int], ...]  # axis and knot
 
-    def slopes(self, rows: int, steps: np.ndarray, directions: Sequence[Direction], seen: torch.Tensor) -> list[torch.Tensor]:
-        """Derivatives of the window's samples by effects, states and latent forces, shape (3 rows, columns) each.
+    def slopes(
+        self, rows: int, steps: np.ndarray, directions: Sequence[Direction], seen: torch.Tensor
+    ) -> list[torch.Tensor]:
+        """Derivatives of the window's samples by effects, states and latent forces, shape (3 rows,
+        columns) each.
 
         ``seen``: what all lanes of the run saw, shape (rows or more, lanes, 3).
         """
-        sizes = [*steps, *[directions[d].step for d in self.nuisances], *[LATENT_SIZES[axis] for axis, _ in self.latents]]
-        own = seen[:rows, self.first : self.first + len(self.order) + 2].transpose(1, 2).reshape(3 * rows, -1)
+        sizes = [
+            *steps,
+            *[directions[d].step for d in self.nuisances],
+            *[LATENT_SIZES[axis] for axis, _ in self.latents],
+        ]
+        own = (
+            seen[:rows, self.first : self.first + len(self.order) + 2]
+            .transpose(1, 2)
+            .reshape(3 * rows, -1)
+        )
         for part in (own[:, : self.fine], own[:, self.fine :]):
             part -= part[:, :1].clone()
         K, D = len(steps), len(self.nuisances)
         order, sizes = torch.from_numpy(self.order).to(own.device), own.new_tensor(sizes)
-        return [own[:, order[part]].div_(sizes[part]) for part in (slice(K), slice(K, K + D), slice(K + D, None))]
+        return [
+            own[:, order[part]].div_(sizes[part])
+            for part in (slice(K), slice(K, K + D), slice(K + D, None))
+        ]
 
     def window_of(
-        self, flights: Flights, setting: Setting, directions: Sequence[Direction], channel: np.ndarray, residual: np.ndarray,
-        slopes: Sequence[np.ndarray], knots: Mapping[str, np.ndarray], moved: np.ndarray,
-    ) -> Window:  # fmt: skip
+        self,
+        flights: Flights,
+        setting: Setting,
+        directions: Sequence[Direction],
+        channel: np.ndarray,
+        residual: np.ndarray,
+        slopes: Sequence[np.ndarray],
+        knots: Mapping[str, np.ndarray],
+        moved: np.ndarray,
+    ) -> Window:
         """What comes of the lanes.
 
-        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated quantities at all its knots; ``moved``:
-        how far each window's state was moved from where its prior has its middle, shape (W, directions): there the residual is taken.
-        """
+        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated
+        quantities at all its knots; ``moved``: how far each window's state was moved from where its
+        prior has its middle, shape (W, directions): there the residual is taken."""
         w, f = self.window, flights
         c, (effects, states, latents) = f.cuts[w], slopes
         own = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
-            c.flight, c.phase, f.time[w], channel, residual + states @ moved[w, list(self.nuisances)], f.sigma[w], effects, states,
-            np.array([directions[d].spread(c) for d in self.nuisances]), latents,
-            np.array([axis // 3 for axis, _ in self.latents]), np.array([axis % 3 for axis, _ in self.latents]),
-            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]), at_knots(f, setting, w, own), c.after_slack,
-        )  # fmt: skip
+            c.flight,
+            c.phase,
+            f.time[w],
+            channel,
+            residual + states @ moved[w, list(self.nuisances)],
+            f.sigma[w],
+            effects,
+            states,
+            np.array([directions[d].spread(c) for d in self.nuisances]),
+            latents,
+            np.array([axis // 3 for axis, _ in self.latents]),
+            np.array([axis % 3 for axis, _ in self.latents]),
+            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]),
+            at_knots(f, setting, w, own),
+            c.after_slack,
+        )
 
 
 def lanes_of(
-    flights: Flights, w: int, alike: np.ndarray, needs: np.ndarray, directions: Sequence[Direction], first: int, kept: int
+    flights: Flights,
+    w: int,
+    alike: np.ndarray,
+    needs: np.ndarray,
+    directions: Sequence[Direction],
+    first: int,
+    kept: int,
 ) -> tuple[Plan, list[Lane]]:
     """Lanes of one window.
 
@@ -112,33 +167,68 @@ def lanes_of(
     c, count, knots = flights.cuts[w], len(flights.cuts), int(flights.knots[w])
     whips = c.phase in FINENESS or c.after_slack
     nuisances = tuple(d for d, x in enumerate(directions) if concerns(x, c))
-    latents = tuple((axis, knot) for axis in range(6 if c.payload == NO_PAYLOAD else 9) for knot in range(knots))
+    latents = tuple(
+        (axis, knot) for axis in range(6 if c.payload == NO_PAYLOAD else 9) for knot in range(knots)
+    )
     fine = alike | needs | whips
     effects, states = len(fine), len(nuisances)
-    split = 1 + np.count_nonzero(fine) + states * whips  # where the rough nominal lane stands, which latent lanes leave
-    columns = [(int(k), Lane(w, 1 + int(k), w, rough=not fine[k])) for k in np.argsort(~alike, kind="stable")]
-    columns += [(effects + i, Lane(w, 0, (1 + d) * count + w, rough=not whips)) for i, d in enumerate(nuisances)]
+    split = (
+        1 + np.count_nonzero(fine) + states * whips
+    )  # where the rough nominal lane stands, which latent lanes leave
+    columns = [
+        (int(k), Lane(w, 1 + int(k), w, rough=not fine[k]))
+        for k in np.argsort(~alike, kind="stable")
+    ]
     columns += [
-        (effects + states + i, Lane(w, 0, w, axis, knot, LATENT_SIZES[axis], resume=kept + knots + max(knot - 1, 0), parent=first + split,
-                                    rough=True))
+        (effects + i, Lane(w, 0, (1 + d) * count + w, rough=not whips))
+        for i, d in enumerate(nuisances)
+    ]
+    columns += [
+        (
+            effects + states + i,
+            Lane(
+                w,
+                0,
+                w,
+                axis,
+                knot,
+                LATENT_SIZES[axis],
+                resume=kept + knots + max(knot - 1, 0),
+                parent=first + split,
+                rough=True,
+            ),
+        )
         for i, (axis, knot) in enumerate(latents)
-    ]  # fmt: skip
-    nominal = [Lane(w, 0, w, keep=kept, shared=int(alike.sum())), Lane(w, 0, w, keep=kept + knots, rough=True)]
+    ]
+    nominal = [
+        Lane(w, 0, w, keep=kept, shared=int(alike.sum())),
+        Lane(w, 0, w, keep=kept + knots, rough=True),
+    ]
     parts = [[(-1, lane), *(x for x in columns if x[1].rough == lane.rough)] for lane in nominal]
     numbers, lanes = zip(*parts[0], *parts[1])
     order = np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
     return Plan(w, first, kept, len(parts[0]), order, nuisances, latents), list(lanes)
 
 
-def at_knots(flights: Flights, setting: Setting, w: int, knots: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def at_knots(
+    flights: Flights, setting: Setting, w: int, knots: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     """Simulated quantities at the knots, those of the payload where there is one."""
     c = flights.cuts[w]
     time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
-    values = {"time": np.minimum(time, c.end)} | {name: value.copy() for name, value in knots.items()}
+    values = {"time": np.minimum(time, c.end)} | {
+        name: value.copy() for name, value in knots.items()
+    }
     if c.payload == NO_PAYLOAD:
-        return {name: value for name, value in values.items() if not name.startswith("payload") and name != "tension"}
+        return {
+            name: value
+            for name, value in values.items()
+            if not name.startswith("payload") and name != "tension"
+        }
     arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
-    reach = values["payload_pos_w"] - values["pos_w"] - Rotation.from_quat(values["quat_wb"]).apply(arm)
+    reach = (
+        values["payload_pos_w"] - values["pos_w"] - Rotation.from_quat(values["quat_wb"]).apply(arm)
+    )
     values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
     values["mount_b"] = np.tile(arm, (len(time), 1))
     f = flights.flights[c.flight]

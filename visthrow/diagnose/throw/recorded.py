@@ -1,4 +1,6 @@
-"""What a replay needs of a flight log: commands, release, and what was measured of vehicle, payload and gyro."""
+"""What a replay needs of a flight log: commands, release, and what was measured of vehicle, payload
+and gyro.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,11 +17,15 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
-"""Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m], [rad/s]."""
+"""Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m],
+[rad/s].
+"""
 
 UNIFORM = 12.0**-0.5  # standard deviation of what rounding takes, of its step
 BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
-ENOUGH = 250.0  # samples of the gyro a second: faster ones tell a model of 500 steps a second no more
+ENOUGH = (
+    250.0  # samples of the gyro a second: faster ones tell a model of 500 steps a second no more
+)
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
 
 
@@ -30,7 +36,9 @@ class Samples:
     time: np.ndarray  # [s], shape (T,)
     values: np.ndarray  # shape (T, 3) or (T, 4)
     sigma: float  # of one component; of an attitude the angle's [rad]
-    near: dict = field(default_factory=dict, repr=False, compare=False)  # what they say about times that were asked for before
+    near: dict = field(
+        default_factory=dict, repr=False, compare=False
+    )  # what they say about times that were asked for before
 
     def between(self, first: float, last: float) -> slice:
         """Samples with first <= time < last."""
@@ -50,8 +58,12 @@ class Recorded:
     payload: Samples | None
     gyro: Samples | None
     voltage: float | None  # at the start [V]
-    hanging: bool | None = None  # whether the log says that a payload hung below at its start; None where it does not
-    landing_point: np.ndarray | None = None  # where the log says that the payload came down [m], shape (3,)
+    hanging: bool | None = (
+        None  # whether the log says that a payload hung below at its start; None where it does not
+    )
+    landing_point: np.ndarray | None = (
+        None  # where the log says that the payload came down [m], shape (3,)
+    )
 
     @property
     def start(self) -> float:
@@ -66,7 +78,9 @@ class Recorded:
 
 
 def measured(log: FlightLog, name: str) -> Channel | None:
-    """A channel as it was measured, where a log holds the truth beside it; None without any valid sample."""
+    """A channel as it was measured, where a log holds the truth beside it; None without any valid
+    sample.
+    """
     for candidate in (f"measured_{name}", name):
         if candidate in log and np.any(log[candidate].valid):
             return log[candidate]
@@ -98,10 +112,12 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
 
 
 def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Samples that come at twice :data:`ENOUGH` or faster, shape (T,) and (T, N), as fewer that say as much: every n-th of them smoothed.
+    """Samples that come at twice :data:`ENOUGH` or faster, shape (T,) and (T, N), as fewer that say
+    as much: every n-th of them smoothed.
 
-    A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and leaves the noise as white as it was: neighbours correlate
-    by at most 0.07. Times are smoothed alike, so that single samples may lack; none goes across a gap.
+    A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and leaves the noise as
+    white as it was: neighbours correlate by at most 0.07. Times are smoothed alike, so that single
+    samples may lack; none goes across a gap.
 
     Source: Savitzky and Golay 1964.
     """
@@ -112,18 +128,20 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     weights, parts = savgol_coeffs(2 * every + 1, 2), []
     for stretch in np.split(np.arange(len(time)), np.flatnonzero(steps > 1.5 / ENOUGH) + 1):
         if len(stretch) >= len(weights):
-            near = sliding_window_view(np.column_stack((time, values))[stretch], len(weights), axis=0)[::every]
+            near = sliding_window_view(
+                np.column_stack((time, values))[stretch], len(weights), axis=0
+            )[::every]
             parts.append(near @ weights)
     thinned = np.concatenate(parts) if parts else np.zeros((0, 1 + values.shape[1]))
     return thinned[:, 0], thinned[:, 1:]
 
 
 def resolution(values: np.ndarray) -> float:
-    """Step that a channel was recorded in, of shape (T, N), where most of its changes are of one step; 0 where they are not.
+    """Step that a channel was recorded in, of shape (T, N), where most of its changes are of one
+    step; 0 where they are not.
 
-    Such samples repeat themselves without being stale. Without the repeated ones those would be left at which a step was just
-    taken: half a step ahead of what was measured.
-    """
+    Such samples repeat themselves without being stale. Without the repeated ones those would be
+    left at which a step was just taken: half a step ahead of what was measured."""
     changes = np.abs(np.diff(values, axis=0))
     changes = changes[changes > 0.0]
     least = float(np.min(changes, initial=np.inf))
@@ -131,48 +149,81 @@ def resolution(values: np.ndarray) -> float:
 
 
 def record_of(log: FlightLog, number: int = 0) -> Recorded:
-    """Take from a log what a replay needs. Raises DiagnoseError: no commands, or no poses of the vehicle."""
+    """Take from a log what a replay needs.
+
+    Raises DiagnoseError: no commands, or no poses of the vehicle.
+    """
     missing = [name for name in ("command", "pos_w", "quat_wb") if measured(log, name) is None]
     if missing:
         raise DiagnoseError(
-            f"flight {number} holds no {' and no '.join(missing)}; a replay needs command, pos_w and quat_wb; "
-            f"it has {', '.join(sorted(log.channels))}"
+            f"flight {number} holds no {' and no '.join(missing)}; a replay needs command, pos_w"
+            f" and quat_wb; it has {', '.join(sorted(log.channels))}"
         )
-    pos, quat, (landing, landing_point) = _samples(log, "pos_w"), _samples(log, "quat_wb"), _landing(log)
+    pos, quat, (landing, landing_point) = (
+        _samples(log, "pos_w"),
+        _samples(log, "quat_wb"),
+        _landing(log),
+    )
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _paired(pos, quat, number)
     return Recorded(
-        *log["command"].samples(), _latch(log), landing, pos, quat, _payload(log, landing), _samples(log, "rate_b"),
-        _voltage(log), _hanging(log), landing_point,
-    )  # fmt: skip
+        *log["command"].samples(),
+        _latch(log),
+        landing,
+        pos,
+        quat,
+        _payload(log, landing),
+        _samples(log, "rate_b"),
+        _voltage(log),
+        _hanging(log),
+        landing_point,
+    )
 
 
 def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]:
-    """Positions and attitudes of the same times: of common stamps, else attitudes between their samples.
+    """Positions and attitudes of the same times: of common stamps, else attitudes between their
+    samples.
 
     Raises DiagnoseError: neither has them.
     """
-    common, at_pos, at_quat = np.intersect1d(np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True)
+    common, at_pos, at_quat = np.intersect1d(
+        np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True
+    )
     if len(common) >= 0.2 * min(len(pos.time), len(quat.time)) and len(common) >= 5:
         time = pos.time[at_pos]
-        return Samples(time, pos.values[at_pos], pos.sigma), Samples(time, quat.values[at_quat], quat.sigma)
+        return Samples(time, pos.values[at_pos], pos.sigma), Samples(
+            time, quat.values[at_quat], quat.sigma
+        )
     at = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
-    near = (quat.time[at] - quat.time[at - 1] < BETWEEN) & (pos.time >= quat.time[0]) & (pos.time <= quat.time[-1])
+    near = (
+        (quat.time[at] - quat.time[at - 1] < BETWEEN)
+        & (pos.time >= quat.time[0])
+        & (pos.time <= quat.time[-1])
+    )
     if np.count_nonzero(near) < 5:
-        raise DiagnoseError(f"flight {number}: positions and attitudes of the vehicle were never measured at one time")
+        raise DiagnoseError(
+            f"flight {number}: positions and attitudes of the vehicle were never measured at one"
+            " time"
+        )
     time = pos.time[near]
-    return Samples(time, pos.values[near], pos.sigma), Samples(time, attitude_at(quat.time, quat.values, time).as_quat(), quat.sigma)
+    return Samples(time, pos.values[near], pos.sigma), Samples(
+        time, attitude_at(quat.time, quat.values, time).as_quat(), quat.sigma
+    )
 
 
 def carriers(flights: Sequence[Recorded]) -> list[bool]:
-    """Whether each flight carries a payload: as its log says, else if it was measured or released there.
+    """Whether each flight carries a payload: as its log says, else if it was measured or released
+    there.
 
     Where no flight measured the payload, one release tells that it hung below in all.
     """
     measured_somewhere = any(f.payload is not None for f in flights)
     released_somewhere = any(f.latch != NEVER for f in flights)
-    seen = [f.payload is not None or f.latch != NEVER if measured_somewhere else released_somewhere for f in flights]
+    seen = [
+        f.payload is not None or f.latch != NEVER if measured_somewhere else released_somewhere
+        for f in flights
+    ]
     return [own if f.hanging is None else f.hanging for f, own in zip(flights, seen)]
 
 
@@ -200,7 +251,9 @@ def _landing(log: FlightLog) -> tuple[float, np.ndarray | None]:
 
 
 def _voltage(log: FlightLog) -> float | None:
-    """Terminal voltage at the start of a log: the median of the samples of its first moment, as single ones are noisy."""
+    """Terminal voltage at the start of a log: the median of the samples of its first moment, as
+    single ones are noisy.
+    """
     channel = measured(log, "battery_voltage")
     if channel is None:
         return None
@@ -213,4 +266,8 @@ def _payload(log: FlightLog, landing: float) -> Samples | None:
     if samples is None:
         return None
     keep = samples.time < landing - 1e-3
-    return Samples(samples.time[keep], samples.values[keep], samples.sigma) if np.count_nonzero(keep) >= 5 else None
+    return (
+        Samples(samples.time[keep], samples.values[keep], samples.sigma)
+        if np.count_nonzero(keep) >= 5
+        else None
+    )

@@ -1,4 +1,6 @@
-"""Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes of a batch share."""
+"""Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes
+of a batch share.
+"""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -20,9 +22,16 @@ KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
 FINENESS = {"throw": 0.25}  # step in a phase against the one asked for: the rope whips in throws
 FINEST = 0.01  # of the square of the step: a tenth of the step asked for
-ROUGHER = 3.0  # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
-STABLE = 1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
-BATCH, CUDA_BATCH = 4096, 32768  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
+ROUGHER = (
+    3.0  # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
+)
+STABLE = (
+    1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
+)
+BATCH, CUDA_BATCH = (
+    4096,
+    32768,
+)  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
 
 
 def downloaded(array: wp.array) -> np.ndarray:
@@ -31,9 +40,15 @@ def downloaded(array: wp.array) -> np.ndarray:
 
 
 def rough_step(setting: Setting, substep: float) -> float:
-    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest lag allows."""
+    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest
+    lag allows.
+    """
     controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
-    lags = [controller.gyro_time_constant, controller.setpoint_time_constant] if controller.kind != "geometric" else []
+    lags = (
+        [controller.gyro_time_constant, controller.setpoint_time_constant]
+        if controller.kind != "geometric"
+        else []
+    )
     lags += [motor.time_constant] if motor.kind != "instant" else []
     lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
     nominal = substep * np.sqrt(max(setting.step_square, FINEST))
@@ -48,14 +63,27 @@ class Simulation:
         settings: a lane names its by the row.
     """
 
-    def __init__(self, settings: Sequence[Setting], substep: float, device: str, download: Callable[[wp.array], Any] = downloaded):
+    def __init__(
+        self,
+        settings: Sequence[Setting],
+        substep: float,
+        device: str,
+        download: Callable[[wp.array], Any] = downloaded,
+    ):
         """Move them to a device.
 
-        ``substep``: largest integration step [s]; ``download``: makes of the device's arrays what flights return.
-        """
+        ``substep``: largest integration step [s]; ``download``: makes of the device's arrays what
+        flights return."""
         self.settings = list(settings)
-        self.replay = Replay([s.plant for s in settings], [s.sensing for s in settings], device, download=download)
-        self.steps = np.array([(substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep)) for s in settings])
+        self.replay = Replay(
+            [s.plant for s in settings], [s.sensing for s in settings], device, download=download
+        )
+        self.steps = np.array(
+            [
+                (substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep))
+                for s in settings
+            ]
+        )
 
 
 class Lane(NamedTuple):
@@ -78,17 +106,22 @@ class Flights:
     """Windows of recorded flights as the replay's arrays.
 
     Attributes:
-        cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in vectors. recording: for a replay.
+        cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in
+            vectors. recording: for a replay.
         time: stamps of each window's samples [s], shape (N,). sigma: their noise.
     """
 
-    def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float]):
+    def __init__(
+        self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float]
+    ):
         """Lay out flights and windows.
 
         ``delays``: of vehicle, payload and gyro that the setting knows of [s].
         """
         self.flights, self.cuts = list(flights), list(cuts)
-        self.knots = np.array([int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts])
+        self.knots = np.array(
+            [int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts]
+        )
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
         self.windows = {name: np.zeros(len(self.cuts)) for name in WINDOW_FIELDS}
@@ -97,11 +130,22 @@ class Flights:
         for w, c in enumerate(self.cuts):
             f = self.flights[c.flight]
             given = {
-                "start": c.start, "end": c.end, "first_knot": c.start, "knots": self.knots[w], "payload": c.payload,
-                "latch": f.latch if c.payload == ATTACHED else NEVER, "clock_zero": f.start,
-                "command_first": lengths[c.flight], "command_last": lengths[c.flight + 1],
-            }  # fmt: skip
-            sources = f.vehicle, f.attitude, f.payload if c.payload in (ATTACHED, LOOSE) else None, f.gyro
+                "start": c.start,
+                "end": c.end,
+                "first_knot": c.start,
+                "knots": self.knots[w],
+                "payload": c.payload,
+                "latch": f.latch if c.payload == ATTACHED else NEVER,
+                "clock_zero": f.start,
+                "command_first": lengths[c.flight],
+                "command_last": lengths[c.flight + 1],
+            }
+            sources = (
+                f.vehicle,
+                f.attitude,
+                f.payload if c.payload in (ATTACHED, LOOSE) else None,
+                f.gyro,
+            )
             for name, source, delay in zip(parts, sources, (delays[0], *delays)):
                 own = source or Samples(np.zeros(0), np.zeros((0, 3)), 1.0)
                 span = own.between(c.start + delay + EARLY, c.end + delay)
@@ -110,20 +154,30 @@ class Flights:
                 counts[name] += len(own.time[span])
             for name in self.windows:
                 self.windows[name][w] = given[name]
-        self.windows = {k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()}
+        self.windows = {
+            k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()
+        }
         self.samples = parts
         data = {
             "command_time": np.concatenate([f.command_time for f in self.flights]),
             "command": np.concatenate([f.command for f in self.flights]),
-            "vehicle_time": self._joined("vehicle").time, "vehicle_quat": self._joined("attitude").values,
-            "payload_time": self._joined("payload").time, "gyro_time": self._joined("gyro").time,
-        }  # fmt: skip
+            "vehicle_time": self._joined("vehicle").time,
+            "vehicle_quat": self._joined("attitude").values,
+            "payload_time": self._joined("payload").time,
+            "gyro_time": self._joined("gyro").time,
+        }
         self.recording = Recording(self.windows, data)
         self.rows = self.recording.rows
         self.time = self._of_samples("time", ("vehicle", "vehicle", "payload", "gyro"))
         self.sigma = self._of_samples("sigma", ("vehicle", "attitude", "payload", "gyro"))
-        pairs = [np.stack((own.values, np.zeros_like(own.values)), axis=1).reshape(-1, 3) for own in parts["vehicle"]]
-        self._measured = [np.concatenate((own, p.values, g.values)) for own, p, g in zip(pairs, parts["payload"], parts["gyro"])]
+        pairs = [
+            np.stack((own.values, np.zeros_like(own.values)), axis=1).reshape(-1, 3)
+            for own in parts["vehicle"]
+        ]
+        self._measured = [
+            np.concatenate((own, p.values, g.values))
+            for own, p, g in zip(pairs, parts["payload"], parts["gyro"])
+        ]
 
     def _of_samples(self, what: str, names: Sequence[str]) -> list[np.ndarray]:
         groups = zip(*([getattr(own, what) for own in self.samples[name]] for name in names))
@@ -135,7 +189,9 @@ class Flights:
         return c.payload, self.flights[c.flight].latch >= c.end
 
     def alike(self, w: int, setting: Setting, other: Setting) -> bool:
-        """Whether a window is flown alike in two settings, which may be seen otherwise: what differs does nothing in it."""
+        """Whether a window is flown alike in two settings, which may be seen otherwise: what
+        differs does nothing in it.
+        """
         c, plant = self.cuts[w], other.plant
         if setting.step_square != other.step_square:
             return False
@@ -147,7 +203,9 @@ class Flights:
 
     def _joined(self, name: str) -> Samples:
         parts = self.samples[name]
-        return Samples(np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0)
+        return Samples(
+            np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0
+        )
 
     def spread(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
         """A number for every sample of a window, from one for each row of its groups."""
@@ -160,10 +218,18 @@ class Flights:
         return np.repeat(np.concatenate((pairs, *rest)), 3)
 
     def residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
-        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the simulated to the measured."""
+        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the
+        simulated to the measured.
+        """
         return (self._measured[w] - seen[: int(self.rows[w]), lane]).ravel()
 
-    def fly(self, simulation: Simulation, states: States, lanes: Sequence[Lane], recording: Recording | None = None) -> Replayed:
+    def fly(
+        self,
+        simulation: Simulation,
+        states: States,
+        lanes: Sequence[Lane],
+        recording: Recording | None = None,
+    ) -> Replayed:
         """Fly lanes.
 
         Args:
@@ -173,10 +239,15 @@ class Flights:
             recording: the windows, if not as they are.
         """
         given = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
-        given["substep"] = simulation.steps[given["plant"], given.pop("rough").astype(int)] * self._fineness[given["window"]]
+        given["substep"] = (
+            simulation.steps[given["plant"], given.pop("rough").astype(int)]
+            * self._fineness[given["window"]]
+        )
         kept = given["keep"] >= 0
         knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
-        return simulation.replay.run(states, recording or self.recording, given, KNOT_SPACING, knots)
+        return simulation.replay.run(
+            states, recording or self.recording, given, KNOT_SPACING, knots
+        )
 
     def repeated(self, windows: np.ndarray) -> "Flights":
         """The same as it concerns :meth:`fly`, of windows that stand there more than once."""
@@ -190,7 +261,8 @@ class Flights:
 
 
 def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
-    """Initial states of all windows: smoothed measurements and, for what nobody measures, what flying through the windows before gives.
+    """Initial states of all windows: smoothed measurements and, for what nobody measures, what
+    flying through the windows before gives.
 
     ``flights``: the windows, those of one flight in order of time; ``simulation``: of one setting.
     Returns the states, and those at the windows' ends that they lead to.
@@ -206,7 +278,9 @@ def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
         for w in now:
             c = flights.cuts[w]
             flight, before = flights.flights[c.flight], by_flight[c.flight][k - 1] if k else None
-            gap = before is None or c.start > flights.cuts[before].end + 1e-6  # in which the inner states have gone
+            gap = (
+                before is None or c.start > flights.cuts[before].end + 1e-6
+            )  # in which the inner states have gone
             inner = hover_state(flight, setting.plant, c.payload) if gap else ends[before]
             states[w] = measured_state(flight, c.start, setting, c.payload, inner)
             if gap:
@@ -214,5 +288,7 @@ def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
         lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
         flown = flights.fly(simulation, stacked([states[w] for w in now]), lanes)
         for row, w in enumerate(now):
-            ends[w] = {name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()}
+            ends[w] = {
+                name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()
+            }
     return stacked(states), stacked(ends)

@@ -1,4 +1,6 @@
-"""Initial states of replay windows: from smoothed measurements, and the directions in which they are not known."""
+"""Initial states of replay windows: from smoothed measurements, and the directions in which they
+are not known.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,25 +15,36 @@ from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded import Recorded, Samples
 
-SMOOTH_BEFORE, SMOOTH_AFTER = 0.06, 0.08  # of a window's start, over which measurements are smoothed [s]
+SMOOTH_BEFORE, SMOOTH_AFTER = (
+    0.06,
+    0.08,
+)  # of a window's start, over which measurements are smoothed [s]
 LEAST_SAMPLES = 6
 MODES = 4  # half waves of a bent rope
 INTEGRAL = 1.0
-"""Deviation of the rate error's integral [rad]: with a third of it the integrators of 80 windows pull a centre of mass that lies
-1.4 mm off by a quarter towards the frame's origin."""
+"""Deviation of the rate error's integral [rad]: with a third of it the integrators of 80 windows
+pull a centre of mass that lies 1.4 mm off by a quarter towards the frame's origin.
+"""
 
 BENT, SHAKEN = (0.03, 0.5), (0.1, 1.5)
-"""Deviation of a bend of the rope [rad] and of its rate [rad/s]: where the rope stayed taut, and where it has just come taut.
+"""Deviation of a bend of the rope [rad] and of its rate [rad/s]: where the rope stayed taut, and
+where it has just come taut.
 
-Ropes that fly through the windows before a window arrive there with bends of some 0.005 rad, of 0.03 rad at most. A wider prior
-lets a rope that is too long for what was measured bend until it is short enough; what it does then is whip."""
+Ropes that fly through the windows before a window arrive there with bends of some 0.005 rad, of
+0.03 rad at most. A wider prior lets a rope that is too long for what was measured bend until it is
+short enough; what it does then is whip."""
 HUNG = 0.1
-"""Of that, where the rope hung still before: there ropes arrive with bends of 0.0005 rad. A wider prior invents bends of
-0.02 rad out of noise; they whip, and tell of the rope's and the payload's mass what is not so."""
+"""Of that, where the rope hung still before: there ropes arrive with bends of 0.0005 rad.
+
+A wider prior invents bends of 0.02 rad out of noise; they whip, and tell of the rope's and the
+payload's mass what is not so.
+"""
 
 States = dict[str, np.ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
 MOVED = "moved"
-"""Beside the fields: how far a fit moved each state along the directions from where their prior has its middle, shape (S, directions)."""
+"""Beside the fields: how far a fit moved each state along the directions from where their prior has
+its middle, shape (S, directions).
+"""
 
 
 @dataclass(frozen=True)
@@ -43,11 +56,15 @@ class Direction:
     sd: float  # vague prior, in the field's unit (attitude: angle [rad])
     step: float  # for the derivative
     part: str | int = ""  # of the rope: "all" segments, the "last", or the half waves of a bend
-    calm: float | None = None  # the prior in windows whose rope was taut all the time, where it is another
+    calm: float | None = (
+        None  # the prior in windows whose rope was taut all the time, where it is another
+    )
 
     @property
     def follows(self) -> bool:
-        """Whether it goes with the effects: a bend of the rope does not, which would take the place of a wrong length."""
+        """Whether it goes with the effects: a bend of the rope does not, which would take the place
+        of a wrong length.
+        """
         return not self.field.startswith("cable") or self.part == "all"
 
     def spread(self, c: Cut) -> float:
@@ -66,7 +83,11 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
     found += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
     found += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
     if plant.vehicle.controller.kind != "geometric":
-        found += [Direction("integral", i, INTEGRAL * gain[i], 1e-3 * gain[i]) for i in range(3) if gain[i] > 0.0]
+        found += [
+            Direction("integral", i, INTEGRAL * gain[i], 1e-3 * gain[i])
+            for i in range(3)
+            if gain[i] > 0.0
+        ]
     if plant.vehicle.motor.kind != "instant":
         found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
     found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
@@ -79,7 +100,9 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
 
 
 def concerns(direction: Direction, c: Cut) -> bool:
-    """Whether the state at the start of a window has the direction: higher bends only a rope that has just come taut."""
+    """Whether the state at the start of a window has the direction: higher bends only a rope that
+    has just come taut.
+    """
     if direction.field.startswith("cable"):
         return c.payload == ATTACHED and (c.after_slack or direction.part in ("all", "last", 1))
     return c.payload == LOOSE if direction.field.startswith("payload") else True
@@ -94,7 +117,9 @@ def _tangents(n: np.ndarray) -> np.ndarray:
 
 
 def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarray) -> States:
-    """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope before its rates."""
+    """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope
+    before its rates.
+    """
     out = dict(states)
     for field in dict.fromkeys(direction.field for direction in directions):
         own = [d for d, direction in enumerate(directions) if direction.field == field]
@@ -105,7 +130,9 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
             value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
         elif field.startswith("cable"):
             n = out["cable_dir_w"]
-            frame = _tangents(n[:, -1])[:, axes]  # one plane for the whole rope: that of its mean direction
+            frame = _tangents(n[:, -1])[
+                :, axes
+            ]  # one plane for the whole rope: that of its mean direction
             shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in own])
             across = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
             value = out[field] + across - np.sum(across * n, axis=-1, keepdims=True) * n
@@ -123,7 +150,9 @@ def _shape(part: str | int, segments: int) -> np.ndarray:
     """How far each segment turns, shape (L,)."""
     if isinstance(part, int):
         return np.cos(part * np.pi * (np.arange(segments) + 0.5) / segments)
-    return np.ones(segments) if part == "all" else (np.arange(segments) == segments - 1).astype(float)
+    return (
+        np.ones(segments) if part == "all" else (np.arange(segments) == segments - 1).astype(float)
+    )
 
 
 def rows_of(states: States, rows: np.ndarray) -> States:
@@ -155,13 +184,17 @@ def resampled(states: States, segments: int) -> States:
 def smoothed(
     samples: Samples, at: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Value and derivative at a time from a local cubic through the samples about it; None without enough of them."""
+    """Value and derivative at a time from a local cubic through the samples about it; None without
+    enough of them.
+    """
     if (at, before, after) not in samples.near:
         samples.near[at, before, after] = _smoothed(samples, at, before, after)
     return samples.near[at, before, after]
 
 
-def _smoothed(samples: Samples, at: float, before: float, after: float) -> tuple[np.ndarray, np.ndarray] | None:
+def _smoothed(
+    samples: Samples, at: float, before: float, after: float
+) -> tuple[np.ndarray, np.ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
         span = samples.between(at - reach * before, at + reach * after)
         if span.stop - span.start >= LEAST_SAMPLES:
@@ -181,16 +214,28 @@ def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.
     return (middle * Rotation.from_rotvec(fit[0])).as_quat(), fit[1]
 
 
-def measured_state(flight: Recorded, at: float, setting: Setting, payload: int, inner: States) -> States:
-    """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one state).
+def measured_state(
+    flight: Recorded, at: float, setting: Setting, payload: int, inner: States
+) -> States:
+    """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one
+    state).
 
     The measurements are taken back through the setting's delays, frame and markers.
     """
     out = {name: value.copy() for name, value in inner.items()}
     x, plant = setting.sensing, setting.plant
-    level, marker = Rotation.from_rotvec(x.frame_tilt).inv(), Rotation.from_rotvec(x.marker_rotation)
-    pos, vel = smoothed(flight.vehicle, at + x.vehicle_delay) or (flight.vehicle.values[0], np.zeros(3))
-    quat, rate = smoothed(flight.attitude, at + x.vehicle_delay) or (flight.attitude.values[0], np.zeros(3))
+    level, marker = (
+        Rotation.from_rotvec(x.frame_tilt).inv(),
+        Rotation.from_rotvec(x.marker_rotation),
+    )
+    pos, vel = smoothed(flight.vehicle, at + x.vehicle_delay) or (
+        flight.vehicle.values[0],
+        np.zeros(3),
+    )
+    quat, rate = smoothed(flight.attitude, at + x.vehicle_delay) or (
+        flight.attitude.values[0],
+        np.zeros(3),
+    )
     attitude = level * Rotation.from_quat(quat) * marker.inv()
     rate = marker.apply(rate)
     if flight.gyro is not None and (seen := smoothed(flight.gyro, at + x.gyro_delay)) is not None:
@@ -210,8 +255,12 @@ def measured_state(flight: Recorded, at: float, setting: Setting, payload: int, 
     return out
 
 
-def _hang(state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray) -> None:
-    """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and follows both."""
+def _hang(
+    state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray
+) -> None:
+    """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and
+    follows both.
+    """
     arm = np.array(plant.rope.mount) - np.array(plant.vehicle.body.com)
     mount = state["pos_w"][0] + attitude.apply(arm)
     mount_vel = state["vel_w"][0] + attitude.apply(cross(state["rate_b"][0], arm))
@@ -238,29 +287,41 @@ def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
     speed, power = np.sqrt(thrust / 4.0 / v.thrust.k_f), _power(v, thrust)
     used = _charge(flight, v, power)
     open_volts = float(np.polynomial.polynomial.polyval(used, v.battery.ocv))
-    sagged = 0.5 * (open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0)))
+    sagged = 0.5 * (
+        open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0))
+    )
     down = np.array([0.0, 0.0, -1.0])
-    state = {name: np.zeros((1, L, 3) if rows else (1, 3)) for name, (_, rows) in STATE_FIELDS.items()}
+    state = {
+        name: np.zeros((1, L, 3) if rows else (1, 3)) for name, (_, rows) in STATE_FIELDS.items()
+    }
     state |= {"slack_first": np.zeros(1), "slack_last": np.zeros(1)}
     below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L
     state |= {
-        "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]), "motor_speed": np.full((1, 4), speed),
-        "setpoint": flight.command[:1, 1:].copy(), "gyro": np.zeros((1, 3)), "charge_used": np.array([used]),
+        "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]),
+        "motor_speed": np.full((1, 4), speed),
+        "setpoint": flight.command[:1, 1:].copy(),
+        "gyro": np.zeros((1, 3)),
+        "charge_used": np.array([used]),
         "voltage": np.array([sagged if v.battery.kind == "sag" else v.battery.reference_voltage]),
-        "cable_dir_w": np.tile(down, (1, L, 1)), "stiffness": below[None] * GRAVITY * rope.length / L,
-    }  # fmt: skip
+        "cable_dir_w": np.tile(down, (1, L, 1)),
+        "stiffness": below[None] * GRAVITY * rope.length / L,
+    }
     return state
 
 
 def _power(v: VehicleParams, thrust: float) -> float:
     """Power drawn from the battery under a steady collective thrust [N]: [W]."""
     speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
-    return float(v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency)
+    return float(
+        v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
+    )
 
 
 def _charge(flight: Recorded, v: VehicleParams, power: float) -> float:
-    """Fraction of the charge used at the start, from the first voltage and the power [W] drawn then. Where none was logged: from that of
-    the hover in which throttle was calibrated, where the controller makes up for no other; else a fifth."""
+    """Fraction of the charge used at the start, from the first voltage and the power [W] drawn
+    then. Where none was logged: from that of the hover in which throttle was calibrated, where the
+    controller makes up for no other; else a fifth.
+    """
     cell, c = v.battery, v.controller
     volts = flight.voltage
     if volts is None and c.kind == "motor_mixing":

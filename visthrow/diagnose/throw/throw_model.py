@@ -1,4 +1,6 @@
-"""The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded commands."""
+"""The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded
+commands.
+"""
 
 import copy
 import dataclasses
@@ -21,13 +23,26 @@ from visthrow.diagnose.likelihood.threads import aside, each
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
-from visthrow.diagnose.throw.direct import channels_of, direct_measurements, needs_no_flight, with_direct
+from visthrow.diagnose.throw.direct import (
+    channels_of,
+    direct_measurements,
+    needs_no_flight,
+    with_direct,
+)
 from visthrow.diagnose.throw.dropped import without_each_command
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.landing import Landings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
-from visthrow.diagnose.throw.replay import BATCH, CUDA_BATCH, Flights, Lane, Simulation, carried, downloaded
+from visthrow.diagnose.throw.replay import (
+    BATCH,
+    CUDA_BATCH,
+    Flights,
+    Lane,
+    Simulation,
+    carried,
+    downloaded,
+)
 from visthrow.diagnose.throw.states import (
     MOVED,
     Direction,
@@ -54,10 +69,18 @@ class ThrowModel:
     """
 
     def __init__(
-        self, logs: Sequence[FlightLog], plant: PlantParams, *, sensing: SensingParams | None = None, camera: CameraParams | None = None,
-        device: str = "cpu", substep: float = 0.002, only: Sequence[str] | None = None, carries: bool | None = None,
+        self,
+        logs: Sequence[FlightLog],
+        plant: PlantParams,
+        *,
+        sensing: SensingParams | None = None,
+        camera: CameraParams | None = None,
+        device: str = "cpu",
+        substep: float = 0.002,
+        only: Sequence[str] | None = None,
+        carries: bool | None = None,
         simpler: bool = False,
-    ):  # fmt: skip
+    ):
         """Cut the flights and find the windows' initial states.
 
         Raises DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
@@ -67,8 +90,10 @@ class ThrowModel:
             device: "cpu" or "cuda:0".
             substep: largest integration step [s].
             only: names of the effects to consider; default all that apply.
-            carries: whether a payload hangs below in all flights; default: in those in which one was measured or released.
-            simpler: consider also blocks simpler than the plant's, such as a rigid rope; each compiles a kernel.
+            carries: whether a payload hangs below in all flights; default: in those in which one
+                was measured or released.
+            simpler: consider also blocks simpler than the plant's, such as a rigid rope; each
+                compiles a kernel.
             camera: whose keypoints the logs hold.
         """
         self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
@@ -80,7 +105,10 @@ class ThrowModel:
         carries, release = any(hangs), (plant.release.lag, plant.release.landing_height)
         cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])])
         if not cuts:
-            raise DiagnoseError(f"{len(flights)} flights hold no stretch of poses and commands long enough to replay")
+            raise DiagnoseError(
+                f"{len(flights)} flights hold no stretch of poses and commands long enough to"
+                " replay"
+            )
         self.channels = [*_measured(flights, carries), *channels_of(logs, flights, camera)]
         thrown = any(f.latch != NEVER for f in flights)
         concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
@@ -98,9 +126,13 @@ class ThrowModel:
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
-        self._before: dict[frozenset[str], list[np.ndarray]] = {}  # what the fits of the latest states took from windows' residuals
+        self._before: dict[
+            frozenset[str], list[np.ndarray]
+        ] = {}  # what the fits of the latest states took from windows' residuals
         self._lock = threading.Lock()  # residuals may be asked for side by side
-        self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = None  # the last that was asked for
+        self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = (
+            None  # the last that was asked for
+        )
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
 
     def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut]) -> Flights:
@@ -109,28 +141,43 @@ class ThrowModel:
         return Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
 
     def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
-        """Take these effects: first those that are simulated by degrees, then switches, then what only cameras see."""
+        """Take these effects: first those that are simulated by degrees, then switches, then what
+        only cameras see.
+        """
         self._sighted = [e for e in effects.values() if needs_no_flight(e)]
         self._graded = [e for e in effects.values() if not e.switch and e not in self._sighted]
         self._switched = [e for e in effects.values() if e.switch]
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
-        self._secants: dict[str, list[np.ndarray]] = {}  # of other kinds of blocks, by their name, where they were asked for first
+        self._secants: dict[
+            str, list[np.ndarray]
+        ] = {}  # of other kinds of blocks, by their name, where they were asked for first
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.interface.Model`; with what was seen besides poses."""
+        """See :class:`visthrow.diagnose.models.interface.Model`; with what was seen
+        besides poses.
+        """
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
-        states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = self._settled(setting)
+        states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = (
+            self._settled(setting)
+        )
         entries = self.entries.values()
-        steps = np.array([0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries])
-        settings = [setting, *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)]]
+        steps = np.array(
+            [0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries]
+        )
+        settings = [
+            setting,
+            *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)],
+        ]
         graded, begun = len(self._graded), perturbed(states, self._directions)
         simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
         found: list[Window] = []
         for batch in self._batches():
             found += self._linearised(simulation, steps[:graded], begun, batch)
-        self._before[self._switches(theta)] = [x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, found)]
+        self._before[self._switches(theta)] = [
+            x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, found)
+        ]
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, found)
@@ -138,38 +185,56 @@ class ThrowModel:
         columns = [*(self._secants[e.name] for e in self._switched), *[blank] * len(self._sighted)]
         if columns:
             found = [
-                dataclasses.replace(w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1))))
+                dataclasses.replace(
+                    w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1)))
+                )
                 for i, w in enumerate(found)
             ]
-        return [with_direct(w, number, self._direct, self.channels, settings, steps) for number, w in zip(self._retained, found)]
+        return [
+            with_direct(w, number, self._direct, self.channels, settings, steps)
+            for number, w in zip(self._retained, found)
+        ]
 
-    def _secant(self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]) -> list[np.ndarray]:
-        """Samples with the other kind of block less those with this one, per theta; a column for each window.
+    def _secant(
+        self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]
+    ) -> list[np.ndarray]:
+        """Samples with the other kind of block less those with this one, per theta; a column for
+        each window.
 
-        Each kind begins in initial states settled for it: a transient that the other's state brings would be taken for its effect.
-        """
+        Each kind begins in initial states settled for it: a transient that the other's state brings
+        would be taken for its effect."""
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = {**theta, e.name: 0.0 if on else 1.0}
         other = apply(self.entries, self.setting, elsewhere)
         start = self._latest[self._switches(elsewhere)] = self._settled(other)
         sign = -1.0 if on else 1.0
         before = self._before[self._switches(theta)]
-        return [sign * (x.residual - own - there) for x, own, there in zip(windows, before, self._flown(other, start))]
+        return [
+            sign * (x.residual - own - there)
+            for x, own, there in zip(windows, before, self._flown(other, start))
+        ]
 
     def _moved(self, states: States, w: int) -> np.ndarray:
-        """How far a window's state is from the middle of its prior, in its directions, shape (D,)."""
+        """How far a window's state is from the middle of its prior, in its directions,
+        shape (D,).
+        """
         return states[MOVED][w, [concerns(x, self.flights.cuts[w]) for x in self._directions]]
 
     def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
-        seen = self.flights.fly(self.simulation(setting), states, [Lane(w, 0, w) for w in self._retained]).seen
+        seen = self.flights.fly(
+            self.simulation(setting), states, [Lane(w, 0, w) for w in self._retained]
+        ).seen
         return [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
 
-    def residuals(self, theta: Mapping[str, float], about: Linearised | None = None) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled last with the same kinds of blocks.
+    def residuals(
+        self, theta: Mapping[str, float], about: Linearised | None = None
+    ) -> list[np.ndarray]:
+        """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled
+        last with the same kinds of blocks.
 
-        Until windows are asked for, they are those of the states that were fitted; then those from the middle of the states' prior.
-        """
+        Until windows are asked for, they are those of the states that were fitted; then those from
+        the middle of the states' prior."""
         setting = apply(self.entries, self.setting, theta)
         states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
         if about is not None:
@@ -178,23 +243,39 @@ class ThrowModel:
         if about is None and (before := self._before.get(self._switches(theta))) is not None:
             flown = [r + own for r, own in zip(flown, before)]
         held = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
-        direct = [[kind.samples(w)[1] - kind.predicted(w, setting) for kind in own] for w, own in zip(self._retained, held)]
+        direct = [
+            [kind.samples(w)[1] - kind.predicted(w, setting) for kind in own]
+            for w, own in zip(self._retained, held)
+        ]
         full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
-        return [r + about.windows[i].nuisance @ moves[i] if i in moves else r for i, r in enumerate(full)]
+        return [
+            r + about.windows[i].nuisance @ moves[i] if i in moves else r
+            for i, r in enumerate(full)
+        ]
 
-    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[np.ndarray]:
-        """Change of some windows' replayed samples by each command that does not come: the one before stays. Shape (N, T) each.
+    def without_commands(
+        self, theta: Mapping[str, float], windows: Sequence[int]
+    ) -> list[np.ndarray]:
+        """Change of some windows' replayed samples by each command that does not come: the one
+        before stays. Shape (N, T) each.
 
-        ``theta``: sizes of the effects, at which :meth:`windows` was asked for before; ``windows``: numbers among those that came.
-        """
+        ``theta``: sizes of the effects, at which :meth:`windows` was asked for before; ``windows``:
+        numbers among those that came."""
         setting = apply(self.entries, self.setting, theta)
-        states, known = self._settled_at.get(_key(theta), self._fitted()[0]), self.setting.plant.vehicle.queue.delay
-        return without_each_command(self.flights, self._retained[list(windows)], known, self.simulation(setting), states)
+        states, known = (
+            self._settled_at.get(_key(theta), self._fitted()[0]),
+            self.setting.plant.vehicle.queue.delay,
+        )
+        return without_each_command(
+            self.flights, self._retained[list(windows)], known, self.simulation(setting), states
+        )
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], about: Linearised
     ) -> tuple[States, dict[int, np.ndarray]]:
-        """States that belong to other sizes of the effects by the derivatives, and how each window's were moved."""
+        """States that belong to other sizes of the effects by the derivatives, and how each
+        window's were moved.
+        """
         names = list(self.entries)
         change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
         found = directions(setting.plant)
@@ -207,14 +288,27 @@ class ThrowModel:
         moved = sizes + self._settled_at[_key(about.theta)][MOVED]
         return states, {i: moved[self._retained[i], own] for i, own in owns.items()}
 
-    def _ways(self, found: Sequence[Direction], about: Linearised, effects: int) -> tuple[dict[int, list[int]], np.ndarray]:
-        """Which directions each window's state has, and how it follows the effects in them, shape (W, directions, K)."""
+    def _ways(
+        self, found: Sequence[Direction], about: Linearised, effects: int
+    ) -> tuple[dict[int, list[int]], np.ndarray]:
+        """Which directions each window's state has, and how it follows the effects in them, shape
+        (W, directions, K).
+        """
         cuts = self.flights.cuts
-        owns = {i: [d for d, x in enumerate(found) if concerns(x, cuts[self._retained[i]])] for i in about.windows}
+        owns = {
+            i: [d for d, x in enumerate(found) if concerns(x, cuts[self._retained[i]])]
+            for i in about.windows
+        }
 
         def way(i: int) -> np.ndarray:
             free = np.array([found[d].follows for d in owns[i]], dtype=bool)
-            return following(self.flights, self._retained[i], about.windows[i], free, self.setting.plant.release.lag)
+            return following(
+                self.flights,
+                self._retained[i],
+                about.windows[i],
+                free,
+                self.setting.plant.release.lag,
+            )
 
         by_effect = np.zeros((len(cuts), len(found), effects))
         for i, moves in zip(owns, each(way, owns)):
@@ -226,21 +320,32 @@ class ThrowModel:
         return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
-        """Largest change of any sample of each channel when the step is so many times finer, in its noise."""
+        """Largest change of any sample of each channel when the step is so many times finer, in its
+        noise.
+        """
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         worst, states = np.zeros(len(self.channels)), self._fitted()[0]
-        for w, plain, other in zip(self._retained, self._flown(self.setting, states), self._flown(fine, states)):
+        for w, plain, other in zip(
+            self._retained, self._flown(self.setting, states), self._flown(fine, states)
+        ):
             np.fmax.at(worst, self._channel(w), np.abs(plain - other) / self.flights.sigma[w])
         return dict(zip(self.channels, worst.tolist()))
 
-    def landings(self, theta: Mapping[str, float], flights: Sequence[int] | None = None) -> Landings:
+    def landings(
+        self, theta: Mapping[str, float], flights: Sequence[int] | None = None
+    ) -> Landings:
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """The same model of other windows of its flights."""
         other = copy.copy(self)
-        other._settled_at, other._before, other._follows, other._secants = {}, {}, None, {}  # of other windows
+        other._settled_at, other._before, other._follows, other._secants = (
+            {},
+            {},
+            None,
+            {},
+        )  # of other windows
         other.flights = self._cut(self.flights.flights, cuts)
         other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return other
@@ -250,7 +355,9 @@ class ThrowModel:
         setting = apply(self.entries, self.setting, theta)
         return setting, self._settled(setting)
 
-    def simulation(self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded) -> Simulation:
+    def simulation(
+        self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded
+    ) -> Simulation:
         """Settings ready to be flown in, with this model's steps."""
         return Simulation(settings, self.substep, self.device, download)
 
@@ -262,10 +369,14 @@ class ThrowModel:
 
     def _initial_fit(self, setting: Setting) -> InitialFit:
         """What fits initial states in a setting."""
-        return InitialFit(self.flights, self._retained, self.simulation(setting), self.setting.plant.release.lag)
+        return InitialFit(
+            self.flights, self._retained, self.simulation(setting), self.setting.plant.release.lag
+        )
 
     def _fitted(self, states: States | None = None) -> tuple[States, dict[int, np.ndarray]]:
-        """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by them; of the same windows, once."""
+        """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by
+        them; of the same windows, once.
+        """
         cuts = tuple(self.flights.cuts)
         if cuts not in self._fits:
             if states is None and (among := self._among_more(cuts)) is not None:
@@ -276,26 +387,39 @@ class ThrowModel:
         return self._fits[cuts]
 
     def _among_more(self, cuts: tuple[Cut, ...]) -> tuple[States, dict[int, np.ndarray]] | None:
-        """What was fitted to all windows of some flights among those of others, as each flight is fitted by itself."""
+        """What was fitted to all windows of some flights among those of others, as each flight is
+        fitted by itself.
+        """
         flights = {c.flight for c in cuts}
         for more, (states, slopes) in self._fits.items():
             rows = [row for row, c in enumerate(more) if c.flight in flights]
             if cuts == tuple(more[row] for row in rows):
-                return rows_of(states, np.array(rows)), {w: slopes[row] for w, row in enumerate(rows) if row in slopes}
+                return rows_of(states, np.array(rows)), {
+                    w: slopes[row] for w, row in enumerate(rows) if row in slopes
+                }
         return None
 
     def _settled(self, setting: Setting) -> States:
-        """States fitted in a setting, from the better of those fitted at theta = 0 and those that the setting begins with."""
+        """States fitted in a setting, from the better of those fitted at theta = 0 and those that
+        the setting begins with.
+        """
         states, slopes = self._fitted()
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting)
-        ways = [[(x.field, x.axis, x.part) for x in found] for found in (fitter.directions, directions(self.setting.plant))]
+        ways = [
+            [(x.field, x.axis, x.part) for x in found]
+            for found in (fitter.directions, directions(self.setting.plant))
+        ]
         start = dict(resampled(states, setting.plant.rope.segments))
         if ways[0] != ways[1]:
             moved = dict(zip(ways[1], states[MOVED].T))
-            start[MOVED] = np.stack([moved.get(way, np.zeros(len(states[MOVED]))) for way in ways[0]], axis=1)
-        return fitter.fit([start, self._through(setting)[0]], slopes if ways[0] == ways[1] else None)
+            start[MOVED] = np.stack(
+                [moved.get(way, np.zeros(len(states[MOVED]))) for way in ways[0]], axis=1
+            )
+        return fitter.fit(
+            [start, self._through(setting)[0]], slopes if ways[0] == ways[1] else None
+        )
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
@@ -315,13 +439,21 @@ class ThrowModel:
             room -= lanes
         return batches
 
-    def _linearised(self, simulation: Simulation, steps: np.ndarray, states: States, batch: list[int]) -> list[Window]:
-        f, settings, needs = self.flights, simulation.settings, np.array([exact(e) for e in self._graded], dtype=bool)
+    def _linearised(
+        self, simulation: Simulation, steps: np.ndarray, states: States, batch: list[int]
+    ) -> list[Window]:
+        f, settings, needs = (
+            self.flights,
+            simulation.settings,
+            np.array([exact(e) for e in self._graded], dtype=bool),
+        )
         plans, lanes, kept = [], [], 0
         known: dict[tuple, np.ndarray] = {}
         for w in batch:
             if f.like(w) not in known:
-                known[f.like(w)] = np.array([f.alike(w, settings[0], other) for other in settings[1:]], dtype=bool)
+                known[f.like(w)] = np.array(
+                    [f.alike(w, settings[0], other) for other in settings[1:]], dtype=bool
+                )
             plan, own = lanes_of(f, w, known[f.like(w)], needs, self._directions, len(lanes), kept)
             plans.append(plan)
             lanes += own
@@ -340,16 +472,24 @@ class ThrowModel:
         def window(i: int) -> Window:
             w, own = plans[i].window, parts[3 * i : 3 * i + 3]
             given = self._channel(w), f.residual(nominal, w, i), own, flown.knots, states[MOVED]
-            return still(plans[i].window_of(f, settings[0], self._directions, *given), blocks, settings[0].plant.air.wind_w)
+            return still(
+                plans[i].window_of(f, settings[0], self._directions, *given),
+                blocks,
+                settings[0].plant.air.wind_w,
+            )
 
         return each(window, range(len(plans)))
 
     def _channel(self, w: int) -> np.ndarray:
         at = {name: i for i, name in enumerate(self.channels)}
-        return self.flights.spread(w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)).astype(int)
+        return self.flights.spread(
+            w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)
+        ).astype(int)
 
     def _without_slack(self, ends: States) -> list[Cut]:
-        """The windows, with the time in which the rope was slack until their ends cut out; those soon after it are marked so."""
+        """The windows, with the time in which the rope was slack until their ends cut out; those
+        soon after it are marked so.
+        """
         cuts: list[Cut] = []
         rings: dict[int, float] = {}  # flight -> until when
         for w, c in enumerate(self.flights.cuts):
@@ -359,14 +499,17 @@ class ThrowModel:
                 c = dataclasses.replace(c, after_slack=True)
             if last >= c.start:
                 rings[c.flight] = last + RINGING
-            cuts += [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
+            cuts += (
+                [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
+            )
         return cuts
 
 
 def effects_for(
     setting: Setting, channels: set[str], payload: bool, releases: bool, simpler: bool = False
 ) -> dict[str, SettingEffect]:
-    """Return effects that make sense in a setting and for logs with these channels, bounded by the setting's own values.
+    """Return effects that make sense in a setting and for logs with these channels, bounded by the
+    setting's own values.
 
     ``simpler``: whether blocks simpler than the setting's are considered.
     """
@@ -380,7 +523,10 @@ def effects_for(
             continue
         if any(c in e.channels and c not in channels for c in ("rate_b", "keypoints", "landing")):
             continue
-        if name.startswith(("payload_marker", "mocap_delay_payload")) and "payload_pos_w" not in channels:
+        if (
+            name.startswith(("payload_marker", "mocap_delay_payload"))
+            and "payload_pos_w" not in channels
+        ):
             continue
         chosen[name] = e.bounded(setting)
     return chosen

@@ -13,14 +13,18 @@ from visthrow.view.parts import Grid, Picture, Section, Text, section
 from visthrow.view.tables import PAPER, PAPER_NOTE, of_paper
 
 SHORT = {
-    "pendulum": "own model", "hybrid": "training simulator", "reference": "reference plant",
+    "pendulum": "own model",
+    "hybrid": "training simulator",
+    "reference": "reference plant",
     "reference-realistic": "realistic reference plant",
-}  # fmt: skip
+}
 """Plant -> its name in tables."""
 
 
 def throws_section(thrown: ResultSet) -> Section:
-    """Landing error and duration of the shipped policies on every plant, the paper's beside them."""
+    """Landing error and duration of the shipped policies on every plant, the paper's
+    beside them.
+    """
     rows, missing = [], []
     for name in SHIPPED:
         for target in TARGETS:
@@ -32,17 +36,40 @@ def throws_section(thrown: ResultSet) -> Section:
                     continue
                 rows.append(_row(name, target, plant, found))
     lead = Text(
-        "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and 2.5 m (`vision`): for the first "
-        "2.5 m is out of distribution. The training simulator has all noise of the training; the reference plants were never seen in it."
+        "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and"
+        " 2.5 m (`vision`): for the first 2.5 m is out of distribution. The training simulator has"
+        " all noise of the training; the reference plants were never seen in it."
     )
-    head = ("policy", "target [m]", "plant", "throws", "landed", "landing error [m], mean and 95 % interval", "deviation [m]",
-            "duration [s]", "bias along / left [m]", "the paper's vehicle: error [m], duration [s]")  # fmt: skip
-    table = Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3) if rows else None
-    return section("throws", "What the policies do", lead, table, _scatter(thrown), missing=missing, head="Not thrown")
+    head = (
+        "policy",
+        "target [m]",
+        "plant",
+        "throws",
+        "landed",
+        "landing error [m], mean and 95 % interval",
+        "deviation [m]",
+        "duration [s]",
+        "bias along / left [m]",
+        "the paper's vehicle: error [m], duration [s]",
+    )
+    table = (
+        Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3) if rows else None
+    )
+    return section(
+        "throws",
+        "What the policies do",
+        lead,
+        table,
+        _scatter(thrown),
+        missing=missing,
+        head="Not thrown",
+    )
 
 
 def wanted_there(plant: str, target: float) -> bool:
-    """Whether the report wants policies thrown there: on the plain reference plant at one target alone."""
+    """Whether the report wants policies thrown there: on the plain reference plant at one target
+    alone.
+    """
     return plant != "reference" or target == FRONT_TARGET
 
 
@@ -53,9 +80,13 @@ def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]
         return (*head, "-", "-", "-", "-", paper)
     bias = st.bias(found.miss)
     return (
-        *head, st.mean(found.of("error")).text(), f"{found.of('error').std():.3f}", f"{found.of('duration').mean():.3f}",
-        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}", paper,
-    )  # fmt: skip
+        *head,
+        st.mean(found.of("error")).text(),
+        f"{found.of('error').std():.3f}",
+        f"{found.of('duration').mean():.3f}",
+        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}",
+        paper,
+    )
 
 
 def _scatter(thrown: ResultSet) -> Picture | None:
@@ -63,11 +94,18 @@ def _scatter(thrown: ResultSet) -> Picture | None:
         panels = []
         for target in TARGETS:
             found = [(name, thrown.shipped(name, plant, target)) for name in SHIPPED]
-            series = [(f"{name} policy", result.miss) for name, result in found if result is not None and result.good.any()]
+            series = [
+                (f"{name} policy", result.miss)
+                for name, result in found
+                if result is not None and result.good.any()
+            ]
             if series:
                 panels.append((f"target {target:.1f} m", series))
         if panels:
-            text = f"Landing points from above on the {SHORT[plant]}; large marks: means. The paper's figure shows 1.5 m and 2.0 m."
+            text = (
+                f"Landing points from above on the {SHORT[plant]}; large marks: means. The paper's"
+                " figure shows 1.5 m and 2.0 m."
+            )
             return Picture("landings", figures.scatter(panels), text)
     return None
 
@@ -86,30 +124,72 @@ def vision_section(thrown: ResultSet) -> Section:
             gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
             paper = _paper(target)
             beside = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
-            rows.append((SHORT[plant], f"{target:.1f}", runs, gap.text(sign=True), _said(gap), faster.text(sign=True), beside))
-            marks.append(figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0]))
-    parts = [Text("Vision minus state: positive means that vision lands further off. Where several trainings of both are recorded, "
-                  "the interval covers trainings and throws; else it speaks of the two shipped policies alone, throw by throw: both "
-                  "met the same vehicles, starts and winds.")]  # fmt: skip
+            rows.append(
+                (
+                    SHORT[plant],
+                    f"{target:.1f}",
+                    runs,
+                    gap.text(sign=True),
+                    _said(gap),
+                    faster.text(sign=True),
+                    beside,
+                )
+            )
+            marks.append(
+                figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0])
+            )
+    parts = [
+        Text(
+            "Vision minus state: positive means that vision lands further off. Where several"
+            " trainings of both are recorded, the interval covers trainings and throws; else it"
+            " speaks of the two shipped policies alone, throw by throw: both met the same vehicles,"
+            " starts and winds."
+        )
+    ]
     if rows:
-        head = ("plant", "target [m]", "policies", "error: vision - state [m]", "in words", "duration: vision - state [s]",
-                "the paper's: error [m], duration [s]")  # fmt: skip
-        picture = figures.marks(marks, "landing error, vision minus state [m]", [SHORT[plant] for plant in PLANTS], zero=0.0)
-        text = "Difference of mean landing errors with 95 % intervals; left of the line vision lands nearer."
+        head = (
+            "plant",
+            "target [m]",
+            "policies",
+            "error: vision - state [m]",
+            "in words",
+            "duration: vision - state [s]",
+            "the paper's: error [m], duration [s]",
+        )
+        picture = figures.marks(
+            marks,
+            "landing error, vision minus state [m]",
+            [SHORT[plant] for plant in PLANTS],
+            zero=0.0,
+        )
+        text = (
+            "Difference of mean landing errors with 95 % intervals; left of the line vision lands"
+            " nearer."
+        )
         parts += [Grid("Vision against state", head, tuple(rows)), Picture("vision", picture, text)]
-    return section("vision", "Vision against state", *parts, missing=missing, head="Not thrown by both")
+    return section(
+        "vision", "Vision against state", *parts, missing=missing, head="Not thrown by both"
+    )
 
 
 def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
-    """Difference of means: throw by throw where one policy of each met the same vehicles and starts."""
-    alike = all(vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target"))
+    """Difference of means: throw by throw where one policy of each met the same vehicles and
+    starts.
+    """
+    alike = all(
+        vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target")
+    )
     if len(vision) == len(state) == 1 and alike:
         return st.paired(vision[0].columns[name], state[0].columns[name])
     return st.difference([r.of(name) for r in vision], [r.of(name) for r in state])
 
 
-def _groups(thrown: ResultSet, plant: str, target: float) -> tuple[tuple[list[Result], list[Result]], str] | None:
-    """Runs of both layouts: those trained for the comparison where two or more of each are there, else the shipped ones."""
+def _groups(
+    thrown: ResultSet, plant: str, target: float
+) -> tuple[tuple[list[Result], list[Result]], str] | None:
+    """Runs of both layouts: those trained for the comparison where two or more of each are there,
+    else the shipped ones.
+    """
     trained = [thrown.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
     if min(map(len, trained)) >= 2:
         return (trained[0], trained[1]), f"{len(trained[0])} and {len(trained[1])} trainings"
@@ -120,7 +200,9 @@ def _groups(thrown: ResultSet, plant: str, target: float) -> tuple[tuple[list[Re
 
 
 def _paper(target: float) -> tuple[st.Interval, float] | None:
-    """The paper's differences: errors [m] with a normal interval from its deviations, ten throws each, and durations [s]."""
+    """The paper's differences: errors [m] with a normal interval from its deviations, ten throws
+    each, and durations [s].
+    """
     vision, state = PAPER.get(("vision", target)), PAPER.get(("state", target))
     if vision is None or state is None:
         return None

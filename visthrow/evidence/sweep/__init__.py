@@ -1,8 +1,8 @@
-"""Lists of training runs and throws, files of ``configs/sweep``: worked in resumable pieces, on several GPUs or a cluster, never twice.
+"""Lists of training runs and throws, files of ``configs/sweep``: worked in resumable pieces, on
+several GPUs or a cluster, never twice.
 
-``units`` cuts a list into units and knows which are done, ``work`` does them, ``pool`` hands them out, ``record`` condenses the
-results into what is committed. The schema of a list is here.
-"""
+``units`` cuts a list into units and knows which are done, ``work`` does them, ``pool`` hands them
+out, ``record`` condenses the results into what is committed. The schema of a list is here."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,14 +19,20 @@ class ThrowParams:
     targets: tuple[float, ...]  # along x [m]
     count: int  # of each policy at each target
     seed: int = 0  # of starts and noise
-    fly_in: Literal["own", "full"] = "own"  # the policy's training config, or its layout's full one (state, vision_ideal)
+    fly_in: Literal["own", "full"] = (
+        "own"  # the policy's training config, or its layout's full one (state, vision_ideal)
+    )
     changes: tuple[str, ...] = ()  # key=value of that config
-    allow: tuple[str, ...] = ()  # parts of the policy's contract that may be broken so; recorded as departures
+    allow: tuple[
+        str, ...
+    ] = ()  # parts of the policy's contract that may be broken so; recorded as departures
 
     def __post_init__(self) -> None:
         known_plant(self.plant)
         if self.count < 1 or not self.targets:
-            raise ConfigError(f"{self.count} throws at the targets {self.targets}; expected 1 or more of each")
+            raise ConfigError(
+                f"{self.count} throws at the targets {self.targets}; expected 1 or more of each"
+            )
 
 
 @dataclass(frozen=True)
@@ -49,10 +55,14 @@ class SweepList:
     commit: Literal["any", "same"] = "any"  # whether a run by another commit counts as done
     changes: tuple[str, ...] = ()  # key=value of every training config
     most_throws: int | None = None  # in any set; for a trial of the list
-    checkpoint_every: int = 100  # iterations: what a killed training loses at most, about 14 s of one H200
+    checkpoint_every: int = (
+        100  # iterations: what a killed training loses at most, about 14 s of one H200
+    )
 
     def __post_init__(self) -> None:
         for name, group in self.runs.items():
             for wanted in group.throws:
                 if wanted not in self.throws:
-                    raise ConfigError(f"runs.{name}: no throws '{wanted}'; {suggest(wanted, self.throws)}")
+                    raise ConfigError(
+                        f"runs.{name}: no throws '{wanted}'; {suggest(wanted, self.throws)}"
+                    )

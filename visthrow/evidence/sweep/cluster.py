@@ -1,4 +1,6 @@
-"""Tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as processes, for a test."""
+"""Tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as
+processes, for a test.
+"""
 
 import os
 from collections import Counter
@@ -12,7 +14,9 @@ from visthrow.evidence.sweep.work import EXIT_STOPPED
 
 SLACK = 5  # minutes that a job is granted beyond its piece: start of the process, last checkpoint
 
-LOST_AT_MOST = 3  # times that a task's job may vanish (preempted, out of time, its node down) before the task counts as failed
+# times that a task's job may vanish (preempted, out of time, its node down) before the task counts
+# as failed
+LOST_AT_MOST = 3
 
 
 class Job:
@@ -53,7 +57,9 @@ class Cluster:
     jobs: int
     minutes: float  # length of a piece; what is not done then is submitted again
     changes: tuple[str, ...] = ()
-    options: dict[str, Any] = field(default_factory=dict)  # of submitit's executor, for instance ``slurm_partition``
+    options: dict[str, Any] = field(
+        default_factory=dict
+    )  # of submitit's executor, for instance ``slurm_partition``
 
     def __post_init__(self) -> None:
         import submitit
@@ -63,21 +69,36 @@ class Cluster:
         try:
             self._executor = submitit.AutoExecutor(self.out / "logs", cluster=self.executor)
         except RuntimeError as error:
-            raise ConfigError(f"no jobs can be submitted from here: {error}; expected the commands of {self.executor}") from error
+            raise ConfigError(
+                f"no jobs can be submitted from here: {error}; expected the commands of"
+                f" {self.executor}"
+            ) from error
         try:
-            self._executor.update_parameters(timeout_min=int(self.minutes) + 1 + SLACK, **self.options)
+            self._executor.update_parameters(
+                timeout_min=int(self.minutes) + 1 + SLACK, **self.options
+            )
         except (NameError, ValueError, TypeError) as error:
             raise ConfigError(f"options of the cluster {self.options}: {error}") from error
 
     def start(self, task: Task, device: str, minutes: float | None) -> Job:
-        self._executor.update_parameters(name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0)
+        self._executor.update_parameters(
+            name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0
+        )
         piece = self.minutes if minutes is None else min(minutes, self.minutes)
         where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())
         job = self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece)
         return Job(job, task.name, self._lost)
 
 
-def do(list_name: str, out: str, changes: tuple[str, ...], folder: str, ids: tuple[str, ...], device: str, minutes: float) -> int:
+def do(
+    list_name: str,
+    out: str,
+    changes: tuple[str, ...],
+    folder: str,
+    ids: tuple[str, ...],
+    device: str,
+    minutes: float,
+) -> int:
     """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
     from visthrow.evidence.sweep.units import load_list
     from visthrow.evidence.sweep.work import work

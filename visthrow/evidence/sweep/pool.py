@@ -1,9 +1,10 @@
-"""Hands units out: trainings and throws in the training simulator to devices, throws on the reference plant to CPU cores.
+"""Hands units out: trainings and throws in the training simulator to devices, throws on the
+reference plant to CPU cores.
 
-What is handed out is a task: a training with its own policy's throws in the training simulator behind it, or one batch on
-a reference plant. Tasks run in processes of their own (:class:`Local`) or as jobs of a cluster
-(:class:`visthrow.evidence.sweep.cluster.Cluster`); a process that was killed costs what it had not yet written, and no more.
-"""
+What is handed out is a task: a training with its own policy's throws in the training simulator
+behind it, or one batch on a reference plant. Tasks run in processes of their own (:class:`Local`)
+or as jobs of a cluster (:class:`visthrow.evidence.sweep.cluster.Cluster`); a process that was
+killed costs what it had not yet written, and no more."""
 
 import os
 import signal
@@ -39,14 +40,21 @@ class Task:
 
 
 class Process(subprocess.Popen):
-    """A task in a process of this machine; it stops by itself when this one dies (see ``visthrow sweep work``)."""
+    """A task in a process of this machine; it stops by itself when this one dies (see ``visthrow
+    sweep work``).
+    """
 
     def __init__(self, words: Sequence[str], log: Path, environment: dict[str, str]) -> None:
         log.parent.mkdir(parents=True, exist_ok=True)
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", **environment}
         with log.open("ab") as file:
             super().__init__(
-                words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
             )
 
     def stop(self) -> None:
@@ -64,14 +72,31 @@ class Local:
     changes: tuple[str, ...] = ()
 
     def start(self, task: Task, device: str, minutes: float | None) -> Process:
-        words = [sys.executable, "-m", "visthrow.cli", "sweep", "work", self.list_name, "--out", str(self.out)]
+        words = [
+            sys.executable,
+            "-m",
+            "visthrow.cli",
+            "sweep",
+            "work",
+            self.list_name,
+            "--out",
+            str(self.out),
+        ]
         words += ["--units", ",".join(task.ids), "--parent", str(os.getpid())]
-        if device.startswith("cuda"):  # the process sees its own GPU alone, and puts no context on the others
+        if device.startswith(
+            "cuda"
+        ):  # the process sees its own GPU alone, and puts no context on the others
             seen = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
             index = int(device.removeprefix("cuda:"))
-            words, environment = [*words, "--device", "cuda:0"], {VISIBLE: seen[index] if seen else str(index)}
+            words, environment = (
+                [*words, "--device", "cuda:0"],
+                {VISIBLE: seen[index] if seen else str(index)},
+            )
         else:
-            words, environment = [*words, "--device", device], dict.fromkeys(THREADS, "1") if not task.gpu else {}
+            words, environment = (
+                [*words, "--device", device],
+                (dict.fromkeys(THREADS, "1") if not task.gpu else {}),
+            )
         words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
         for change in self.changes:
             words += ["--set", change]
@@ -88,7 +113,9 @@ class Outcome:
 
 
 def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
-    """What is left to do and can be done now, the most important first; ids that are found to be done are added to ``done``."""
+    """What is left to do and can be done now, the most important first; ids that are found to be
+    done are added to ``done``.
+    """
 
     def left(unit: Source | ThrowUnit) -> bool:
         if unit.id not in done and unit.done(out):
@@ -98,7 +125,9 @@ def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
     for source in work.sources:
         units = work.throws.get(source.id, ())
         untrained = bool(source.config) and left(source)
-        mine = [unit.id for unit in units if unit.params.plant == "hybrid" and (untrained or left(unit))]
+        mine = [
+            unit.id for unit in units if unit.params.plant == "hybrid" and (untrained or left(unit))
+        ]
         if untrained or mine:
             yield Task(source.id, (*([source.id] if untrained else []), *mine), gpu=True)
         for unit in () if untrained else units:
@@ -109,9 +138,9 @@ def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
 class Pool:
     """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop.
 
-    Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU cores, and ``start(task, device, minutes)``.
-    What that returns has ``poll()`` for the exit status, None while it runs, ``stop()`` to write what it has and end, and ``kill()``.
-    """
+    Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU
+    cores, and ``start(task, device, minutes)``. What that returns has ``poll()`` for the exit
+    status, None while it runs, ``stop()`` to write what it has and end, and ``kill()``."""
 
     def __init__(self, work: Work, out: Path, starter: Any, say: Callable[[str], None]) -> None:
         self.work, self.out, self.starter, self.say = work, out, starter, say
@@ -165,13 +194,19 @@ class Pool:
 
     def _reap(self) -> bool:
         """Take note of what ended; whether anything did."""
-        ended = [(task, status) for task, _, handle in self._running.values() if (status := handle.poll()) is not None]
+        ended = [
+            (task, status)
+            for task, _, handle in self._running.values()
+            if (status := handle.poll()) is not None
+        ]
         for task, status in ended:
             del self._running[task.name]
             if status in (EXIT_BUSY, EXIT_STOPPED):
                 self._wait[task.name] = time.monotonic() + BUSY_PAUSE
             elif status != 0:
-                self.outcome.failed[task.name] = last_line(task.log(self.out)) or f"exit status {status}"
+                self.outcome.failed[task.name] = (
+                    last_line(task.log(self.out)) or f"exit status {status}"
+                )
                 self.say(f"{task.name} FAILED: {self.outcome.failed[task.name]}")
             elif task.gpu:
                 self.say(f"{task.name} done")
@@ -183,7 +218,10 @@ class Pool:
             if handle.poll() is None:
                 handle.stop()
         end = time.monotonic() + GRACE
-        while any(handle.poll() is None for _, _, handle in self._running.values()) and time.monotonic() < end:
+        while (
+            any(handle.poll() is None for _, _, handle in self._running.values())
+            and time.monotonic() < end
+        ):
             time.sleep(POLL)
         for _, _, handle in self._running.values():
             if handle.poll() is None:
@@ -193,4 +231,6 @@ class Pool:
 
 def last_line(log: Path) -> str:
     """Return the last line of what a task printed."""
-    return log.read_text(errors="replace").strip().rpartition("\n")[2].strip() if log.exists() else ""
+    return (
+        log.read_text(errors="replace").strip().rpartition("\n")[2].strip() if log.exists() else ""
+    )

@@ -1,4 +1,6 @@
-"""What is told and kept of a list: a line a run, and two records, of the trainings and of the throws."""
+"""What is told and kept of a list: a line a run, and two records, of the trainings and of the
+throws.
+"""
 
 import csv
 import json
@@ -25,7 +27,9 @@ def status(work: Work, out: Path) -> tuple[list[str], bool]:
         seconds += spent
         left += (not source.done(out)) + len(units) - thrown
         lines.append(f"{source.name:{width}}  {state:44}  throws {thrown}/{len(units)}")
-    lines.append(f"{len(work.sources)} runs, {seconds / 60:.1f} minutes of training, {left} units left")
+    lines.append(
+        f"{len(work.sources)} runs, {seconds / 60:.1f} minutes of training, {left} units left"
+    )
     return lines, left == 0
 
 
@@ -37,26 +41,45 @@ def _state(source: Source, out: Path) -> tuple[str, float]:
     seconds = _seconds(rows)
     if source.done(out):
         error = _final(source, out)["error_mean"]
-        return f"done in {seconds:.0f} s" + ("" if error is None else f", {error:.3f} m at 2.0 m"), seconds
+        return (
+            f"done in {seconds:.0f} s" + ("" if error is None else f", {error:.3f} m at 2.0 m"),
+            seconds,
+        )
     if held(lock_of(out, source.id)):
         return f"running, {len(rows)} of {source.iterations} iterations", seconds
-    return (f"stopped after {len(rows)} of {source.iterations} iterations" if rows else "not begun"), seconds
+    return (
+        f"stopped after {len(rows)} of {source.iterations} iterations" if rows else "not begun"
+    ), seconds
 
 
 def collect(work: Work, out: Path, records: Path) -> list[Path]:
-    """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already; returns their paths.
+    """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already;
+    returns their paths.
 
-    Of two results for the same question, older and newer weights or config, the one that is here counts. Raises StorageError: nothing is
-    done, and nothing stands there.
-    """
-    training, throws = records / "training" / f"{work.name}.json", records / "throws" / f"{work.name}.json"
+    Of two results for the same question, older and newer weights or config, the one that is here
+    counts. Raises StorageError: nothing is done, and nothing stands there."""
+    training, throws = (
+        records / "training" / f"{work.name}.json",
+        records / "throws" / f"{work.name}.json",
+    )
     runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {
-        source.name: _run(source, out) for source in work.sources if source.config and source.done(out)
+        source.name: _run(source, out)
+        for source in work.sources
+        if source.config and source.done(out)
     }
-    if not runs and not any(unit.done(out) for units in work.throws.values() for unit in units) and not throws.exists():
-        raise StorageError(f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep run {work.name}' made")
+    if (
+        not runs
+        and not any(unit.done(out) for units in work.throws.values() for unit in units)
+        and not throws.exists()
+    ):
+        raise StorageError(
+            f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep"
+            f" run {work.name}' made"
+        )
     order = {source.name: i for i, source in enumerate(work.sources)}
-    listed = sorted((run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]])
+    listed = sorted(
+        (run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]]
+    )
     results.write_line(training, {"runs": listed})
     kept = {_question(result): result for result in results.load_all([throws]).values()}
     for units in work.throws.values():
@@ -91,7 +114,10 @@ def _summary(source: Source, out: Path) -> dict[str, Any]:
 def _final(source: Source, out: Path) -> dict[str, float | None]:
     """Mean error and duration of the throws that end a training, at 2.0 m."""
     rows = [row for row in _summary(source, out)["figures"]["throws"] if row["target"] == 2.0]
-    return {name: rows[0].get(name) if rows else None for name in ("error_mean", "duration_mean", "success")}
+    return {
+        name: rows[0].get(name) if rows else None
+        for name in ("error_mean", "duration_mean", "success")
+    }
 
 
 def _run(source: Source, out: Path) -> dict[str, Any]:
@@ -104,13 +130,34 @@ def _run(source: Source, out: Path) -> dict[str, Any]:
     for i, row in enumerate(rows, 1):
         seconds += float(row["rollout_s"]) + float(row["learning_s"])
         if i % step == 0:
-            curve.append([int(row["iteration"]) * per_iteration, round(seconds, 2), round(float(row["landing_error"]), 5)])
-    pieces = [json.loads(path.read_text()) for path in sorted((source.folder(out) / PIECES).glob("*.json"))]
+            curve.append(
+                [
+                    int(row["iteration"]) * per_iteration,
+                    round(seconds, 2),
+                    round(float(row["landing_error"]), 5),
+                ]
+            )
+    pieces = [
+        json.loads(path.read_text())
+        for path in sorted((source.folder(out) / PIECES).glob("*.json"))
+    ]
     return {
-        "name": source.name, "run": Path(source.config).stem, "variant": variant_of(source.config),
-        "layout": experiment.task.observation.layout, "train_seed": source.seed, "key": source.key,
-        "iterations": len(rows), "environments": experiment.ppo.environments, "steps": len(rows) * per_iteration,
-        "seconds": round(seconds, 2), "wall_s": round(sum(piece["seconds"] for piece in pieces), 2), "pieces": len(pieces),
-        "device": (summary["processors"].get("gpu") or [summary["processors"]["cpu"]])[0], "commit": summary["commit"],
-        "command": summary["command"], "versions": summary["versions"], "final": _final(source, out), "curve": curve,
-    }  # fmt: skip
+        "name": source.name,
+        "run": Path(source.config).stem,
+        "variant": variant_of(source.config),
+        "layout": experiment.task.observation.layout,
+        "train_seed": source.seed,
+        "key": source.key,
+        "iterations": len(rows),
+        "environments": experiment.ppo.environments,
+        "steps": len(rows) * per_iteration,
+        "seconds": round(seconds, 2),
+        "wall_s": round(sum(piece["seconds"] for piece in pieces), 2),
+        "pieces": len(pieces),
+        "device": (summary["processors"].get("gpu") or [summary["processors"]["cpu"]])[0],
+        "commit": summary["commit"],
+        "command": summary["command"],
+        "versions": summary["versions"],
+        "final": _final(source, out),
+        "curve": curve,
+    }

@@ -14,7 +14,9 @@ ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
 MOTORS = ("motor_command", "motor_speed", "pwm")
 THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
 
-STILL = 0.01  # a vehicle whose position keeps within this [m] for the whole log has not flown, if its motors stood or nothing tells
+# a vehicle whose position keeps within this [m] for the whole log has not flown, if its motors
+# stood or nothing tells
+STILL = 0.01
 
 
 @dataclass(frozen=True)
@@ -30,18 +32,35 @@ class Question:
 QUESTIONS = (
     Question("thrust gain against mass", (THRUSTS, POSITIONS + ("acc_b",)), "seconds_flown", 3.0),
     Question("thrust curve", (THRUSTS, POSITIONS + ("acc_b",)), "thrust_range", 0.3),
-    Question("battery sag", (THRUSTS, ("battery_voltage",), POSITIONS + ("acc_b",)), "voltage_range", 0.1),
+    Question(
+        "battery sag", (THRUSTS, ("battery_voltage",), POSITIONS + ("acc_b",)), "voltage_range", 0.1
+    ),
     Question("rotor drag", (POSITIONS, ATTITUDES), "speed_p95_m_s", 0.7),
     Question("wind or frame tilt", (POSITIONS, ATTITUDES), "seconds_flown", 5.0),
     Question("wind against frame tilt", (POSITIONS, ATTITUDES), "yaw_range_deg", 60.0),
-    Question("centre of mass, motor by motor gain", (MOTORS, POSITIONS + ("rate_b",)), "seconds_flown", 3.0),
-    Question("motor lag and command delay", (("command", "motor_command", "rate_setpoint_b"), ("rate_b",)), "rate_p95_rad_s", 0.3),
+    Question(
+        "centre of mass, motor by motor gain",
+        (MOTORS, POSITIONS + ("rate_b",)),
+        "seconds_flown",
+        3.0,
+    ),
+    Question(
+        "motor lag and command delay",
+        (("command", "motor_command", "rate_setpoint_b"), ("rate_b",)),
+        "rate_p95_rad_s",
+        0.3,
+    ),
     Question("rope length", (("payload_pos_w",),), "swing_deg", 2.0),
     Question("payload drag", (("payload_pos_w",),), "payload_speed_p95_m_s", 1.5),
     Question("release lag", (("payload_pos_w",), ("release_command",)), "releases", 1.0),
-    Question("camera against motion capture", (("marker_pos_c", "keypoints"), POSITIONS, ("payload_pos_w",)), "seconds", 5.0),
+    Question(
+        "camera against motion capture",
+        (("marker_pos_c", "keypoints"), POSITIONS, ("payload_pos_w",)),
+        "seconds",
+        5.0,
+    ),
     Question("ground effect", (THRUSTS, POSITIONS), "seconds_low", 2.0),
-)  # fmt: skip
+)
 
 
 def look(log: FlightLog) -> list[Row]:
@@ -54,34 +73,52 @@ def look(log: FlightLog) -> list[Row]:
     elif figures.get("idle"):
         text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
         rows.append(Row("excited", "", "bad", text, {"idle": 1}))
-    concern = [q for q in QUESTIONS if any(name in log for name in q.needs[0])]  # not things of which the log holds nothing at all
+    concern = [
+        q for q in QUESTIONS if any(name in log for name in q.needs[0])
+    ]  # not things of which the log holds nothing at all
     return rows + [_answer(question, log, figures) for question in concern]
 
 
 def _words(figures: dict) -> str:
     units = {
-        "seconds": "s", "seconds_flown": "s flown", "seconds_hover": "s of hover", "speed_p95_m_s": "m/s (95 %)",
-        "yaw_range_deg": "deg of yaw", "swing_deg": "deg of swing", "releases": "releases", "height_range_m": "m of height",
-        "thrust_range": "of thrust (95 to 5 %, relative)", "voltage_range": "V of battery",
-    }  # fmt: skip
+        "seconds": "s",
+        "seconds_flown": "s flown",
+        "seconds_hover": "s of hover",
+        "speed_p95_m_s": "m/s (95 %)",
+        "yaw_range_deg": "deg of yaw",
+        "swing_deg": "deg of swing",
+        "releases": "releases",
+        "height_range_m": "m of height",
+        "thrust_range": "of thrust (95 to 5 %, relative)",
+        "voltage_range": "V of battery",
+    }
     return ", ".join(f"{figures[key]:.3g} {word}" for key, word in units.items() if key in figures)
 
 
 def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
-    missing = [" or ".join(group) for group in question.needs if not any(name in log for name in group)]
+    missing = [
+        " or ".join(group) for group in question.needs if not any(name in log for name in group)
+    ]
     if missing:
-        return Row("answers", question.name, "warn", f"cannot be answered: no {', no '.join(missing)}")
+        return Row(
+            "answers", question.name, "warn", f"cannot be answered: no {', no '.join(missing)}"
+        )
     if figures.get("still") or figures.get("idle"):
         return Row("answers", question.name, "warn", "cannot be answered: the vehicle did not fly")
     reached = figures.get(question.excited)
     if question.excited and (reached is None or reached < question.least):
         came = "nothing" if reached is None else f"{reached:.3g}"
-        text = f"cannot be answered: {question.excited} is {came}, at least {question.least:g} is needed"
+        text = (
+            f"cannot be answered: {question.excited} is {came}, at least {question.least:g} is"
+            " needed"
+        )
         return Row("answers", question.name, "warn", text)
     return Row("answers", question.name, "ok", "can be answered")
 
 
-def _first(log: FlightLog, names: tuple[str, ...], fewest: int = 20) -> tuple[str, np.ndarray, np.ndarray] | None:
+def _first(
+    log: FlightLog, names: tuple[str, ...], fewest: int = 20
+) -> tuple[str, np.ndarray, np.ndarray] | None:
     """Name and samples of the first of several channels that holds more than so many."""
     name = next((n for n in names if n in log and np.sum(log[n].valid) > fewest), None)
     return None if name is None else (name, *log[name].samples())
@@ -89,7 +126,9 @@ def _first(log: FlightLog, names: tuple[str, ...], fewest: int = 20) -> tuple[st
 
 def excitation(log: FlightLog) -> dict[str, float]:
     """Figures of what a log excites; what no channel tells is left out."""
-    spans = [float(np.ptp(channel.time)) for channel in log.channels.values() if len(channel.time) > 1]
+    spans = [
+        float(np.ptp(channel.time)) for channel in log.channels.values() if len(channel.time) > 1
+    ]
     figures = {"seconds": max(spans, default=0.0)}
     flown = _flown(log, figures)
     _motion(log, figures, flown)
@@ -159,11 +198,16 @@ def _payload(log: FlightLog, figures: dict) -> None:
 
 
 def _standing(log: FlightLog, figures: dict) -> None:
-    place, thrust = _first(log, POSITIONS), _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 0)
+    place, thrust = (
+        _first(log, POSITIONS),
+        _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 0),
+    )
     idle = "throttle" in log and np.ptp(log["throttle"].values) == 0.0
     if thrust is not None:
         name, _, values = thrust
-        idle |= float(np.percentile(values, 95)) < (IDLE_SPEED if name == "motor_speed" else IDLE_SHARE)
+        idle |= float(np.percentile(values, 95)) < (
+            IDLE_SPEED if name == "motor_speed" else IDLE_SHARE
+        )
     if place is not None:
         width = np.max(np.percentile(place[2], 98, axis=0) - np.percentile(place[2], 2, axis=0))
         if width < STILL and (idle or thrust is None):

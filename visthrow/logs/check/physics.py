@@ -1,4 +1,7 @@
-"""Checks of units, frames and delays by physics: what must follow from what, whatever the vehicle. Onboard-safe."""
+"""Checks of units, frames and delays by physics: what must follow from what, whatever the vehicle.
+
+Onboard-safe.
+"""
 
 from collections.abc import Iterator
 
@@ -11,23 +14,29 @@ from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, Known, Row
 from visthrow.logs.flightlog import Channel, FlightLog
 
-MOVES = 0.05  # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough to be compared
+# below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
+# to be compared
+MOVES = 0.05
 STEEPEST = 75.0  # median tilt of a flight [deg]
 
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST, _FARTHEST = 60.0, 2000.0  # of vehicles that throw [m/s], [m]
 _SHARES = ("motor_command", "motor_wanted", "throttle")
-_LARGEST_SHARE = 2.0  # of a command whose full size is 1; what a controller asks for may exceed it, a wrong unit by far more
+# of a command whose full size is 1; what a controller asks for may exceed it, a wrong unit by far
+# more
+_LARGEST_SHARE = 2.0
 _VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
 BELONGS, FIRMLY, CLEARLY = 0.35, 0.7, 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN, _DELAY_BAD, _DELAY_KNOWN = 0.02, 0.05, 0.012  # between measurements of one motion [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
-_PUSHED = 0.2  # RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
+# RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
+_PUSHED = 0.2
 _LONGER, _OTHER_CABLE = 0.05, 0.25  # of the model's length: markers sit off the ends, another cable
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
-_SEEN = 0.5  # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
+# correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
+_SEEN = 0.5
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
 
@@ -61,12 +70,20 @@ def median_tilt(attitude: Channel) -> float:
 
 def _plausible(log: FlightLog) -> Iterator[Row]:
     for name, channel in log.channels.items():
-        if channel.unit != "m" or channel.values.shape[1:] != (3,) or np.sum(channel.valid) < 50 or "setpoint" in name:
+        if (
+            channel.unit != "m"
+            or channel.values.shape[1:] != (3,)
+            or np.sum(channel.valid) < 50
+            or "setpoint" in name
+        ):
             continue
         time, pos = channel.samples()
         period = float(np.median(np.diff(time)))
         if not _PERIOD[0] <= period <= _PERIOD[1]:
-            text = f"a sample every {period:.3g} s, expected {_PERIOD[0]:g} to {_PERIOD[1]:g}: is the unit of time wrong?"
+            text = (
+                f"a sample every {period:.3g} s, expected {_PERIOD[0]:g} to {_PERIOD[1]:g}: is the"
+                " unit of time wrong?"
+            )
             yield Row("units", name, "bad", text, {"period_s": period})
             continue
         speeds = np.linalg.norm(relations.derivative(time, pos, 0.1)[1], axis=1)
@@ -75,7 +92,10 @@ def _plausible(log: FlightLog) -> Iterator[Row]:
         fast, far = float(np.percentile(speeds, 99)), float(np.max(np.abs(pos)))
         figures = {"speed_p99_m_s": fast, "farthest_m": far}
         if fast > _FASTEST or far > _FARTHEST:
-            text = f"{fast:.3g} m/s and {far:.3g} m from the origin: no such vehicle; millimetres taken for metres?"
+            text = (
+                f"{fast:.3g} m/s and {far:.3g} m from the origin: no such vehicle; millimetres"
+                " taken for metres?"
+            )
             yield Row("units", name, "bad", text, figures)
     yield from _implausible_sizes(log)
 
@@ -86,7 +106,10 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
         if name in log and np.sum(log[name].valid) > 50:
             tilt = median_tilt(log[name])
             if tilt > STEEPEST:
-                text = f"half of the time tilted by more than {tilt:.0f} deg: degrees taken for radians, axes, or quaternion order?"
+                text = (
+                    f"half of the time tilted by more than {tilt:.0f} deg: degrees taken for"
+                    " radians, axes, or quaternion order?"
+                )
                 yield Row("units", name, "bad", text, {"median_tilt_deg": tilt})
     for name in _SHARES:
         if name in log and log[name].unit == "1" and np.any(log[name].valid):
@@ -98,14 +121,22 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
         if name in log and np.any(log[name].valid):
             middle = float(np.median(log[name].samples()[1]))
             if middle > _VOLTS[1] or 0.0 < middle < _VOLTS[0]:
-                yield Row("units", name, "bad", f"{middle:.3g} V: no such pack; another unit?", {"median_v": middle})
+                yield Row(
+                    "units",
+                    name,
+                    "bad",
+                    f"{middle:.3g} V: no such pack; another unit?",
+                    {"median_v": middle},
+                )
 
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
     (time_p, p), (time_v, v) = log[pos].samples(), log[vel].samples()
     if not (usable(time_p, p, 0.02) and usable(time_v, v, 0.0)):
         return []
-    return _compared(relations.relate(*relations.derivative(time_p, p), time_v, v), f"d({pos})/dt", vel)
+    return _compared(
+        relations.relate(*relations.derivative(time_p, p), time_v, v), f"d({pos})/dt", vel
+    )
 
 
 def _rates(log: FlightLog, quat: str) -> list[Row]:
@@ -113,7 +144,11 @@ def _rates(log: FlightLog, quat: str) -> list[Row]:
         return []
     measured = log["rate_b"].samples()
     derived = relations.rates_of(*log[quat].samples())
-    if not (usable(*derived, 0.0) and usable(*measured, 0.0) and (usable(*derived, MOVES) or usable(*measured, MOVES))):
+    if not (
+        usable(*derived, 0.0)
+        and usable(*measured, 0.0)
+        and (usable(*derived, MOVES) or usable(*measured, MOVES))
+    ):
         return []
     return _compared(relations.relate(*derived, *measured), f"rate of {quat}", "rate_b")
 
@@ -125,21 +160,48 @@ def _compared(found: relations.Relation | None, first: str, second: str) -> list
     both = f"{first}, {second}"
     figures = _figures(found)
     if _apart(found):
-        text = f"hardly go together in any axes (correlation {found.axes_correlation:.2f}): not the same flight, or noise"
+        text = (
+            f"hardly go together in any axes (correlation {found.axes_correlation:.2f}): not the"
+            " same flight, or noise"
+        )
         return [Row("frames", both, "bad", text, figures)]
     if _turned(found):
-        return [Row("frames", both, "bad", f"go together {_better(found)}", figures | {"axes": found.axes, "nats": found.nats})]
-    rows = [Row("frames", both, "ok", f"go together as they are, correlation {found.correlation:.2f}", figures)]
+        return [
+            Row(
+                "frames",
+                both,
+                "bad",
+                f"go together {_better(found)}",
+                figures | {"axes": found.axes, "nats": found.nats},
+            )
+        ]
+    rows = [
+        Row(
+            "frames",
+            both,
+            "ok",
+            f"go together as they are, correlation {found.correlation:.2f}",
+            figures,
+        )
+    ]
     if not 0.67 < found.scale < 1.5:
         hint = relations.unit_hint(found.scale) or "no unit explains it"
         weak = abs(found.correlation) < 0.7 and 0.4 < found.scale < 1.5
-        text = f"the second is {found.scale:.4g} times the first: {'noise dilutes it' if weak else hint}"
+        text = (
+            f"the second is {found.scale:.4g} times the first:"
+            f" {'noise dilutes it' if weak else hint}"
+        )
         rows.append(Row("units", both, "warn" if weak else "bad", text, figures))
     return [*rows, _late(found, both, figures)]
 
 
 def _figures(found: relations.Relation) -> dict[str, float]:
-    return {"correlation": found.correlation, "delay_s": found.delay, "delay_sd_s": found.delay_sd, "scale": found.scale}
+    return {
+        "correlation": found.correlation,
+        "delay_s": found.delay,
+        "delay_sd_s": found.delay_sd,
+        "scale": found.scale,
+    }
 
 
 def _turned(found: relations.Relation) -> bool:
@@ -158,17 +220,31 @@ def _kind(axes: str) -> str:
 
 def _late(found: relations.Relation, both: str, figures: dict) -> Row:
     """How late the second measurement of one motion is, and what would put it right."""
-    text = f"the second is {1e3 * found.delay:+.1f} ms behind the first (sd {1e3 * found.delay_sd:.1f} ms)"
-    far = abs(found.delay) > _DELAY_BAD and found.delay_sd < 0.3 * abs(found.delay) and found.correlation > FIRMLY
+    text = (
+        f"the second is {1e3 * found.delay:+.1f} ms behind the first (sd"
+        f" {1e3 * found.delay_sd:.1f} ms)"
+    )
+    far = (
+        abs(found.delay) > _DELAY_BAD
+        and found.delay_sd < 0.3 * abs(found.delay)
+        and found.correlation > FIRMLY
+    )
     if far:
-        text += f": streams on clocks apart; add {-found.delay:+.3f} s to the second's time (offset of its clock in the mapping)"
+        text += (
+            f": streams on clocks apart; add {-found.delay:+.3f} s to the second's time (offset of"
+            " its clock in the mapping)"
+        )
     verdict = "bad" if far else "warn" if abs(found.delay) > _DELAY_WARN else "ok"
     return Row("delay", both, verdict, text, figures)
 
 
 def _apart(found: relations.Relation) -> bool:
-    """Whether two signals hardly go together, in whatever axes; the best of 48 exchanges reaches 0.5 by chance."""
-    return found.axes_correlation < BELONGS or (found.correlation < BELONGS and found.axes_correlation < FIRMLY)
+    """Whether two signals hardly go together, in whatever axes; the best of 48 exchanges reaches
+    0.5 by chance.
+    """
+    return found.axes_correlation < BELONGS or (
+        found.correlation < BELONGS and found.axes_correlation < FIRMLY
+    )
 
 
 def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
@@ -192,20 +268,32 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     both = f"acc_b, {quat}"
     hint = relations.unit_hint(size / GRAVITY)
     if not 0.85 < size / GRAVITY < 1.15:
-        text = f"the mean force is {size:.4g} m/s^2, not {GRAVITY}: {hint or 'axes are exchanged, or gravity is missing'}"
+        text = (
+            f"the mean force is {size:.4g} m/s^2, not {GRAVITY}:"
+            f" {hint or 'axes are exchanged, or gravity is missing'}"
+        )
         return [Row("units" if hint else "frames", both, "bad", text, figures)]
     if tilt > 30.0:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
         return [Row("frames", both, "bad", text, figures)]
     verdict = "warn" if tilt > 3.0 or abs(size / GRAVITY - 1.0) > 0.03 else "ok"
-    return [Row("frames", both, verdict, f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up", figures)]
+    return [
+        Row(
+            "frames",
+            both,
+            verdict,
+            f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up",
+            figures,
+        )
+    ]
 
 
 def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
-    """Hold what pushes the vehicle, by accelerometer and attitude, against how its velocity changes.
+    """Hold what pushes the vehicle, by accelerometer and attitude, against how its velocity
+    changes.
 
-    Without an accelerometer the push is a multirotor's thrust, along body z; then a payload must not pull as well.
-    """
+    Without an accelerometer the push is a multirotor's thrust, along body z; then a payload must
+    not pull as well."""
     if path not in log or ("acc_b" not in log and "payload_pos_w" in log and "attached" not in log):
         return []
     (time_p, p), (time_q, q) = log[path].samples(), log[quat].samples()
@@ -231,53 +319,114 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     both = f"d({path})/dt, {quat} {name}"
     wrong = _exchanged(time, acc, pushed, turn, found.axes_delay, both, force_b is not None)
     if wrong is None and force_b is not None:
-        wrong = _exchanged_body(time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY]), time_a, force_b, both)
+        wrong = _exchanged_body(
+            time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY]), time_a, force_b, both
+        )
     return [wrong] if wrong is not None else _pushed(found, acc, pushed, both, force_b is not None)
 
 
-def _exchanged_body(time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray, force_b: np.ndarray, both: str) -> Row | None:
-    """Which exchange of axes level with the rotors an accelerometer has: it feels the little that drag and cable leave there."""
+def _exchanged_body(
+    time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray, force_b: np.ndarray, both: str
+) -> Row | None:
+    """Which exchange of axes level with the rotors an accelerometer has: it feels the little that
+    drag and cable leave there.
+    """
     at = time[(time > time_a[0] + _SPAN) & (time < time_a[-1] - _SPAN)]
     if len(at) < 50:
         return None
     felt = relations.mean_over(time_a, force_b, at, 2.0 * _SPAN)
-    found = relations.relate(at, relations.on_grid(time, expected_b, at), at, felt, reach=_DELAY_BAD)
+    found = relations.relate(
+        at, relations.on_grid(time, expected_b, at), at, felt, reach=_DELAY_BAD
+    )
     if found is None or found.nats < _NATS or found.axes_correlation < _SEEN:
         return None
-    return Row("frames", both, "bad", f"acc_b fits {_better(found)}", {"axes": found.axes, "of": "acc_b", "nats": found.nats})
+    return Row(
+        "frames",
+        both,
+        "bad",
+        f"acc_b fits {_better(found)}",
+        {"axes": found.axes, "of": "acc_b", "nats": found.nats},
+    )
 
 
-def accelerations(time: np.ndarray, path: np.ndarray, unit: str, span: float = _SPAN) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and accelerations [m/s^2], shape (N, 3), of positions (unit m) or velocities, over about ``span`` seconds each."""
+def accelerations(
+    time: np.ndarray, path: np.ndarray, unit: str, span: float = _SPAN
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and accelerations [m/s^2], shape (N, 3), of positions (unit m) or
+    velocities, over about ``span`` seconds each.
+    """
     if unit == "m":
         time, path = relations.derivative(time, path, span)
     return relations.derivative(time, path, span)
 
 
-def _pushed(found: relations.Relation, acc: np.ndarray, pushed: np.ndarray, both: str, sensed: bool) -> list[Row]:
+def _pushed(
+    found: relations.Relation, acc: np.ndarray, pushed: np.ndarray, both: str, sensed: bool
+) -> list[Row]:
     """Rows about a push that has the axes of the change of velocity."""
     off = np.mean(pushed - acc, axis=0)
-    figures = {"correlation": found.correlation, "delay_s": found.delay, "scale": found.scale, "offset_m_s2": off.tolist()}
+    figures = {
+        "correlation": found.correlation,
+        "delay_s": found.delay,
+        "scale": found.scale,
+        "offset_m_s2": off.tolist(),
+    }
     if found.correlation < FIRMLY and not sensed:
         return []  # a payload or a draught pushes as well
     if found.correlation < FIRMLY:
-        verdict = "bad" if found.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0 else "warn"
-        text = f"hardly go together (correlation {found.correlation:.2f}): attitude or accelerometer of another flight, or noise"
+        verdict = (
+            "bad"
+            if found.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0
+            else "warn"
+        )
+        text = (
+            f"hardly go together (correlation {found.correlation:.2f}): attitude or accelerometer"
+            " of another flight, or noise"
+        )
         return [Row("frames", both, verdict, text, figures)]
-    rows = [Row("frames", both, "ok", f"go together as they are, correlation {found.correlation:.2f}", figures)]
+    rows = [
+        Row(
+            "frames",
+            both,
+            "ok",
+            f"go together as they are, correlation {found.correlation:.2f}",
+            figures,
+        )
+    ]
     if not 0.5 < found.scale < 2.0:
         hint = relations.unit_hint(found.scale) or "no unit explains it"
-        rows.append(Row("units", both, "bad" if hint else "warn", f"the second is {found.scale:.4g} times the first: {hint}", figures))
+        rows.append(
+            Row(
+                "units",
+                both,
+                "bad" if hint else "warn",
+                f"the second is {found.scale:.4g} times the first: {hint}",
+                figures,
+            )
+        )
     if sensed:
         rows.append(_late(found, both, figures))
         if np.linalg.norm(off) > _OFFSET:
-            text = f"the second is off by ({', '.join(f'{x:+.2f}' for x in off)}) m/s^2 in the mean: bias, or a tilted mount"
+            text = (
+                f"the second is off by ({', '.join(f'{x:+.2f}' for x in off)}) m/s^2 in the mean:"
+                " bias, or a tilted mount"
+            )
             rows.append(Row("frames", both, "warn", text, figures))
     return rows
 
 
-def _exchanged(time: np.ndarray, acc: np.ndarray, pushed: np.ndarray, turn: Rotation, delay: float, both: str, sensed: bool) -> Row | None:
-    """Which exchange of axes, of the path or of the accelerometer, or which turn of the attitude, makes both fit."""
+def _exchanged(
+    time: np.ndarray,
+    acc: np.ndarray,
+    pushed: np.ndarray,
+    turn: Rotation,
+    delay: float,
+    both: str,
+    sensed: bool,
+) -> Row | None:
+    """Which exchange of axes, of the path or of the accelerometer, or which turn of the attitude,
+    makes both fit.
+    """
     inside = (time + delay > time[0]) & (time + delay < time[-1])
     acc, turn = acc[inside], turn[inside]
     pushed = relations.on_grid(time, pushed, time[inside] + delay)
@@ -287,7 +436,11 @@ def _exchanged(time: np.ndarray, acc: np.ndarray, pushed: np.ndarray, turn: Rota
         force_b = turn.inv().apply(pushed + gravity)
         seen = np.einsum("nij,kjm,nm->kni", turn.as_matrix(), MATRICES, force_b)
         tried["acc_b"] = acc - (seen - gravity)
-    errors = {(what, EVERY[k]): float(np.mean(e**2)) for what, of in tried.items() for k, e in enumerate(of)}
+    errors = {
+        (what, EVERY[k]): float(np.mean(e**2))
+        for what, of in tried.items()
+        for k, e in enumerate(of)
+    }
     plain = errors["path", OURS]
     (what, axes), least = min(errors.items(), key=lambda item: item[1])
     independent = max(float(np.ptp(time)) / (3.0 * relations.INDEPENDENT), 10.0)
@@ -312,7 +465,15 @@ def _still_gravity(log: FlightLog) -> list[Row]:
     figures = {"median_m_s2": size, "mean_b_m_s2": np.mean(acc, axis=0).tolist()}
     if not 0.7 < size / GRAVITY < 1.4:
         hint = relations.unit_hint(size / GRAVITY) or "gravity is missing or the unit is wrong"
-        return [Row("units", "acc_b", "bad", f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}", figures)]
+        return [
+            Row(
+                "units",
+                "acc_b",
+                "bad",
+                f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}",
+                figures,
+            )
+        ]
     return [Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)]
 
 
@@ -325,10 +486,15 @@ def _commands(log: FlightLog) -> list[Row]:
     else:
         return []
     rows: list[Row] = []
-    for name in (name for name in ("command", "rate_setpoint_b") if name in log and usable(*rates, MOVES)):
+    for name in (
+        name for name in ("command", "rate_setpoint_b") if name in log and usable(*rates, MOVES)
+    ):
         time, wanted = log[name].samples()
         wanted = wanted[:, -3:]  # a command's first is thrust
-        if usable(time, wanted, MOVES) and (found := relations.relate(time, wanted, *rates)) is not None:
+        if (
+            usable(time, wanted, MOVES)
+            and (found := relations.relate(time, wanted, *rates)) is not None
+        ):
             rows += _followed(found, f"{name}, {turning}", float(np.max(np.std(rates[1], axis=0))))
     return rows
 
@@ -336,17 +502,33 @@ def _commands(log: FlightLog) -> list[Row]:
 def _followed(found: relations.Relation, both: str, spread: float) -> list[Row]:
     figures = _figures(found)
     if _apart(found):
-        text = f"the rates do not follow the commands (best correlation {found.axes_correlation:.2f}): not the same flight?"
+        text = (
+            f"the rates do not follow the commands (best correlation {found.axes_correlation:.2f}):"
+            " not the same flight?"
+        )
         return [Row("frames", both, "bad" if spread > _LIVELY else "warn", text, figures)]
     if _turned(found):
         text = f"the rates follow the commands {_better(found)}"
-        return [Row("frames", both, "bad", text, figures | {"axes": found.axes, "nats": found.nats})]
+        return [
+            Row("frames", both, "bad", text, figures | {"axes": found.axes, "nats": found.nats})
+        ]
     late = found.delay < -0.005
     hint = relations.unit_hint(found.scale)
     weak = found.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if late or weak else "ok"
-    text = f"the rates follow {1e3 * found.delay:.1f} ms later, correlation {found.correlation:.2f}, gain {found.scale:.2f}"
-    text += ": before they were commanded" if late else f": {hint}" if hint else ": weakly" if weak else ""
+    text = (
+        f"the rates follow {1e3 * found.delay:.1f} ms later, correlation {found.correlation:.2f},"
+        f" gain {found.scale:.2f}"
+    )
+    text += (
+        ": before they were commanded"
+        if late
+        else f": {hint}"
+        if hint
+        else ": weakly"
+        if weak
+        else ""
+    )
     return [Row("delay", both, verdict, text, figures)]
 
 
@@ -364,14 +546,33 @@ def _cable(log: FlightLog, known: Known) -> list[Row]:
     length, both = np.linalg.norm(gap, axis=1), "pos_w, payload_pos_w"
     if len(length) < 20:
         return [Row("frames", both, "bad", "vehicle and payload were never measured at one time")]
-    middle, spread = float(np.median(length)), float(np.percentile(length, 90) - np.percentile(length, 10))
+    middle, spread = (
+        float(np.median(length)),
+        float(np.percentile(length, 90) - np.percentile(length, 10)),
+    )
     above = float(np.mean(gap[:, 2] > 0.5 * middle))
     figures = {"median_m": middle, "p10_to_p90_m": spread, "payload_above_share": above}
     text = f"{middle:.4f} m apart (10 to 90 %: {1e3 * spread:.1f} mm)"
     if above > 0.5:
-        return [Row("frames", both, "bad", text + ", the payload above: bodies exchanged, or z down", figures)]
+        return [
+            Row(
+                "frames",
+                both,
+                "bad",
+                text + ", the payload above: bodies exchanged, or z down",
+                figures,
+            )
+        ]
     if not 0.02 < middle < 20.0:
-        return [Row("units", both, "bad", text + ": no cable; millimetres taken for metres, or metres for millimetres?", figures)]
+        return [
+            Row(
+                "units",
+                both,
+                "bad",
+                text + ": no cable; millimetres taken for metres, or metres for millimetres?",
+                figures,
+            )
+        ]
     rows = [Row("frames", both, "warn" if spread > 0.1 * middle else "ok", text, figures)]
     rows += _length(middle, known.cable_length, both) if known.cable_length else []
     return rows + _payload_late(time_q, q, time_p, p, both)
@@ -383,30 +584,50 @@ def _length(middle: float, expected: float, both: str) -> list[Row]:
     figures = {"median_m": middle, "model_m": expected}
     text = f"apart by {100 * off:+.1f} % of the model's cable of {expected:g} m"
     verdict = "bad" if abs(off) > _OTHER_CABLE else "warn" if abs(off) > _LONGER else "ok"
-    return [Row("cable", both, verdict, text + (": another cable, or another body" if verdict == "bad" else ""), figures)]
+    return [
+        Row(
+            "cable",
+            both,
+            verdict,
+            text + (": another cable, or another body" if verdict == "bad" else ""),
+            figures,
+        )
+    ]
 
 
-def _payload_late(time_q: np.ndarray, q: np.ndarray, time_p: np.ndarray, p: np.ndarray, both: str) -> list[Row]:
+def _payload_late(
+    time_q: np.ndarray, q: np.ndarray, time_p: np.ndarray, p: np.ndarray, both: str
+) -> list[Row]:
     """By how much the payload's stream is late: a cable keeps its length, at the right delay."""
     delays = np.arange(-0.2, 0.2001, 0.01)
     inside = (time_p > time_q[0] + 0.2) & (time_p < time_q[-1] - 0.2)
     if np.sum(inside) < 50:
         return []
-    lengths = np.array([np.linalg.norm(p[inside] - relations.on_grid(time_q, q, time_p[inside] - d), axis=1) for d in delays])
+    lengths = np.array(
+        [
+            np.linalg.norm(p[inside] - relations.on_grid(time_q, q, time_p[inside] - d), axis=1)
+            for d in delays
+        ]
+    )
     spread = np.std(lengths, axis=1)
     at = int(np.argmin(spread))
     independent = max(float(np.ptp(time_p[inside])) / relations.INDEPENDENT, 10.0)
     nats = independent * float(np.log(spread[len(delays) // 2] / max(spread[at], 1e-9)))
     if nats < _NATS or at in (0, len(delays) - 1) or abs(delays[at]) < _DELAY_WARN:
         return []
-    text = f"the payload is {1e3 * delays[at]:+.0f} ms behind the vehicle: the cable's length then varies by "
+    text = (
+        f"the payload is {1e3 * delays[at]:+.0f} ms behind the vehicle: the cable's length then"
+        " varies by "
+    )
     text += f"{1e3 * spread[at]:.1f} mm, not {1e3 * spread[len(delays) // 2]:.1f} ({nats:.0f} nats)"
     verdict = "bad" if abs(delays[at]) > _DELAY_BAD else "warn"
     return [Row("delay", both, verdict, text, {"delay_s": float(delays[at]), "nats": nats})]
 
 
 def _same(log: FlightLog) -> list[Row]:
-    """Two measurements of one quantity on different clocks: the delay between them, and whether it holds."""
+    """Two measurements of one quantity on different clocks: the delay between them, and whether it
+    holds.
+    """
     rows: list[Row] = []
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         if first not in log or second not in log:
@@ -420,7 +641,9 @@ def _same(log: FlightLog) -> list[Row]:
     return rows
 
 
-def _drift(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, both: str) -> list[Row]:
+def _drift(
+    time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, both: str
+) -> list[Row]:
     """Whether the delay is the same from piece to piece of 5 s."""
     delays, piece = [], 5.0
     for start in np.arange(time_a[0], time_a[-1] - piece, piece):
@@ -436,5 +659,8 @@ def _drift(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray,
     late = np.array([delay for _, delay in delays])
     spread = float(np.ptp(late))
     figures = {"delays_s": late.tolist(), "from_s": [float(start) for start, _ in delays]}
-    text = f"the delay runs from {1e3 * np.min(late):+.1f} to {1e3 * np.max(late):+.1f} ms over {len(late)} pieces of {piece:.0f} s"
+    text = (
+        f"the delay runs from {1e3 * np.min(late):+.1f} to {1e3 * np.max(late):+.1f} ms over"
+        f" {len(late)} pieces of {piece:.0f} s"
+    )
     return [Row("delay", both, "warn" if spread > 0.01 else "ok", text, figures)]

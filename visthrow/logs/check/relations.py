@@ -9,16 +9,25 @@ from visthrow.common.rotations import continuous
 from visthrow.logs.axes import EVERY, MATRICES
 
 REACH = 0.4  # largest delay looked for [s]
-_NEAR = 0.25  # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
+_NEAR = (
+    0.25  # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
+)
 _LONGEST_GRID = 60_000  # samples; longer stretches are thinned
 
-INDEPENDENT = 0.1  # samples of a flight this far apart [s] count as independent where evidence is weighed
+INDEPENDENT = (
+    0.1  # samples of a flight this far apart [s] count as independent where evidence is weighed
+)
 
 UNITS = {
-    180 / np.pi: "one is in degrees", np.pi / 180: "one is in degrees", 1000.0: "one is in thousandths",
-    1e-3: "one is in thousandths", 9.80665: "one is in g", 1 / 9.80665: "one is in g", 100.0: "one is in hundredths",
+    180 / np.pi: "one is in degrees",
+    np.pi / 180: "one is in degrees",
+    1000.0: "one is in thousandths",
+    1e-3: "one is in thousandths",
+    9.80665: "one is in g",
+    1 / 9.80665: "one is in g",
+    100.0: "one is in hundredths",
     0.01: "one is in hundredths",
-}  # fmt: skip
+}
 """Ratio -> what it gives away."""
 
 
@@ -37,11 +46,15 @@ class Relation:
 
 
 def on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N), shape (..., N, C)."""
+    """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N),
+    shape (..., N, C).
+    """
     return np.stack([np.interp(grid, time, column) for column in values.T], -1)
 
 
-def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, reach: float = REACH) -> Relation | None:
+def relate(
+    time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, reach: float = REACH
+) -> Relation | None:
     """Relate two signals of one or three components.
 
     Args:
@@ -77,7 +90,9 @@ def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray,
     own = np.trace(cross) / scale_of
     at = int(np.argmax(own))
     offset, curve = peak(own, at)
-    exchanges, matrices = (EVERY, MATRICES) if a.shape[1] == 3 else (("x", "-x"), np.array([[[1.0]], [[-1.0]]]))
+    exchanges, matrices = (
+        (EVERY, MATRICES) if a.shape[1] == 3 else (("x", "-x"), np.array([[[1.0]], [[-1.0]]]))
+    )
     scores = np.einsum("kij,jil->kl", matrices, cross / scale_of)
     k, best_at = np.unravel_index(np.argmax(scores), scores.shape)
     best = float(scores[k, best_at])
@@ -86,9 +101,15 @@ def relate(time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray,
     plain, turned = (min(max(c, 0.0), 0.999) for c in (own[at], best))
     nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EVERY))
     return Relation(
-        (at - steps + offset) * period, float(sd), float(own[at]), float(np.trace(cross[:, :, at])) / power, exchanges[k], best,
-        float(best_at - steps) * period, float(nats),
-    )  # fmt: skip
+        (at - steps + offset) * period,
+        float(sd),
+        float(own[at]),
+        float(np.trace(cross[:, :, at])) / power,
+        exchanges[k],
+        best,
+        float(best_at - steps) * period,
+        float(nats),
+    )
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
@@ -112,8 +133,11 @@ def unit_hint(ratio: float) -> str:
     return ""
 
 
-def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative over about ``span`` seconds, or two periods where these are longer; gaps are left out.
+def derivative(
+    time: np.ndarray, values: np.ndarray, span: float = 0.06
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative over about ``span`` seconds, or two periods where these are longer; gaps are left
+    out.
 
     Returns times [s] and derivatives.
     """
@@ -121,7 +145,9 @@ def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> tupl
     return middle, (values[last] - values[first]) / width[:, None]
 
 
-def rates_of(time: np.ndarray, quat: np.ndarray, span: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
+def rates_of(
+    time: np.ndarray, quat: np.ndarray, span: float = 0.06
+) -> tuple[np.ndarray, np.ndarray]:
     """Body rates from attitudes xyzw, over about ``span`` seconds as in :func:`derivative`.
 
     Returns times [s] and rates [rad/s], shape (N, 3).
@@ -134,7 +160,9 @@ def rates_of(time: np.ndarray, quat: np.ndarray, span: float = 0.06) -> tuple[np
 
 
 def _pairs(time: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """First and last sample of each stretch of about ``span``, the time in its middle [s] and its width [s]."""
+    """First and last sample of each stretch of about ``span``, the time in its middle [s] and its
+    width [s].
+    """
     period = float(np.median(np.diff(time))) if len(time) > 2 else 1.0
     reach = max(1, round(0.5 * span / period))
     first = np.arange(max(len(time) - 2 * reach, 0))

@@ -11,7 +11,8 @@ ORDER = ("ok", "warn", "bad")
 class Row:
     """One finding."""
 
-    topic: str  # clock, gaps, values, noise, units, frames, delay, cable, thrust, excited, answers, duplicates
+    # clock, gaps, values, noise, units, frames, delay, cable, thrust, excited, answers, duplicates
+    topic: str
     channel: str  # that it speaks of; or several; or "" for the whole log
     verdict: Verdict
     text: str
@@ -30,7 +31,9 @@ class Known:
     cable_length: float = 0.0  # to the payload's centre [m]; 0: none
     mass: float = 0.0  # of all that flies [kg]; 0: not known
     thrust_input: str = ""  # channel that the thrust comes from; "": whatever the log holds
-    thrust_map: tuple[float, float, float] | None = None  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
+    thrust_map: tuple[float, float, float] | None = (
+        None  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
+    )
 
 
 NOTHING = Known()

@@ -15,7 +15,9 @@ from visthrow.logs.flightlog import FlightLog
 _ALIKE = 0.2  # logs that share a larger part of their samples are copies of one another
 _ONE_PAYLOAD = 0.005  # two logs whose payloads' paths agree to this [m] hold one payload
 _MOST_PAIRED = 12
-_OTHER_SCALE = 0.08  # of the logarithm of thrust over force, that a battery's charge alone does not make
+_OTHER_SCALE = (
+    0.08  # of the logarithm of thrust over force, that a battery's charge alone does not make
+)
 _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
 
@@ -35,16 +37,23 @@ class Checked:
 def check(logs: Sequence[FlightLog], known: Known = NOTHING) -> list[Checked]:
     """Look at logs one by one, and at what they have in common."""
     common = [_copies(logs), _shared_payloads(logs), _masses(logs, known)]
-    rows = [(*_look(log, known), *(row for found in common for row in found.get(i, ()))) for i, log in enumerate(logs)]
+    rows = [
+        (*_look(log, known), *(row for found in common for row in found.get(i, ())))
+        for i, log in enumerate(logs)
+    ]
     return [Checked(label(log, i), of) for i, (log, of) in enumerate(zip(logs, rows))]
 
 
 CONTRADICT = ("frames", "units", "delay", "thrust", "excited")
-"""Topics in which a bad finding keeps a log from naming causes: the channels are not of one flight and clock."""
+"""Topics in which a bad finding keeps a log from naming causes: the channels are not of one flight
+and clock.
+"""
 
 
 def contradictions(results: Sequence[Checked]) -> list[str]:
-    """Why no cause may be named from logs: their channels contradict each other, or nothing moved."""
+    """Why no cause may be named from logs: their channels contradict each other, or
+    nothing moved.
+    """
     return [
         f"{checked.name}: {row.channel + ': ' if row.channel else ''}{row.text}"
         for checked in results
@@ -54,8 +63,15 @@ def contradictions(results: Sequence[Checked]) -> list[str]:
 
 
 def copies(results: Sequence[Checked]) -> dict[int, int]:
-    """Return the logs that hold what an earlier one holds, by number, and which one: a copy counts once."""
-    return {i: row.figures["copy_of"] for i, checked in enumerate(results) for row in checked.rows if row.topic == "duplicates"}
+    """Return the logs that hold what an earlier one holds, by number, and which one: a copy counts
+    once.
+    """
+    return {
+        i: row.figures["copy_of"]
+        for i, checked in enumerate(results)
+        for row in checked.rows
+        if row.topic == "duplicates"
+    }
 
 
 def label(log: FlightLog, number: int) -> str:
@@ -73,7 +89,11 @@ def _look(log: FlightLog, known: Known) -> list[Row]:
     for name, channel in log.channels.items():
         rows += signals.look(name, channel, signals.notes_of(log, name))
     rows += _clocks(log)
-    full = {name: channel for name, channel in log.channels.items() if np.sum(channel.valid) >= signals.FEW_SAMPLES}
+    full = {
+        name: channel
+        for name, channel in log.channels.items()
+        if np.sum(channel.valid) >= signals.FEW_SAMPLES
+    }
     usable = FlightLog(full, log.meta)
     return rows + physics.look(usable, known) + thrust.look(usable, known) + excitation.look(usable)
 
@@ -109,10 +129,19 @@ def _clocks(log: FlightLog) -> list[Row]:
     spans = [(c.time[0], c.time[-1]) for c in log.channels.values() if len(c.time) > 1]
     rows = []
     if len(clocks) > 1:
-        text = f"{len(clocks)} clocks: " + "; ".join(f"{name}: {', '.join(of)}" for name, of in clocks.items())
+        text = f"{len(clocks)} clocks: " + "; ".join(
+            f"{name}: {', '.join(of)}" for name, of in clocks.items()
+        )
         rows.append(Row("clock", "", "ok", text, {"clocks": len(clocks)}))
     if spans and max(start for start, _ in spans) > min(end for _, end in spans):
-        rows.append(Row("clock", "", "bad", "channels that never overlap in time: different clocks, or different flights"))
+        rows.append(
+            Row(
+                "clock",
+                "",
+                "bad",
+                "channels that never overlap in time: different clocks, or different flights",
+            )
+        )
     return rows
 
 
@@ -123,20 +152,32 @@ def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
         for i in range(j):
             shared = len(prints[i] & prints[j]) / max(min(len(prints[i]), len(prints[j])), 1)
             if shared > _ALIKE and prints[i]:
-                text = f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy counts once"
-                found.setdefault(j, []).append(Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared}))
+                text = (
+                    f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy"
+                    " counts once"
+                )
+                found.setdefault(j, []).append(
+                    Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared})
+                )
     return found
 
 
 def _masses(logs: Sequence[FlightLog], known: Known) -> dict[int, list[Row]]:
-    """Logs whose thrust stands to the force otherwise than in the others: another battery, vehicle, payload or map."""
-    masses = {i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, known)) is not None}
+    """Logs whose thrust stands to the force otherwise than in the others: another battery, vehicle,
+    payload or map.
+    """
+    masses = {
+        i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, known)) is not None
+    }
     if len(masses) < 2:
         return {}
     middle, found = float(np.median(list(masses.values()))), {}
     for i, mass in masses.items():
         if abs(np.log(mass / middle)) > _OTHER_SCALE:
-            text = f"thrust over force {mass:.4g} kg, {mass / middle:.3g} times that of the flights' middle: "
+            text = (
+                f"thrust over force {mass:.4g} kg, {mass / middle:.3g} times that of the flights'"
+                " middle: "
+            )
             text += "the thrust's scale differs from flight to flight"
             found[i] = [Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})]
     return found
@@ -145,7 +186,11 @@ def _masses(logs: Sequence[FlightLog], known: Known) -> dict[int, list[Row]]:
 def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
     """Logs of several vehicles with one payload: how far their clocks are apart."""
     found: dict[int, list[Row]] = {}
-    named = [i for i, log in enumerate(logs) if "payload_pos_w" in log and np.sum(log["payload_pos_w"].valid) > 100]
+    named = [
+        i
+        for i, log in enumerate(logs)
+        if "payload_pos_w" in log and np.sum(log["payload_pos_w"].valid) > 100
+    ]
     for first, second in combinations(named[:_MOST_PAIRED], 2):
         (time_a, a), (time_b, b) = (logs[i]["payload_pos_w"].samples() for i in (first, second))
         if max(np.max(np.std(a, axis=0)), np.max(np.std(b, axis=0))) < physics.MOVES:
@@ -160,8 +205,15 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
             late, sd = 1e3 * relation.delay, 1e3 * relation.delay_sd
             text = f"the payload of {label(logs[first], first)} to {1e3 * off:.1f} mm, "
             text += f"this clock {late:+.1f} ms behind (sd {sd:.1f} ms)"
-            figures = {"with": first, "delay_s": relation.delay, "delay_sd_s": relation.delay_sd, "rms_m": off}
-            found.setdefault(second, []).append(Row("clock", "payload_pos_w", "warn", text, figures))
+            figures = {
+                "with": first,
+                "delay_s": relation.delay,
+                "delay_sd_s": relation.delay_sd,
+                "rms_m": off,
+            }
+            found.setdefault(second, []).append(
+                Row("clock", "payload_pos_w", "warn", text, figures)
+            )
     return found
 
 
@@ -169,15 +221,25 @@ def _prints(log: FlightLog) -> set[bytes]:
     """Fingerprints of short runs of samples, whatever their time stamps."""
     prints: set[bytes] = set()
     for name, channel in log.channels.items():
-        if not any(word in name for word in _MOVING) or len(channel.values) < 8 or channel.values.dtype.kind == "b":
+        if (
+            not any(word in name for word in _MOVING)
+            or len(channel.values) < 8
+            or channel.values.dtype.kind == "b"
+        ):
             continue
-        rows = np.ascontiguousarray(channel.values.reshape(len(channel.values), -1), dtype=np.float64)
+        rows = np.ascontiguousarray(
+            channel.values.reshape(len(channel.values), -1), dtype=np.float64
+        )
         moving = np.flatnonzero(np.any(rows[1:] != rows[:-1], axis=1))
         first = moving[:: max(1, len(moving) // 2000)]
-        runs = rows[first[first + 4 <= len(rows), None] + np.arange(4)].reshape(-1, 4 * rows.shape[1])
+        runs = rows[first[first + 4 <= len(rows), None] + np.arange(4)].reshape(
+            -1, 4 * rows.shape[1]
+        )
         ordered = np.sort(runs, axis=1)  # NaN last
         others = np.sum((ordered[:, 1:] != ordered[:, :-1]) & ~np.isnan(ordered[:, :-1]), axis=1)
-        prints.update(hashlib.blake2b(run.tobytes(), digest_size=8).digest() for run in runs[others > 2])
+        prints.update(
+            hashlib.blake2b(run.tobytes(), digest_size=8).digest() for run in runs[others > 2]
+        )
     return prints
 
 
@@ -185,8 +247,14 @@ def table(checked: Checked, every: bool = False) -> str:
     """Print a log's rows; noise and clocks that are fine only on demand."""
     marks = {"ok": "ok  ", "warn": "WARN", "bad": "BAD "}
     lines = [f"{checked.name}: {checked.verdict}"]
-    shown = [row for row in checked.rows if every or row.verdict != "ok" or row.topic not in ("noise", "clock", "gaps")]
+    shown = [
+        row
+        for row in checked.rows
+        if every or row.verdict != "ok" or row.topic not in ("noise", "clock", "gaps")
+    ]
     width = max((len(row.channel) for row in shown), default=0)
     for row in shown:
-        lines.append(f"  {marks[row.verdict]} {row.topic:<10} {row.channel:<{min(width, 34)}}  {row.text}")
+        lines.append(
+            f"  {marks[row.verdict]} {row.topic:<10} {row.channel:<{min(width, 34)}}  {row.text}"
+        )
     return "\n".join(lines)

@@ -1,4 +1,6 @@
-"""Checks of one channel by itself: its clock, gaps, stuck and saturated values, jumps, and the noise of its sensor."""
+"""Checks of one channel by itself: its clock, gaps, stuck and saturated values, jumps, and the
+noise of its sensor.
+"""
 
 import numpy as np
 
@@ -8,21 +10,51 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 MAD_TO_SIGMA = 1.4826
 FEW_SAMPLES = 20
-FEW_STEPS, SLOW_PERIOD = 5, 0.5  # values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice
+FEW_STEPS, SLOW_PERIOD = (
+    5,
+    0.5,
+)  # values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice
 SHORT = 0.5  # shorter channels answer nothing [s]
 LONG = 1800.0  # of longer logs only windows spread over them are simulated [s]
 
 _GAP_PERIODS = 3.0
 _JITTER_WARN = 0.25  # of a period, 95th percentile
-_STUCK_TIME = 0.25  # [s]; a moving vehicle's pose does not stand still to the last digit for so long
+_STUCK_TIME = (
+    0.25  # [s]; a moving vehicle's pose does not stand still to the last digit for so long
+)
 _RAIL_SHARE = 0.01
-_RAILED = ("command", "motor_command", "motor_output", "pwm", "acc_b", "rate_b", "throttle", "motor_speed")
-_SWITCHES = ("release_command", "attached", "mode")  # channels that rest on one of few values by their nature
+_RAILED = (
+    "command",
+    "motor_command",
+    "motor_output",
+    "pwm",
+    "acc_b",
+    "rate_b",
+    "throttle",
+    "motor_speed",
+)
+_SWITCHES = (
+    "release_command",
+    "attached",
+    "mode",
+)  # channels that rest on one of few values by their nature
 _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
 _FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad": 50.0, "V": 500.0}
-"""Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs."""
+"""Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs.
+"""
 _HARDEST = 30.0  # acceleration of a vehicle or payload that throws [m/s^2]
-_ASKED = ("setpoint", "command", "action", "observation", "goal", "keypoints", "throttle", "motor", "pwm", "residual")
+_ASKED = (
+    "setpoint",
+    "command",
+    "action",
+    "observation",
+    "goal",
+    "keypoints",
+    "throttle",
+    "motor",
+    "pwm",
+    "residual",
+)
 """Channels of which somebody may ask for a step, or that hold no motion."""
 _STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm", "motor_speed")
 
@@ -30,14 +62,16 @@ _STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm",
 def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -> np.ndarray:
     """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
 
-    Third differences of a motion that is smooth over four samples vanish; those of white noise have 20 times its variance.
-    ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: which third differences count.
-    Returns sigma in the values' unit, shape () or (D,).
+    Third differences of a motion that is smooth over four samples vanish; those of white noise have
+    20 times its variance. ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: which
+    third differences count. Returns sigma in the values' unit, shape () or (D,).
 
     Source: Rousseeuw and Croux 1993 for the median absolute deviation.
     """
     third = np.diff(np.asarray(values, dtype=float), n=3, axis=0)[good]
-    return MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
+    return (
+        MAD_TO_SIGMA * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
+    )
 
 
 def noise(channel: Channel) -> np.ndarray:
@@ -65,26 +99,57 @@ def _resolution(values: np.ndarray) -> np.ndarray:
 
 
 def look(name: str, channel: Channel, notes: dict) -> list[Row]:
-    """All checks of one channel; ``notes``: what the reader left out; see :func:`visthrow.logs.readers.table.make_channel`."""
+    """All checks of one channel; ``notes``: what the reader left out; see
+    :func:`visthrow.logs.readers.table.make_channel`.
+    """
     count = len(channel.time)
     span = float(np.ptp(channel.time)) if count else 0.0
     if count >= FEW_STEPS and span > SLOW_PERIOD * count:
-        return [Row("clock", name, "ok", f"{count} settled values over {span:.0f} s", {"samples": count, "seconds": span})]
+        return [
+            Row(
+                "clock",
+                name,
+                "ok",
+                f"{count} settled values over {span:.0f} s",
+                {"samples": count, "seconds": span},
+            )
+        ]
     if count < FEW_SAMPLES or span < SHORT:
-        text = f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
+        text = (
+            f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
+        )
         event = name in ("separation", "landing", "goal_w", "release_command", "attached", "mode")
-        return [Row("clock", name, "ok" if event else "bad", text, {"samples": count, "seconds": span})]
-    return [_clock(name, channel, notes), *_gaps(name, channel), *_values(name, channel), *_noise(name, channel)]
+        return [
+            Row("clock", name, "ok" if event else "bad", text, {"samples": count, "seconds": span})
+        ]
+    return [
+        _clock(name, channel, notes),
+        *_gaps(name, channel),
+        *_values(name, channel),
+        *_noise(name, channel),
+    ]
 
 
 def _clock(name: str, channel: Channel, notes: dict) -> Row:
     steps = np.diff(channel.time)
     period, span = float(np.median(steps)), float(np.ptp(channel.time))
     jitter = float(np.percentile(np.abs(steps - period), 95)) / period
-    figures = {"samples": len(channel.time), "seconds": span, "rate_hz": 1.0 / period, "jitter_of_period": jitter}
-    text = f"{len(channel.time)} samples, {span:.1f} s, {1.0 / period:.4g} Hz, jitter {100 * jitter:.0f} % of a period"
+    figures = {
+        "samples": len(channel.time),
+        "seconds": span,
+        "rate_hz": 1.0 / period,
+        "jitter_of_period": jitter,
+    }
+    text = (
+        f"{len(channel.time)} samples, {span:.1f} s, {1.0 / period:.4g} Hz, jitter"
+        f" {100 * jitter:.0f} % of a period"
+    )
     verdict = "warn" if jitter > _JITTER_WARN else "ok"
-    for key, words in (("repeated", "stamps repeated"), ("backwards", "stamps going back"), ("unstamped", "rows unstamped")):
+    for key, words in (
+        ("repeated", "stamps repeated"),
+        ("backwards", "stamps going back"),
+        ("unstamped", "rows unstamped"),
+    ):
         if notes.get(key):
             verdict, text = "warn", f"{text}; {notes[key]} {words}"
             figures[key] = notes[key]
@@ -106,12 +171,30 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
     lost = float(np.sum(steps[wide] - period))
     invalid = float(np.mean(~channel.valid))
     share = lost / float(np.ptp(channel.time))
-    figures = {"gaps": int(np.sum(wide)), "longest_s": float(np.max(steps)), "lost_share": share, "invalid_share": invalid}
+    figures = {
+        "gaps": int(np.sum(wide)),
+        "longest_s": float(np.max(steps)),
+        "lost_share": share,
+        "invalid_share": invalid,
+    }
     if not np.any(wide) and invalid == 0.0:
         return []
-    verdict = "bad" if invalid + share > 0.5 else "warn" if invalid + share > 0.02 or np.max(steps) > 0.5 else "ok"
-    text = f"{int(np.sum(wide))} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the time, "
-    return [Row("gaps", name, verdict, text + f"{100 * invalid:.1f} % of the samples not valid", figures)]
+    verdict = (
+        "bad"
+        if invalid + share > 0.5
+        else "warn"
+        if invalid + share > 0.02 or np.max(steps) > 0.5
+        else "ok"
+    )
+    text = (
+        f"{int(np.sum(wide))} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the"
+        " time, "
+    )
+    return [
+        Row(
+            "gaps", name, verdict, text + f"{100 * invalid:.1f} % of the samples not valid", figures
+        )
+    ]
 
 
 def _values(name: str, channel: Channel) -> list[Row]:
@@ -143,9 +226,20 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
         return [Row("values", name, "bad", "one value from beginning to end", figures)]
     if longest > _STUCK_TIME:
         verdict = "bad" if total > 0.3 * float(np.ptp(time)) else "warn"
-        return [Row("values", name, verdict, f"stands still to the last digit for {longest:.2f} s at {at:.2f} s", figures)]
+        return [
+            Row(
+                "values",
+                name,
+                verdict,
+                f"stands still to the last digit for {longest:.2f} s at {at:.2f} s",
+                figures,
+            )
+        ]
     if share > 0.2:
-        text = f"{100 * share:.0f} % of the samples repeat the one before: measured more slowly than logged, or rounded"
+        text = (
+            f"{100 * share:.0f} % of the samples repeat the one before: measured more slowly than"
+            " logged, or rounded"
+        )
         return [Row("values", name, "warn", text, figures)]
     return []
 
@@ -164,7 +258,15 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
                 worst, where = share, f"its {words} value {rail:.6g}"
     if worst <= _RAIL_SHARE:
         return []
-    return [Row("values", name, "warn", f"{100 * worst:.1f} % of the samples at {where}: saturated", {"share": worst})]
+    return [
+        Row(
+            "values",
+            name,
+            "warn",
+            f"{100 * worst:.1f} % of the samples at {where}: saturated",
+            {"share": worst},
+        )
+    ]
 
 
 def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[Row]:
@@ -178,33 +280,60 @@ def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[R
     unit_word, rows = "" if unit == "1" else f" {unit}", []
     if np.any(far):
         at = int(np.argmax(np.where(far, size, 0.0)))
-        text = f"{int(np.sum(far))} jumps, the largest {size[at]:.3g}{unit_word} at {time[at]:.2f} s"
-        rows.append(Row("values", name, "warn" if np.mean(far) < 0.02 else "bad", text, {"jumps": int(np.sum(far))}))
+        text = (
+            f"{int(np.sum(far))} jumps, the largest {size[at]:.3g}{unit_word} at {time[at]:.2f} s"
+        )
+        rows.append(
+            Row(
+                "values",
+                name,
+                "warn" if np.mean(far) < 0.02 else "bad",
+                text,
+                {"jumps": int(np.sum(far))},
+            )
+        )
     return rows + _jumps_across(name, values, time, np.flatnonzero(~near)) if unit == "m" else rows
 
 
 def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray) -> list[Row]:
-    """Positions that do not go on behind a gap where they went before it: another origin, or another body."""
+    """Positions that do not go on behind a gap where they went before it: another origin, or
+    another body.
+    """
     off = []
     for i in gaps:
         before, after = slice(max(i - 8, 0), i + 1), slice(i + 1, i + 10)
         if min(len(time[before]), len(time[after])) < 5:
             continue
-        expected = [np.polyfit(time[part] - middle, values[part], 1)[1] for part, middle in
-                    ((before, 0.5 * (time[i] + time[i + 1])), (after, 0.5 * (time[i] + time[i + 1])))]  # fmt: skip
-        apart, width = float(np.linalg.norm(expected[1] - expected[0])), float(time[i + 1] - time[i])
+        expected = [
+            np.polyfit(time[part] - middle, values[part], 1)[1]
+            for part, middle in (
+                (before, 0.5 * (time[i] + time[i + 1])),
+                (after, 0.5 * (time[i] + time[i + 1])),
+            )
+        ]
+        apart, width = (
+            float(np.linalg.norm(expected[1] - expected[0])),
+            float(time[i + 1] - time[i]),
+        )
         if apart > 0.05 + 0.25 * _HARDEST * width**2:
             off.append((apart, float(time[i]), width))
     if not off:
         return []
     apart, at, width = max(off)
-    text = f"{len(off)} jumps across gaps, the largest {apart:.3g} m over the {width:.2f} s from {at:.2f} s: another origin or body?"
+    text = (
+        f"{len(off)} jumps across gaps, the largest {apart:.3g} m over the {width:.2f} s from"
+        f" {at:.2f} s: another origin or body?"
+    )
     return [Row("values", name, "warn", text, {"jumps_across_gaps": len(off), "largest_m": apart})]
 
 
 def _noise(name: str, channel: Channel) -> list[Row]:
     sigma = noise(channel)
-    if channel.values.dtype.kind == "b" or not np.all(np.isfinite(sigma)) or not np.any(sigma > 0.0):
+    if (
+        channel.values.dtype.kind == "b"
+        or not np.all(np.isfinite(sigma))
+        or not np.any(sigma > 0.0)
+    ):
         return []
     text = f"sd of the noise {', '.join(f'{s:.3g}' for s in sigma[:4])} {channel.unit}"
     return [Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})]

@@ -1,7 +1,9 @@
-"""Logs of autopilots as flight logs: PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog).
+"""Logs of autopilots as flight logs:
 
-All of them are north-east-down and forward-right-down; ours become x north, y west, z up and forward, left, up.
-"""
+PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog).
+
+All of them are north-east-down and forward-right-down; ours become x north, y west, z up and
+forward, left, up."""
 
 import math
 from dataclasses import replace
@@ -18,12 +20,18 @@ from visthrow.logs.readers.table import make_channel
 NED = "x,-y,-z"  # our axes in the autopilot's, world and body alike
 
 
-def _t(message: str, fields: str, channel: str, unit: str, kind: str = "vector", **more) -> tuple[str, ChannelMap]:
-    """Fields of one kind of message that make a channel; of those to one channel the first that is there is used."""
+def _t(
+    message: str, fields: str, channel: str, unit: str, kind: str = "vector", **more
+) -> tuple[str, ChannelMap]:
+    """Fields of one kind of message that make a channel; of those to one channel the first that is
+    there is used.
+    """
     columns, turned = tuple(fields.split()), kind != "vector"
     axes = NED if turned or len(columns) == 3 else ""
     order = "wxyz" if kind == "quaternion" else "xyzw"
-    return message, ChannelMap(channel, columns, unit, kind, order, axes=axes, body_axes=NED if turned else "", **more)
+    return message, ChannelMap(
+        channel, columns, unit, kind, order, axes=axes, body_axes=NED if turned else "", **more
+    )
 
 
 ULOG = (
@@ -32,9 +40,28 @@ ULOG = (
     _t("vehicle_attitude", "q[0] q[1] q[2] q[3]", "quat_wb", "1", kind="quaternion"),
     _t("vehicle_angular_velocity", "xyz[0] xyz[1] xyz[2]", "rate_b", "rad/s"),
     _t("sensor_combined", "gyro_rad[0] gyro_rad[1] gyro_rad[2]", "rate_b", "rad/s"),
-    _t("sensor_combined", "accelerometer_m_s2[0] accelerometer_m_s2[1] accelerometer_m_s2[2]", "acc_b", "m/s^2", frame="body"),
-    _t("vehicle_visual_odometry", "position[0] position[1] position[2]", "mocap_pos_w", "m", frame="world"),
-    _t("vehicle_visual_odometry", "q[0] q[1] q[2] q[3]", "mocap_quat_wb", "1", kind="quaternion", frame="world"),
+    _t(
+        "sensor_combined",
+        "accelerometer_m_s2[0] accelerometer_m_s2[1] accelerometer_m_s2[2]",
+        "acc_b",
+        "m/s^2",
+        frame="body",
+    ),
+    _t(
+        "vehicle_visual_odometry",
+        "position[0] position[1] position[2]",
+        "mocap_pos_w",
+        "m",
+        frame="world",
+    ),
+    _t(
+        "vehicle_visual_odometry",
+        "q[0] q[1] q[2] q[3]",
+        "mocap_quat_wb",
+        "1",
+        kind="quaternion",
+        frame="world",
+    ),
     _t("vehicle_rates_setpoint", "roll pitch yaw", "rate_setpoint_b", "rad/s", frame="body"),
     _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", scale=-1.0),
     _t("battery_status", "voltage_v", "battery_voltage", "V"),
@@ -72,31 +99,52 @@ TELEMETRY = (
     _t("RAW_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
     _t("VISION_POSITION_ESTIMATE", "x y z", "mocap_pos_w", "m", frame="world"),
     _t("ATT_POS_MOCAP", "x y z", "mocap_pos_w", "m", frame="world"),
-    _t("ATTITUDE_TARGET", "body_roll_rate body_pitch_rate body_yaw_rate", "rate_setpoint_b", "rad/s", frame="body"),
+    _t(
+        "ATTITUDE_TARGET",
+        "body_roll_rate body_pitch_rate body_yaw_rate",
+        "rate_setpoint_b",
+        "rad/s",
+        frame="body",
+    ),
     _t("ATTITUDE_TARGET", "thrust", "throttle", "1"),
     _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV"),
     _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1"),
 )
 
 SWEEP, SWEEP_AXES = ("SIDS", "SIDD"), 7
-"""Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it sweeps rates of roll, pitch, yaw."""
+"""Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it
+sweeps rates of roll, pitch, yaw.
+"""
 
-READERS = {".ulg": (read_ulog, ULOG), ".bin": (read_dataflash, DATAFLASH), ".tlog": (read_telemetry, TELEMETRY)}
+READERS = {
+    ".ulg": (read_ulog, ULOG),
+    ".bin": (read_dataflash, DATAFLASH),
+    ".tlog": (read_telemetry, TELEMETRY),
+}
 """Ending -> reader of the messages, and what they tell."""
 
 
 def log_of_autopilot(path: str | Path) -> FlightLog:
-    """Read the log of an autopilot, by its ending. Raises LogError: it cannot be read, or holds nothing of a vehicle's motion."""
+    """Read the log of an autopilot, by its ending.
+
+    Raises LogError: it cannot be read, or holds nothing of a vehicle's motion.
+    """
     reader, taps = READERS[Path(path).suffix.lower()]
     found = reader(path, {message for message, _ in taps} | set(SWEEP))
     channels, notes = {}, {}
     for message, entry in taps:
         fields = found.first(message)
-        if fields is None or entry.name in channels or not all(column in fields for column in entry.columns):
+        if (
+            fields is None
+            or entry.name in channels
+            or not all(column in fields for column in entry.columns)
+        ):
             continue
         with np.errstate(invalid="ignore"):  # damaged floats
             values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
-        channels[entry.name], noted = make_channel(np.asarray(fields["time"], float), values, entry, str(path))
+        channels[entry.name], noted = make_channel(
+            np.asarray(fields["time"], float), values, entry, str(path)
+        )
         notes[entry.name] = noted | {"clock": "autopilot", "message": message}
     _add_sweep(channels, notes, found)
     starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
@@ -106,14 +154,22 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
     start = min(starts)  # time counts from the first sample
     if not math.isfinite(start):
         raise LogError(f"{path}: stamps are not finite")
-    channels = {name: replace(channel, time=channel.time - start) for name, channel in channels.items()}
+    channels = {
+        name: replace(channel, time=channel.time - start) for name, channel in channels.items()
+    }
     meta = {"source": str(path), "start": start, "kind": found.kind, "ingest": notes, **found.meta}
     return FlightLog(channels, meta)
 
 
 def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:
-    """Add a sweep of ArduPilot's SYSTEMID to the commanded rate of its axis, which the log tells without it."""
-    started, sweep, rates = found.first(SWEEP[0]), found.first(SWEEP[1]), channels.get("rate_setpoint_b")
+    """Add a sweep of ArduPilot's SYSTEMID to the commanded rate of its axis, which the log tells
+    without it.
+    """
+    started, sweep, rates = (
+        found.first(SWEEP[0]),
+        found.first(SWEEP[1]),
+        channels.get("rate_setpoint_b"),
+    )
     if started is None or sweep is None or rates is None:
         return
     axis = int(np.asarray(started["Ax"])[-1]) - SWEEP_AXES
@@ -124,4 +180,6 @@ def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:
     values = rates.values.copy()
     values[:, axis] += added
     channels["rate_setpoint_b"] = replace(rates, values=values)
-    notes["rate_setpoint_b"] |= {"sweep": f"SIDD about axis {axis}, {time[0]:.1f} to {time[-1]:.1f} s"}
+    notes["rate_setpoint_b"] |= {
+        "sweep": f"SIDD about axis {axis}, {time[0]:.1f} to {time[-1]:.1f} s"
+    }

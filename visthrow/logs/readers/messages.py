@@ -1,10 +1,13 @@
-"""Messages of autopilot logs as arrays: PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog). Onboard-safe.
+"""Messages of autopilot logs as arrays:
 
-The one place that opens these files. Names, units and axes stay those of the autopilot; ``visthrow.logs.readers.autopilot`` makes flight
-logs of them, ``hil.poses.sources`` poses. Files are read as bytes: no device string, no condition, nothing is evaluated.
+PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog). Onboard-safe.
 
-Source: PX4 ULog file format; ArduPilot, AP_Logger/LogStructure.h; MAVLink's .tlog (big-endian microseconds before each message).
-"""
+The one place that opens these files. Names, units and axes stay those of the autopilot;
+``visthrow.logs.readers.autopilot`` makes flight logs of them, ``hil.poses.sources`` poses. Files
+are read as bytes: no device string, no condition, nothing is evaluated.
+
+Source: PX4 ULog file format; ArduPilot, AP_Logger/LogStructure.h; MAVLink's .tlog (big-endian
+microseconds before each message)."""
 
 import io
 import os
@@ -23,11 +26,17 @@ from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 
 Fields = dict[str, np.ndarray]
-"""Field -> values, shape (T,); ``time`` is when it was measured and ``arrival`` when it was written, both [s]."""
+"""Field -> values, shape (T,); ``time`` is when it was measured and ``arrival`` when it was
+written, both [s].
+"""
 
-MOST_RETURNS = 8  # times that a reader may step back to one and the same byte; one that is led astray by a damaged length does so for ever
+# times that a reader may step back to one and the same byte; one that is led astray by a damaged
+# length does so for ever
+MOST_RETURNS = 8
 
-_HEAD = b"\xa3\x95"  # of every DataFlash message; whatever begins otherwise would be searched byte by byte
+_HEAD = (  # of every DataFlash message; whatever begins otherwise would be searched byte by byte
+    b"\xa3\x95"
+)
 _INSTANCE = ("I", "C")  # fields of DataFlash that number sensors and estimator cores
 _STDERR = 2
 
@@ -73,7 +82,10 @@ def read_ulog(path: str | Path, wanted: Collection[str]) -> Messages:
 
 
 def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
-    """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement. Raises LogError: the file is no DataFlash log."""
+    """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement.
+
+    Raises LogError: the file is no DataFlash log.
+    """
     from pymavlink.DFReader import DFReader_binary
 
     columns = _Columns()
@@ -89,7 +101,10 @@ def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
             instance = next((row[name] for name in _INSTANCE if isinstance(row.get(name), int)), 0)
             if "TimeUS" in row:
                 measured = row["CTimeMS"] * 1e-3 if "CTimeMS" in row else row["TimeUS"] * 1e-6
-                columns.add((message.get_type(), instance), row | {"time": measured, "arrival": row["TimeUS"] * 1e-6})
+                columns.add(
+                    (message.get_type(), instance),
+                    row | {"time": measured, "arrival": row["TimeUS"] * 1e-6},
+                )
         log.close()
     return Messages(Path(path), "dataflash", columns.arrays(), {"damaged": bool(complaints)})
 
@@ -105,7 +120,8 @@ def _next(log: Any, wanted: list[str], columns: "_Columns") -> Any:
 
 
 def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
-    """Read messages of a ``.tlog``, of the first sender of each; the time is the sender's stamp where there is one.
+    """Read messages of a ``.tlog``, of the first sender of each; the time is the sender's stamp
+    where there is one.
 
     Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
@@ -117,9 +133,13 @@ def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
         if name in wanted and sender.setdefault(name, whose) == whose:
             row = message.to_dict()
             boot, usec = row.get("time_boot_ms"), row.get("time_usec")
-            measured = boot * 1e-3 if boot is not None else usec * 1e-6 if usec is not None else arrival
+            measured = (
+                boot * 1e-3 if boot is not None else usec * 1e-6 if usec is not None else arrival
+            )
             columns.add((name, 0), row | {"time": measured, "arrival": arrival})
-    return Messages(Path(path), "telemetry", columns.arrays(), {"damaged": used < Path(path).stat().st_size})
+    return Messages(
+        Path(path), "telemetry", columns.arrays(), {"damaged": used < Path(path).stat().st_size}
+    )
 
 
 def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
@@ -140,17 +160,23 @@ def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
             message = decoder.decode(bytearray(data[at + 8 : at + 8 + length])) if length else None
         except Exception:  # of a damaged message, pymavlink raises whatever it stumbles over
             message = None
-        if message is None or message.get_msgId() < 0:  # an unknown one, whose checksum is not known either
+        if (
+            message is None or message.get_msgId() < 0
+        ):  # an unknown one, whose checksum is not known either
             at += 1  # look for the next message
             continue
         yield struct.unpack_from(">Q", data, at)[0] * 1e-6, message
         at, count = at + 8 + length, count + 1
     if not count:
-        raise LogError(f"{path}: {len(data)} bytes without a single MAVLink message; expected a .tlog")
+        raise LogError(
+            f"{path}: {len(data)} bytes without a single MAVLink message; expected a .tlog"
+        )
 
 
 def _mavlink_length(data: bytes, at: int) -> int:
-    """Return the length of the message that begins at a place; 0 where none does, or it is cut short."""
+    """Return the length of the message that begins at a place; 0 where none does, or it is cut
+    short.
+    """
     head = data[at : at + 3]
     if len(head) < 3 or head[0] not in (0xFE, 0xFD):
         return 0
@@ -159,7 +185,9 @@ def _mavlink_length(data: bytes, at: int) -> int:
 
 
 class _Columns:
-    """Rows of messages, gathered by message and instance; a row that lacks a field of the first is left out."""
+    """Rows of messages, gathered by message and instance; a row that lacks a field of the first is
+    left out.
+    """
 
     def __init__(self) -> None:
         self.rows: dict[tuple[str, int], dict[str, list[float]]] = {}
@@ -170,18 +198,27 @@ class _Columns:
             if isinstance(value, (int, float)):
                 numbers[name] = float(value)
             elif isinstance(value, (list, tuple)):
-                numbers |= {f"{name}[{i}]": float(x) for i, x in enumerate(value) if isinstance(x, (int, float))}
+                numbers |= {
+                    f"{name}[{i}]": float(x)
+                    for i, x in enumerate(value)
+                    if isinstance(x, (int, float))
+                }
         rows = self.rows.setdefault(key, {name: [] for name in numbers})
         if rows.keys() <= numbers.keys():
             for name, values in rows.items():
                 values.append(numbers[name])
 
     def arrays(self) -> dict[tuple[str, int], Fields]:
-        return {key: {name: np.array(values) for name, values in rows.items()} for key, rows in self.rows.items()}
+        return {
+            key: {name: np.array(values) for name, values in rows.items()}
+            for key, rows in self.rows.items()
+        }
 
 
 class Forward(io.BytesIO):
-    """Bytes of a file for a reader that looks for the next message of a damaged log by stepping back: never in a circle."""
+    """Bytes of a file for a reader that looks for the next message of a damaged log by stepping
+    back: never in a circle.
+    """
 
     def __init__(self, data: bytes) -> None:
         """Begin at the first byte."""
@@ -189,7 +226,10 @@ class Forward(io.BytesIO):
         self._returns: Counter[int] = Counter()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a byte, as in any file. Raises LogError: it leads to a byte that was returned to too often."""
+        """Go to a byte, as in any file.
+
+        Raises LogError: it leads to a byte that was returned to too often.
+        """
         before = self.tell()
         after = super().seek(offset, whence)
         if after < before:
@@ -201,10 +241,11 @@ class Forward(io.BytesIO):
 
 @contextmanager
 def _parsing(path: str | Path, what: str) -> Iterator[list[str]]:
-    """Turn whatever a parser makes of a file that is none of its own into one error; what it prints becomes a list.
+    """Turn whatever a parser makes of a file that is none of its own into one error; what it prints
+    becomes a list.
 
-    Some of them print a line a damaged byte, and past Python. Raises LogError: instead of any other exception.
-    """
+    Some of them print a line a damaged byte, and past Python. Raises LogError: instead of any other
+    exception."""
     said: list[str] = []
     heard = io.StringIO()
     try:
@@ -218,7 +259,10 @@ def _parsing(path: str | Path, what: str) -> Iterator[list[str]]:
                 os.dup2(kept, _STDERR)
                 os.close(kept)
                 file.seek(0)
-                said += [*heard.getvalue().splitlines(), *file.read().decode(errors="replace").splitlines()]
+                said += [
+                    *heard.getvalue().splitlines(),
+                    *file.read().decode(errors="replace").splitlines(),
+                ]
     except Exception as error:
         detail = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise LogError(f"{path}: cannot be read: {detail}; expected {what}") from error

@@ -1,10 +1,13 @@
-"""Recordings of other tools as columns: ROS 1 and 2 bags, MCAP, MATLAB, HDF5, and the Crazyflie's own log on a card.
+"""Recordings of other tools as columns:
 
-A recording holds several tables, each on a clock of its own: column ``drone/pose:position.x`` is of the table ``drone/pose``, whose
-stamps are ``drone/pose:time`` [s]. A mapping reads them as it reads a table's columns, each channel with its clock.
+ROS 1 and 2 bags, MCAP, MATLAB, HDF5, and the Crazyflie's own log on a card.
 
-Source: crazyflie-firmware, tools/usdlog/cfusdlog.py (the card's format); rosbags, mcap, scipy.io and h5py read the others.
-"""
+A recording holds several tables, each on a clock of its own: column ``drone/pose:position.x`` is of
+the table ``drone/pose``, whose stamps are ``drone/pose:time`` [s]. A mapping reads them as it reads
+a table's columns, each channel with its clock.
+
+Source: crazyflie-firmware, tools/usdlog/cfusdlog.py (the card's format); rosbags, mcap, scipy.io
+and h5py read the others."""
 
 import io
 import json
@@ -20,13 +23,15 @@ from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 from visthrow.logs.readers.table import Table
 
-WIDEST = 32  # a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal
+# a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal
+WIDEST = 32
 _CARD = 0xBC
 _CARD_TYPES = set("BbHhIiQqfdeL?")
 
 
 def read_recording(path: Path) -> Table:
-    """Read all columns of numbers from a file of one of :data:`READERS`, or of the Crazyflie's card.
+    """Read all columns of numbers from a file of one of :data:`READERS`, or of the Crazyflie's
+    card.
 
     Raises LogError: a package is missing, or the file cannot be read or holds no numbers.
     """
@@ -43,7 +48,9 @@ def read_recording(path: Path) -> Table:
 
 
 def is_card(path: Path) -> bool:
-    """Tell whether a file without a known ending is of a Crazyflie's card; LogError where there is none."""
+    """Tell whether a file without a known ending is of a Crazyflie's card; LogError where there is
+    none.
+    """
     if not path.is_file():
         raise LogError(f"{path}: no such file")
     with path.open("rb") as file:
@@ -52,15 +59,22 @@ def is_card(path: Path) -> bool:
 
 
 def _card(path: Path) -> Table:
-    """Events of the card's log: each a table; stamps of version 1 in milliseconds, of version 2 in microseconds."""
+    """Events of the card's log: each a table; stamps of version 1 in milliseconds, of version 2 in
+    microseconds.
+    """
     data = path.read_bytes()
     if len(data) < 9 or data[0] != _CARD:
-        raise LogError(f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log of a Crazyflie's card")
+        raise LogError(
+            f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log of a"
+            " Crazyflie's card"
+        )
     if struct.unpack("<I", data[-4:])[0] != zlib.crc32(data[:-4]):
         raise LogError(f"{path}: its checksum is wrong: cut short or damaged")
     version, kinds = struct.unpack_from("<HH", data, 1)
     if version not in (1, 2):
-        raise LogError(f"{path}: version {version} of a Crazyflie's card; versions 1 and 2 are known")
+        raise LogError(
+            f"{path}: version {version} of a Crazyflie's card; versions 1 and 2 are known"
+        )
     stamp, unit = ("<HI", 1e-3) if version == 1 else ("<HQ", 1e-6)
     at, events = 5, {}
     for _ in range(kinds):
@@ -72,8 +86,16 @@ def _card(path: Path) -> Table:
             field, at = _word(data, at)
             fields.append((field[:-3], field[-2]))
         if not all(kind in _CARD_TYPES for _, kind in fields):
-            raise LogError(f"{path}: a variable of {name} has a type that is not known; known: {''.join(sorted(_CARD_TYPES))}")
-        events[number] = (name, [field for field, _ in fields], "<" + "".join(kind for _, kind in fields), [])
+            raise LogError(
+                f"{path}: a variable of {name} has a type that is not known; known:"
+                f" {''.join(sorted(_CARD_TYPES))}"
+            )
+        events[number] = (
+            name,
+            [field for field, _ in fields],
+            "<" + "".join(kind for _, kind in fields),
+            [],
+        )
     while at + struct.calcsize(stamp) <= len(data) - 4:
         number, time = struct.unpack_from(stamp, data, at)
         if number not in events:
@@ -110,12 +132,18 @@ def _hdf5(path: Path) -> Table:
     h5py = load_extra("h5py", "recordings", f"{path}: an HDF5 file", LogError)
     found: dict[str, Any] = {}
     with h5py.File(path) as file:
-        file.visititems(lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None)
+        file.visititems(
+            lambda name, item: (
+                found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None
+            )
+        )
     return _flat(found)
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
-    """Columns of a tree of arrays: vectors as they are, matrices column by column, the longer side being time."""
+    """Columns of a tree of arrays: vectors as they are, matrices column by column, the longer side
+    being time.
+    """
     table: Table = {}
     for name, value in tree.items():
         if name.startswith("__"):
@@ -125,14 +153,19 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
             continue
         values = np.asarray(value)
         if values.dtype.names:
-            table |= _flat({field: values[field] for field in values.dtype.names}, f"{prefix}{name}.")
+            table |= _flat(
+                {field: values[field] for field in values.dtype.names}, f"{prefix}{name}."
+            )
         elif values.dtype.kind in "biuf":
             values = values.squeeze()
             values = values.T if values.ndim == 2 and values.shape[0] < values.shape[1] else values
             if values.ndim == 1 and len(values) > 1:
                 table[prefix + name] = values.astype(float)
             elif values.ndim == 2 and values.shape[1] <= WIDEST:
-                table |= {f"{prefix}{name}[{i}]": column.astype(float) for i, column in enumerate(values.T)}
+                table |= {
+                    f"{prefix}{name}[{i}]": column.astype(float)
+                    for i, column in enumerate(values.T)
+                }
     return table
 
 
@@ -143,10 +176,20 @@ def _bag(path: Path) -> Table:
     from rosbags.typesys import Stores, get_typestore
 
     def messages() -> Iterator[tuple[str, float, Any]]:
-        folder = path if path.suffix == ".bag" or path.is_dir() else path.parent if (path.parent / "metadata.yaml").exists() else path
+        folder = (
+            path
+            if path.suffix == ".bag" or path.is_dir()
+            else path.parent
+            if (path.parent / "metadata.yaml").exists()
+            else path
+        )
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             for connection, stamp, raw in reader.messages():
-                yield connection.topic.strip("/"), stamp * 1e-9, reader.deserialize(raw, connection.msgtype)
+                yield (
+                    connection.topic.strip("/"),
+                    stamp * 1e-9,
+                    reader.deserialize(raw, connection.msgtype),
+                )
 
     return _topics(messages())
 
@@ -170,7 +213,10 @@ def _topics(messages: Iterator[tuple[str, float, Any]]) -> Table:
     rows: dict[str, list[dict[str, float]]] = {}
     for topic, arrival, message in messages:
         row = dict(_numbers(message, ""))
-        stamp = next((at for head in ("header.stamp", "stamp", "timestamp") if (at := _stamp(row, head))), 0.0)
+        stamp = next(
+            (at for head in ("header.stamp", "stamp", "timestamp") if (at := _stamp(row, head))),
+            0.0,
+        )
         rows.setdefault(topic, []).append({"time": stamp or arrival, "arrival": arrival} | row)
     start = min((row["time"] for of in rows.values() for row in of), default=0.0)
     table: Table = {}
@@ -184,7 +230,10 @@ def _topics(messages: Iterator[tuple[str, float, Any]]) -> Table:
 
 def _stamp(row: dict[str, float], head: str) -> float:
     """Seconds of a ROS stamp; 0 where the message has none."""
-    whole, part = row.get(f"{head}.sec", row.get(f"{head}.secs", 0.0)), row.get(f"{head}.nanosec", row.get(f"{head}.nsecs", 0.0))
+    whole, part = (
+        row.get(f"{head}.sec", row.get(f"{head}.secs", 0.0)),
+        row.get(f"{head}.nanosec", row.get(f"{head}.nsecs", 0.0)),
+    )
     return whole + 1e-9 * part
 
 
@@ -205,7 +254,11 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
 
 
 READERS: dict[str, tuple[Callable[[Path], Table], str]] = {
-    ".mat": (_matlab, "a MATLAB file"), ".h5": (_hdf5, "an HDF5 file"), ".hdf5": (_hdf5, "an HDF5 file"),
-    ".bag": (_bag, "a ROS 1 bag"), ".db3": (_bag, "a ROS 2 bag"), ".mcap": (_mcap, "an MCAP file"),
-}  # fmt: skip
+    ".mat": (_matlab, "a MATLAB file"),
+    ".h5": (_hdf5, "an HDF5 file"),
+    ".hdf5": (_hdf5, "an HDF5 file"),
+    ".bag": (_bag, "a ROS 1 bag"),
+    ".db3": (_bag, "a ROS 2 bag"),
+    ".mcap": (_mcap, "an MCAP file"),
+}
 """Ending -> reader, and what it expects."""

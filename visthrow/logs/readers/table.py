@@ -1,4 +1,6 @@
-"""CSV (plain, gzip, xz) and parquet tables into flight logs, by a mapping; our own exports without one."""
+"""CSV (plain, gzip, xz) and parquet tables into flight logs, by a mapping; our own exports without
+one.
+"""
 
 import csv
 import gzip
@@ -21,8 +23,13 @@ from visthrow.logs.units import to_si
 Table = dict[str, np.ndarray]
 """Column -> values; numbers as float64 (NaN where the cell is empty), anything else as text."""
 
-_EXPORTED = re.compile(r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:, (?P<frame>world|body|camera|image|mocap))?\]")
-_LARGEST = 1e100  # no number of a flight is as large, in whatever unit; its square is still a number
+_EXPORTED = re.compile(
+    r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:,"
+    r" (?P<frame>world|body|camera|image|mocap))?\]"
+)
+_LARGEST = (
+    1e100  # no number of a flight is as large, in whatever unit; its square is still a number
+)
 _SNIFFED = 65536  # characters in which separators are looked for
 _COMMA = re.compile(r"\d,\d")
 _WORDS = {"True": 1.0, "False": 0.0}
@@ -34,9 +41,10 @@ _OPENERS = {".gz": gzip.decompress, ".xz": lzma.decompress}
 def read_table(path: str | Path) -> Table:
     """Read a table.
 
-    Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma, lists stand in a cell
-    (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); without a header line columns are called ``column 1`` and so on. Raises LogError: it
-    cannot be read, has no rows, or a row has another number of cells than the header.
+    Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma,
+    lists stand in a cell (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); without a header line
+    columns are called ``column 1`` and so on. Raises LogError: it cannot be read, has no rows, or a
+    row has another number of cells than the header.
 
     Args:
         path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.txt`` or ``.parquet``.
@@ -49,7 +57,9 @@ def read_table(path: str | Path) -> Table:
         text = _OPENERS.get(path.suffix, bytes)(data).decode("utf-8-sig")
         comma, rows = _rows(text)
     except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
-        raise LogError(f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz") from error
+        raise LogError(
+            f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
+        ) from error
     header = [name.strip() for name in rows[0][1]] if rows else []
     body = rows[1:]
     if header and all(_is_number(cell, comma) for cell in header):
@@ -62,7 +72,9 @@ def read_table(path: str | Path) -> Table:
         raise LogError(f"{path}: a header of {len(header)} columns and no rows below it")
     wrong = next(((line, row) for line, row in body if len(row) != len(header)), None)
     if wrong is not None:
-        raise LogError(f"{path}: line {wrong[0]} has {len(wrong[1])} cells; the header has {len(header)}")
+        raise LogError(
+            f"{path}: line {wrong[0]} has {len(wrong[1])} cells; the header has {len(header)}"
+        )
     twice = {name for name in header if header.count(name) > 1}
     if twice:
         raise LogError(f"{path}: column '{min(twice)}' stands twice in the header")
@@ -76,7 +88,11 @@ def _rows(text: str) -> tuple[bool, list[tuple[int, list[str]]]]:
     """Return whether decimals have a comma, and each line that is not empty with its number."""
     head = [line for line in text[:_SNIFFED].splitlines()[:20] if line.strip()] or [""]
     mark = next((m for m in ";\t," if m in head[0]), " ")
-    comma = mark in ";\t" and any(map(_COMMA.search, head[1:])) and not any("." in line for line in head[1:])
+    comma = (
+        mark in ";\t"
+        and any(map(_COMMA.search, head[1:]))
+        and not any("." in line for line in head[1:])
+    )
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, skipinitialspace=mark == " ")
     return comma, [(reader.line_num, row) for row in reader if row]
 
@@ -94,7 +110,10 @@ def _lists(name: str, cells: tuple[str, ...]) -> Table:
     first = next((cell.strip() for cell in cells if cell.strip()), "")
     if not _LIST.fullmatch(first):
         return {}
-    rows = [[float(part) if _is_number(part) else math.nan for part in _PARTS.split(c.strip("[]() \t"))] for c in cells]
+    rows = [
+        [float(part) if _is_number(part) else math.nan for part in _PARTS.split(c.strip("[]() \t"))]
+        for c in cells
+    ]
     width = max(map(len, rows))
     values = np.array([row + [math.nan] * (width - len(row)) for row in rows])
     return {f"{name}[{i}]": values[:, i] for i in range(width)}
@@ -108,7 +127,9 @@ def _column(cells: tuple[str, ...], comma: bool = False) -> np.ndarray:
     except ValueError:
         pass
     try:
-        return np.array([float(_WORDS.get(cell, cell)) if cell.strip() else math.nan for cell in cells])
+        return np.array(
+            [float(_WORDS.get(cell, cell)) if cell.strip() else math.nan for cell in cells]
+        )
     except ValueError:
         return np.array(cells)
 
@@ -124,7 +145,11 @@ def _parquet(data: bytes, path: Path) -> Table:
     columns = {}
     for name in table.column_names:
         values = table[name].to_numpy(zero_copy_only=False)
-        columns[name] = values.astype(np.float64) if values.dtype.kind in "bifu" else _column(tuple(map(_text, values)))
+        columns[name] = (
+            values.astype(np.float64)
+            if values.dtype.kind in "bifu"
+            else _column(tuple(map(_text, values)))
+        )
     if not columns or not table.num_rows:
         raise LogError(f"{path}: a parquet table without rows")
     return columns
@@ -144,7 +169,9 @@ def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
     logs = [_log(table, mapping, rows, label, source) for rows, label in parts]
     if not logs:
         shortest = mapping.split.shortest if mapping.split else 0.0
-        raise LogError(f"{source}: {count} rows, but no stretch without a gap that lasts {shortest:g} s")
+        raise LogError(
+            f"{source}: {count} rows, but no stretch without a gap that lasts {shortest:g} s"
+        )
     return logs
 
 
@@ -152,8 +179,14 @@ def _numbers(table: Table, name: str, source: str) -> np.ndarray:
     if name not in table:
         raise LogError(f"{source}: no column '{name}'; {suggest(name, table)}")
     if table[name].dtype.kind not in "fiub":
-        row, cell = next((i, c) for i, c in enumerate(table[name].tolist(), start=1) if c.strip() and not _is_number(c))
-        raise LogError(f"{source}: column '{name}' holds text such as '{cell}' in row {row}; expected numbers")
+        row, cell = next(
+            (i, c)
+            for i, c in enumerate(table[name].tolist(), start=1)
+            if c.strip() and not _is_number(c)
+        )
+        raise LogError(
+            f"{source}: column '{name}' holds text such as '{cell}' in row {row}; expected numbers"
+        )
     return table[name]
 
 
@@ -163,7 +196,9 @@ def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
     return _numbers(table, clock.column, source) * to_si(clock.unit, "time")[1] + clock.offset
 
 
-def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tuple[np.ndarray | slice, str]]:
+def _parts(
+    table: Table, mapping: TableMap, count: int, source: str
+) -> list[tuple[np.ndarray | slice, str]]:
     split = mapping.split
     if split is None:
         return [(slice(None), "")]
@@ -173,7 +208,10 @@ def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tup
             raise LogError(f"{source}: no column '{split.column}'; {suggest(split.column, table)}")
         values = table[split.column]
         order = list(dict.fromkeys(values.tolist()))
-        parts = [(everything[values == value], f"{value:g}" if isinstance(value, float) else value) for value in order]
+        parts = [
+            (everything[values == value], f"{value:g}" if isinstance(value, float) else value)
+            for value in order
+        ]
     else:
         parts = [(everything, "")]
     if split.gap > 0.0:
@@ -181,15 +219,23 @@ def _parts(table: Table, mapping: TableMap, count: int, source: str) -> list[tup
         parts = [
             (piece, f"{label}#{i}" if label else f"#{i}")
             for rows, label in parts
-            for i, piece in enumerate(np.split(rows, np.flatnonzero(np.diff(time[rows]) > split.gap) + 1))
+            for i, piece in enumerate(
+                np.split(rows, np.flatnonzero(np.diff(time[rows]) > split.gap) + 1)
+            )
         ]
     if split.shortest > 0.0:
         time = _stamps(table, mapping.time, source)
-        parts = [(rows, label) for rows, label in parts if len(rows) and np.ptp(time[rows]) >= split.shortest]
+        parts = [
+            (rows, label)
+            for rows, label in parts
+            if len(rows) and np.ptp(time[rows]) >= split.shortest
+        ]
     return parts
 
 
-def _log(table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, source: str) -> FlightLog:
+def _log(
+    table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, source: str
+) -> FlightLog:
     count = len(next(iter(table.values()))[rows])
     meta = {"source": source, "part": label, "rows": count, "ingest": {}}
     channels = {}
@@ -199,8 +245,8 @@ def _log(table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, 
         columns = [_numbers(table, name, source)[rows] for name in entry.columns]
         if {len(column) for column in columns} != {len(time)}:
             raise LogError(
-                f"{source}: channel '{entry.name}': {len(time)} stamps, columns of {', '.join(str(len(c)) for c in columns)}; "
-                "expected one table and its clock"
+                f"{source}: channel '{entry.name}': {len(time)} stamps, columns of"
+                f" {', '.join(str(len(c)) for c in columns)}; expected one table and its clock"
             )
         values = np.column_stack(columns)
         channel, notes = make_channel(time, values, entry, source)
@@ -209,10 +255,13 @@ def _log(table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, 
     return FlightLog(channels, meta)
 
 
-def make_channel(time: np.ndarray, values: np.ndarray, entry: ChannelMap, source: str) -> tuple[Channel, dict]:
+def make_channel(
+    time: np.ndarray, values: np.ndarray, entry: ChannelMap, source: str
+) -> tuple[Channel, dict]:
     """Turn columns into a channel of ours.
 
-    Rows without a stamp, of a stamp that was there before, or of an earlier one are left out and counted: a clock must go on.
+    Rows without a stamp, of a stamp that was there before, or of an earlier one are left out and
+    counted: a clock must go on.
 
     Args:
         time: Stamps [s], shape (T,); NaN where there is none.
@@ -227,10 +276,16 @@ def make_channel(time: np.ndarray, values: np.ndarray, entry: ChannelMap, source
     unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
     rows = np.flatnonzero(np.isfinite(time))
     steps = np.diff(time[rows])
-    notes = {"rows": len(time), "unstamped": len(time) - len(rows), "repeated": int(np.sum(steps == 0.0)),
-             "backwards": int(np.sum(steps < 0.0))}  # fmt: skip
+    notes = {
+        "rows": len(time),
+        "unstamped": len(time) - len(rows),
+        "repeated": int(np.sum(steps == 0.0)),
+        "backwards": int(np.sum(steps < 0.0)),
+    }
     rows = rows[np.diff(np.maximum.accumulate(time[rows]), prepend=-np.inf) > 0.0]
-    blank = np.all(np.isnan(values[rows]), axis=1)  # a row of blanks is of another channel: no sample
+    blank = np.all(
+        np.isnan(values[rows]), axis=1
+    )  # a row of blanks is of another channel: no sample
     notes["blank"] = int(np.sum(blank))
     time, values = time[rows[~blank]], values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
@@ -273,17 +328,24 @@ def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarr
     if not entry.axes and not entry.body_axes:
         return quat
     length = np.linalg.norm(quat, axis=1)
-    turned = Rotation.from_matrix(turn_of(entry.axes or OURS)) * Rotation.from_quat(np.where(length[:, None] > 0, quat, [0, 0, 0, 1]))
-    return (turned * Rotation.from_matrix(turn_of(entry.body_axes or OURS)).inv()).as_quat() * length[:, None]
+    turned = Rotation.from_matrix(turn_of(entry.axes or OURS)) * Rotation.from_quat(
+        np.where(length[:, None] > 0, quat, [0, 0, 0, 1])
+    )
+    return (
+        turned * Rotation.from_matrix(turn_of(entry.body_axes or OURS)).inv()
+    ).as_quat() * length[:, None]
 
 
 def is_export(table: Table) -> bool:
     """Tell whether a table is one of :func:`visthrow.logs.export.export`."""
-    return "time [s]" in table and all(_EXPORTED.fullmatch(name) for name in table if name != "time [s]")
+    return "time [s]" in table and all(
+        _EXPORTED.fullmatch(name) for name in table if name != "time [s]"
+    )
 
 
 def log_of_export(table: Table, path: Path) -> FlightLog:
-    """Read back a table that :func:`visthrow.logs.export.export` wrote; parquet carries the metadata.
+    """Read back a table that :func:`visthrow.logs.export.export` wrote; parquet carries the
+    metadata.
 
     Raises LogError: columns of one channel do not fit together.
     """
@@ -293,18 +355,26 @@ def log_of_export(table: Table, path: Path) -> FlightLog:
         if column != "time [s]":
             index = tuple(map(int, match["index"].split(","))) if match["index"] else ()
             place = match["unit"], match["frame"] or "none"
-            found.setdefault(match["name"], (place, {}))[1][index] = _numbers(table, column, str(path))
+            found.setdefault(match["name"], (place, {}))[1][index] = _numbers(
+                table, column, str(path)
+            )
     try:
         for name, (place, cells) in found.items():
             spec = STANDARD_CHANNELS.get(name)
-            unit, frame = place if spec is None else (spec.unit, spec.frame)  # a standard unit may hold a comma
+            unit, frame = (
+                place if spec is None else (spec.unit, spec.frame)
+            )  # a standard unit may hold a comma
             shape = tuple(np.max(list(cells), axis=0) + 1) if () not in cells else ()
             if len(cells) != math.prod(shape):
-                raise LogError(f"channel '{name}' has {len(cells)} columns; expected {math.prod(shape)}")
+                raise LogError(
+                    f"channel '{name}' has {len(cells)} columns; expected {math.prod(shape)}"
+                )
             values = np.full((len(time), *shape), np.nan)
             for index, column in cells.items():
                 values[(slice(None), *index)] = column
-            there = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)  # not where it is NaN
+            there = np.all(
+                np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1
+            )  # not where it is NaN
             channels[name] = Channel(time[there], values[there], unit, frame)
         return FlightLog(channels, {"source": str(path), **_metadata(path)})
     except LogError as error:

@@ -1,4 +1,6 @@
-"""First-order training: the cost of flights, in which a hazard weighs a release at every step, and its descent."""
+"""First-order training: the cost of flights, in which a hazard weighs a release at every step, and
+its descent.
+"""
 
 import dataclasses
 import math
@@ -23,47 +25,80 @@ from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
 ALTITUDE, GROUND, ABOVE, UPRIGHT = 0.15, 0.1, 0.08, 0.15
-"""Reach of the barriers: of altitude and distance, payload over ground, payload below vehicle [m], cosine of the tilt."""
+"""Reach of the barriers: of altitude and distance, payload over ground, payload below vehicle [m],
+cosine of the tilt.
+"""
 BARRIER = 600.0  # cost of the square of how far a state is within it
 ROUND = 0.02
-"""Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which is noise where throws are good."""
+"""Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which
+is noise where throws are good.
+"""
 OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the median flight's
 NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
 
 
 class FirstOrder:
-    """First-order training by a surrogate that is fitted to the environment's plants; :class:`visthrow.training.trainer.Algorithm`."""
+    """First-order training by a surrogate that is fitted to the environment's plants;
+    :class:`visthrow.training.trainer.Algorithm`.
+    """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         self.cfg, self.p, self._ranks = experiment, experiment.first_order, ranks
         seen, p, on_gpu = experiment.task.observation, experiment.ppo, device.startswith("cuda")
-        late, others = seen.oldest > experiment.sim.control_period, experiment.task.target.moves or experiment.fleet is not None
+        late, others = (
+            seen.oldest > experiment.sim.control_period,
+            experiment.task.target.moves or experiment.fleet is not None,
+        )
         if seen.layout != "state" or late or others:
-            expected = 'observation.layout = "state", a latency of one period at most, one vehicle and goals that stand still'
-            raise ConfigError(f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy of its policy')
+            expected = (
+                'observation.layout = "state", a latency of one period at most, one vehicle and'
+                " goals that stand still"
+            )
+            raise ConfigError(
+                f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy'
+                " of its policy"
+            )
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
         if self.p.horizon < self.lag + NODES[-1]:
-            raise ConfigError(f"first_order.horizon is {self.p.horizon} steps; expected at least {self.lag + 2} for a release")
+            raise ConfigError(
+                f"first_order.horizon is {self.p.horizon} steps; expected at least {self.lag + 2}"
+                " for a release"
+            )
         self._shares = [math.prod((rest - b) / (a - b) for b in NODES if b != a) for a in NODES]
-        blind = dataclasses.replace(experiment, ppo=dataclasses.replace(p, privileged=()))  # there is no critic
+        blind = dataclasses.replace(
+            experiment, ppo=dataclasses.replace(p, privileged=())
+        )  # there is no critic
         self.env = env = ThrowEnv(blind, device, seed)
         self.samples = env.num_envs * self.p.horizon * ranks.world
-        shape = {"hidden_dims": p.hidden, "activation": p.activation, "obs_normalization": p.normalize}
-        self.network = Network(env.get_observations(), {"actor": ["actor"]}, "actor", act.ACTIONS, **shape).to(device)
+        shape = {
+            "hidden_dims": p.hidden,
+            "activation": p.activation,
+            "obs_normalization": p.normalize,
+        }
+        self.network = Network(
+            env.get_observations(), {"actor": ["actor"]}, "actor", act.ACTIONS, **shape
+        ).to(device)
         with torch.no_grad():  # random commands give every observation a spread to start from
             self.surrogate, last = fit(env, self.network), self.network.mlp[-1]
             last.weight.mul_(0.1)  # hover with the latch at rest, whatever is seen
             last.bias.copy_(env._start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
-        self.flights, (self.adjoint, adjoint) = Flights(env, self.p.horizon), course(self.p.horizon, env.num_envs, device)
+        self.flights, (self.adjoint, adjoint) = (
+            Flights(env, self.p.horizon),
+            course(self.p.horizon, env.num_envs, device),
+        )
         self.layers = Layers(self.network, self.flights.obs)
         self._launches, self._adapting = self._recorded(adjoint), False
         self._schedule(0.0)
         rate = torch.tensor(self.p.learning_rate, device=device) if on_gpu else self.p.learning_rate
-        self.optimizer = torch.optim.Adam(self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu)
-        self.rollout, self.backward = (Replayed(work) if on_gpu else work for work in (self._fly, self._back))
+        self.optimizer = torch.optim.Adam(
+            self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu
+        )
+        self.rollout, self.backward = (
+            Replayed(work) if on_gpu else work for work in (self._fly, self._back)
+        )
 
     @property
     def iterations(self) -> int:
@@ -71,40 +106,74 @@ class FirstOrder:
         return self.p.adapting if self._adapting else self.p.iterations
 
     def _schedule(self, done: float) -> None:
-        """Width of the hazard, share of the latch in it, and first step that it counts at, at this share of the training."""
+        """Width of the hazard, share of the latch in it, and first step that it counts at, at this
+        share of the training.
+        """
         p = self.p
-        self._width = p.adapting_width if self._adapting else p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
-        self._latched, freed = (min(max((done - low) / (high - low), 0.0), 1.0) for low, high in (p.latched, p.free))
+        self._width = (
+            p.adapting_width
+            if self._adapting
+            else p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
+        )
+        self._latched, freed = (
+            min(max((done - low) / (high - low), 0.0), 1.0) for low, high in (p.latched, p.free)
+        )
         self._first = p.first_release * (1.0 - freed)
 
     @torch.no_grad()
     def _fly(self) -> None:
-        """Fly one batch without release, on a CPU each flight until nothing that follows has a derivative: its latch asked twice."""
-        stops, asked = self._latched == 1.0 and self.env.device == "cpu", torch.zeros_like(self.flights.steps)
+        """Fly one batch without release, on a CPU each flight until nothing that follows has a
+        derivative: its latch asked twice.
+        """
+        stops, asked = (
+            self._latched == 1.0 and self.env.device == "cpu",
+            torch.zeros_like(self.flights.steps),
+        )
 
         def decide(k: int, seen: Tensor) -> Tensor | None:
             before = k - (self.lag + NODES[-1] + 1)  # all that a release there depends on is known
             if stops and before >= self._first:
                 asked.add_(self.layers.action[before, :, act.COMMANDS] > self.cfg.release.threshold)
                 torch.lt(asked, 2, out=self.flights.flying)
-            return self.layers.forward(k, seen, self.flights.flying) if not stops or self.flights.flying.any() else None
+            return (
+                self.layers.forward(k, seen, self.flights.flying)
+                if not stops or self.flights.flying.any()
+                else None
+            )
 
         self.flights.fly(decide)
 
     def _rewards_at_release(self, x: SimpleNamespace, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Reward, landing error [m] and time to impact [s] of a release at each of the first steps, shape (count, E)."""
+        """Reward, landing error [m] and time to impact [s] of a release at each of the first steps,
+        shape (count, E).
+        """
         p, release, flights = self.cfg.task.reward, self.cfg.release, self.flights
         up = x.load_vel[..., 2]
-        fall = (up + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height)).clamp(min=1e-6).sqrt()) / GRAVITY
+        fall = (
+            up
+            + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height))
+            .clamp(min=1e-6)
+            .sqrt()
+        ) / GRAVITY
         landing = x.load_pos[..., :2] + x.load_vel[..., :2] * fall[..., None]
-        landing = landing + (flights.landing[: len(fall)] - landing).detach()  # the simulator's value, the slope of flight without drag
+        landing = (
+            landing + (flights.landing[: len(fall)] - landing).detach()
+        )  # the simulator's value, the slope of flight without drag
         fall = fall + (flights.time[: len(fall)] - fall).detach()
-        share = torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device) * fall[..., None]
+        share = (
+            torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device)
+            * fall[..., None]
+        )
         path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None]
         path[..., 2] -= 0.5 * GRAVITY * share**2
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
-        rows = [(torch.arange(count, device=fall.device) + (self.lag + node)).clamp(min=0) for node in NODES]
-        landing, fall, clearance = (sum(w * v[i] for w, i in zip(self._shares, rows)) for v in (landing, fall, clearance))
+        rows = [
+            (torch.arange(count, device=fall.device) + (self.lag + node)).clamp(min=0)
+            for node in NODES
+        ]
+        landing, fall, clearance = (
+            sum(w * v[i] for w, i in zip(self._shares, rows)) for v in (landing, fall, clearance)
+        )
         error = ((landing - self.env.views.goal_w[:, :2]).square().sum(-1) + ROUND**2).sqrt()
         reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
         return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
@@ -112,44 +181,92 @@ class FirstOrder:
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
         task, env = self.cfg.task, self.env
-        p, bounds, rate, height, load = task.reward, task.bounds, x.response[1:, :, 1:], x.pos[1:, :, 2], x.load_pos[1:, :, 2]
+        p, bounds, rate, height, load = (
+            task.reward,
+            task.bounds,
+            x.response[1:, :, 1:],
+            x.pos[1:, :, 2],
+            x.load_pos[1:, :, 2],
+        )
         now = act.clip_action(x.action)
-        now, before = (a.flatten(0, 1) for a in (now, torch.cat([env._start_action.expand_as(now[:1]), now[:-1]])))
-        acting = rewards.command(p, now, env._rate_weights) + rewards.change(p, now, before, env._change_weights)
-        inside = [height - bounds.altitude[0] - ALTITUDE, bounds.altitude[1] - ALTITUDE - height, height - load - ABOVE,
-                  load - self.cfg.release.landing_height - GROUND, bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
-                  x.tilt[1:, :, 2] - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT]  # fmt: skip
+        now, before = (
+            a.flatten(0, 1)
+            for a in (now, torch.cat([env._start_action.expand_as(now[:1]), now[:-1]]))
+        )
+        acting = rewards.command(p, now, env._rate_weights) + rewards.change(
+            p, now, before, env._change_weights
+        )
+        inside = [
+            height - bounds.altitude[0] - ALTITUDE,
+            bounds.altitude[1] - ALTITUDE - height,
+            height - load - ABOVE,
+            load - self.cfg.release.landing_height - GROUND,
+            bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
+            x.tilt[1:, :, 2] - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
+        ]
         barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in inside)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
-        return moving + acting.view_as(moving) + rewards.carry_time(p, self.cfg.sim.control_period) - barrier
+        return (
+            moving
+            + acting.view_as(moving)
+            + rewards.carry_time(p, self.cfg.sim.control_period)
+            - barrier
+        )
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
         p, steps, T, lag = self.cfg.task.reward, self.flights.steps, self.flights.last, self.lag
-        k, K = torch.arange(T, device=steps.device)[:, None], T - lag - 1  # the cubic looks a step past the separation
+        k, K = (
+            torch.arange(T, device=steps.device)[:, None],
+            T - lag - 1,
+        )  # the cubic looks a step past the separation
         reward, error, fall = self._rewards_at_release(x, K)
         asked = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
         smooth, cut = torch.sigmoid(asked / self._width), k[:K] + lag + 2 > steps
-        hazard = smooth + self._latched * ((asked > 0.0).float() - smooth).detach()  # the slope stays that of the smooth one
+        hazard = (
+            smooth + self._latched * ((asked > 0.0).float() - smooth).detach()
+        )  # the slope stays that of the smooth one
         hazard = torch.where(k[:K] > steps, 1.0, hazard * (k[:K] >= self._first))
         reward = torch.where(cut, -p.termination, reward)
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
         carried = survival[(k[:, 0] - lag).clamp(0, K)] * (k < steps)
         past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * carried.detach()
-        gain = (chance * reward).sum(0) + (carried * self._carrying(x)).sum(0) - p.termination * survival[-1]
+        gain = (
+            (chance * reward).sum(0)
+            + (carried * self._carrying(x)).sum(0)
+            - p.termination * survival[-1]
+        )
         done, error = (chance * ~cut).detach(), (error.square() - ROUND**2).clamp(min=0.0).sqrt()
-        duration, share = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall, done / done.sum().clamp(min=1e-6)
-        figures = {"landing_error": (share * error).sum(), "duration": (share * duration).sum(), "released": done.sum(0).mean()}
+        duration, share = (
+            (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall,
+            done / done.sum().clamp(min=1e-6),
+        )
+        figures = {
+            "landing_error": (share * error).sum(),
+            "duration": (share * duration).sum(),
+            "released": done.sum(0).mean(),
+        }
         return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
 
     def derivatives(self) -> dict[str, Tensor]:
-        """Derivatives of the cost of the last rollout by the actions, as the layers hold them; returns figures."""
-        f, T, states = self.flights.x, self.flights.last, ("pos", "vel", "load_pos", "load_vel", "response")
+        """Derivatives of the cost of the last rollout by the actions, as the layers hold them;
+        returns figures.
+        """
+        f, T, states = (
+            self.flights.x,
+            self.flights.last,
+            ("pos", "vel", "load_pos", "load_vel", "response"),
+        )
         tilt = ob.rotation_from_quat(f["quat"][: T + 1])[..., 2, :]  # world z in the body frame
-        leaves = {name: f[name][: T + 1].clone() for name in states} | {"tilt": tilt, "action": self.layers.action[:T].clone()}
+        leaves = {name: f[name][: T + 1].clone() for name in states} | {
+            "tilt": tilt,
+            "action": self.layers.action[:T].clone(),
+        }
         with torch.enable_grad():
-            cost, figures = self._cost(SimpleNamespace(**{name: leaf.requires_grad_() for name, leaf in leaves.items()}))
+            cost, figures = self._cost(
+                SimpleNamespace(**{name: leaf.requires_grad_() for name, leaf in leaves.items()})
+            )
         by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()))))
         for name in states:
             self.adjoint[name][: T + 1] = by[name]
@@ -163,18 +280,41 @@ class FirstOrder:
     def _recorded(self, adjoint: Course) -> list[wp.Launch]:
         """Launches of the backward kernel, a step each."""
         env, flights, action, p = self.env, self.flights, self.cfg.task.action, Setting()
-        p.max_thrust, p.max_rate, p.history = action.max_thrust, wp.vec3(*action.max_rate), env.layout.history
+        p.max_thrust, p.max_rate, p.history = (
+            action.max_thrust,
+            wp.vec3(*action.max_rate),
+            env.layout.history,
+        )
         p.period, p.decay = self.cfg.sim.control_period, self.p.decay
-        plants = {"mass": flights.mass, "load_mass": flights.load_mass, "mount": flights.mount, "age": env.pose_age}
+        plants = {
+            "mass": flights.mass,
+            "load_mass": flights.load_mass,
+            "mount": flights.mount,
+            "age": env.pose_age,
+        }
         for name, tensor in (self.surrogate | plants).items():
             setattr(p, name, wp.from_torch(tensor, dtype=Setting.vars[name].type.dtype))
-        rest = map(wp.from_torch, (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action))
-        given, how = (adjoint, flights.course, *rest), {"device": env.device, "block_dim": 64, "record_cmd": True}
-        return [wp.launch(backward, env.num_envs, [p, k, *given], **how) for k in range(self.p.horizon)]
+        rest = map(
+            wp.from_torch,
+            (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action),
+        )
+        given, how = (
+            (adjoint, flights.course, *rest),
+            {
+                "device": env.device,
+                "block_dim": 64,
+                "record_cmd": True,
+            },
+        )
+        return [
+            wp.launch(backward, env.num_envs, [p, k, *given], **how) for k in range(self.p.horizon)
+        ]
 
     @torch.no_grad()
     def _back(self) -> None:
-        """From the derivatives of the cost by states and actions to whole derivatives by the actions."""
+        """From the derivatives of the cost by states and actions to whole derivatives by the
+        actions.
+        """
         for k in reversed(range(self.flights.last)):
             with on_torch_stream(self.env.device):
                 self._launches[k].launch()
@@ -187,23 +327,38 @@ class FirstOrder:
     @torch.no_grad()
     def learn(self, done: float) -> dict[str, float]:
         p, parameters, T = self.p, list(self.network.mlp.parameters()), self.flights.last
-        highest, lowest = (p.adapting_rate, 0.1 * p.adapting_rate) if self._adapting else (p.learning_rate, p.final_rate)
+        highest, lowest = (
+            (p.adapting_rate, 0.1 * p.adapting_rate)
+            if self._adapting
+            else (p.learning_rate, p.final_rate)
+        )
         rate = cosine_rate(self.optimizer, done, highest, lowest)
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
-        most = OUTLIER * size.kthvalue(len(size) // 2 + 1).values  # a few wild flights must not outweigh the rest
-        self.layers.gradients(self.flights.obs[:T], self.flights.flown()[:T], (most / size).clamp(max=1.0))
+        most = (
+            OUTLIER * size.kthvalue(len(size) // 2 + 1).values
+        )  # a few wild flights must not outweigh the rest
+        self.layers.gradients(
+            self.flights.obs[:T], self.flights.flown()[:T], (most / size).clamp(max=1.0)
+        )
         self._ranks.average(parameters)
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()
         self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
-        return {name: float(value) for name, value in figures.items()} | {"learning_rate": rate, "episodes": float(self.env.num_envs)}
+        return {name: float(value) for name, value in figures.items()} | {
+            "learning_rate": rate,
+            "episodes": float(self.env.num_envs),
+        }
 
     def export(self, contract: dict, made_by: dict) -> Policy:
-        return Policy.from_actor_state(self.network.state_dict(), self.cfg.ppo.activation, contract, made_by)
+        return Policy.from_actor_state(
+            self.network.state_dict(), self.cfg.ppo.activation, contract, made_by
+        )
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers: it releases as it has learnt to, and the rate starts at that of adaptation."""
+        """Start from a policy of the same layers: it releases as it has learnt to, and the rate
+        starts at that of adaptation.
+        """
         self.network.take_up(policy)
         self._adapting = True
 

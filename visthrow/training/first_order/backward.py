@@ -1,9 +1,9 @@
-"""Backward pass of flights: through the surrogate a kernel a step, a thread a flight, and between two of them through the network.
+"""Backward pass of flights: through the surrogate a kernel a step, a thread a flight, and between
+two of them through the network.
 
-Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn). What a derivative by a state is
-worth is known once all later steps are done: so the network's own are products with one vector a step, those by its weights products
-over all steps at the end.
-"""
+Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn).
+What a derivative by a state is worth is known once all later steps are done: so the network's own
+are products with one vector a step, those by its weights products over all steps at the end."""
 
 import torch
 import warp as wp
@@ -14,8 +14,14 @@ from visthrow.onboard import observations as ob
 from visthrow.training.first_order.surrogate import TAUT, Course
 from visthrow.training.ppo.network import Network
 
-SLACK_THROTTLE = 0.05  # least at which the slope of the thrust is taken: at none it is nought, and nothing would lead away from there
-PREVIOUS_AT, GOAL_AT, LOAD_AT = ob.VEHICLE, ob.VEHICLE + 5, ob.VEHICLE + 7  # columns of a state observation where these begin
+# least at which the slope of the thrust is taken: at none it is nought, and nothing would lead away
+# from there
+SLACK_THROTTLE = 0.05
+PREVIOUS_AT, GOAL_AT, LOAD_AT = (
+    ob.VEHICLE,
+    ob.VEHICLE + 5,
+    ob.VEHICLE + 7,
+)  # columns of a state observation where these begin
 
 
 @wp.struct
@@ -38,17 +44,30 @@ class Setting:
 
 @wp.func
 def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
-    """Derivative by the turn of what has the derivative ``grad_w`` by the world vector ``R arm_b``."""
+    """Derivative by the turn of what has the derivative ``grad_w`` by the world vector
+    ``R arm_b``.
+    """
     return wp.cross(arm_b, wp.quat_rotate_inv(quat, grad_w))
 
 
 @wp.func
 def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
-    """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k + 1 make of them."""
+    """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k +
+    1 make of them.
+    """
     dt, half, up = p.period, 0.5 * p.period, wp.vec3(0.0, 0.0, 1.0)
-    mass, load_mass, mount, rot, rot_next = p.mass[e], p.load_mass[e], p.mount[e], x.quat[k, e], x.quat[k + 1, e]
+    mass, load_mass, mount, rot, rot_next = (
+        p.mass[e],
+        p.load_mass[e],
+        p.mount[e],
+        x.quat[k, e],
+        x.quat[k + 1, e],
+    )
     g_pos, g_load = p.decay * adj.pos[k + 1, e], p.decay * adj.load_pos[k + 1, e]
-    g_vel, g_load_vel = p.decay * adj.vel[k + 1, e] + half * g_pos, p.decay * adj.load_vel[k + 1, e] + half * g_load
+    g_vel, g_load_vel = (
+        p.decay * adj.vel[k + 1, e] + half * g_pos,
+        p.decay * adj.load_vel[k + 1, e] + half * g_load,
+    )
     g_turn, g_response = p.decay * adj.turn[k + 1, e], p.decay * adj.response[k + 1, e]
     z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
     rates = x.response[k, e] + x.response[k + 1, e]
@@ -75,7 +94,9 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
     g_z = 0.5 * thrust * g_f
     g_turn += turned(rot_next, up, g_z)
     phi = half * wp.vec3(rates[1], rates[2], rates[3])
-    g_rate = half * (g_turn + 0.5 * wp.cross(phi, g_turn) + wp.cross(phi, wp.cross(phi, g_turn)) / 6.0)
+    g_rate = half * (
+        g_turn + 0.5 * wp.cross(phi, g_turn) + wp.cross(phi, wp.cross(phi, g_turn)) / 6.0
+    )
     g_mean = wp.vec4(0.5 * p.force[0] * wp.dot(z, g_f), g_rate[0], g_rate[1], g_rate[2])
     g_response += g_mean
     adj.response[k, e] += g_mean + wp.cw_mul(p.response[0], g_response)
@@ -99,8 +120,18 @@ def three(by_seen: wp.array2d(dtype=float), e: int, i: int):
 
 
 @wp.func
-def seen_back(p: Setting, x: Course, adj: Course, by_seen: wp.array2d(dtype=float), i: int, e: int, share: float):
-    """From an observation to state i, of which ``share`` is in it, and to the payload as it was up to ``history`` steps before."""
+def seen_back(
+    p: Setting,
+    x: Course,
+    adj: Course,
+    by_seen: wp.array2d(dtype=float),
+    i: int,
+    e: int,
+    share: float,
+):
+    """From an observation to state i, of which ``share`` is in it, and to the payload as it was up
+    to ``history`` steps before.
+    """
     adj.pos[i, e] += share * three(by_seen, e, 0)
     adj.vel[i, e] += share * three(by_seen, e, 3)
     adj.response[i, e] += share * wp.vec4(0.0, by_seen[e, 6], by_seen[e, 7], by_seen[e, 8])
@@ -135,7 +166,10 @@ def backward(
         seen_back(p, x, adj, by_seen, k, e, p.age[e] / p.period)
         step_back(p, x, adj, k, e)
         throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
-        command = wp.cw_mul(wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2]), adj.command[k, e])
+        command = wp.cw_mul(
+            wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2]),
+            adj.command[k, e],
+        )
         for j in range(5):
             if wp.abs(action[k, e, j]) <= 1.0:
                 by_action[k, e, j] += by_seen[e, PREVIOUS_AT + j]
@@ -144,17 +178,31 @@ def backward(
 
 
 class Layers:
-    """What a network's layers made of the steps of flights, shape (T, E, N), and derivatives by it; by what one step saw, shape (E, D)."""
+    """What a network's layers made of the steps of flights, shape (T, E, N), and derivatives by it;
+    by what one step saw, shape (E, D).
+    """
 
     def __init__(self, network: Network, obs: Tensor):
-        self._network, self._linear = network, [layer for layer in network.mlp if isinstance(layer, nn.Linear)]
-        rooms = [[obs.new_zeros(*obs.shape[:2], layer.out_features) for layer in self._linear] for _ in range(3)]
+        self._network, self._linear = (
+            network,
+            [layer for layer in network.mlp if isinstance(layer, nn.Linear)],
+        )
+        rooms = [
+            [obs.new_zeros(*obs.shape[:2], layer.out_features) for layer in self._linear]
+            for _ in range(3)
+        ]
         self._inner, self._by_inner, (*self._slope, _) = rooms
         self._first = torch.zeros_like(self._linear[0].weight)  # with the normaliser's spread
-        self.action, self.by_action, self.by_seen = self._inner[-1], self._by_inner[-1], torch.zeros_like(obs[0])
+        self.action, self.by_action, self.by_seen = (
+            self._inner[-1],
+            self._by_inner[-1],
+            torch.zeros_like(obs[0]),
+        )
 
     def forward(self, k: int, seen: Tensor, flying: Tensor) -> Tensor:
-        """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are flying, shape (E,)."""
+        """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are
+        flying, shape (E,).
+        """
         rows = _picked(flying)
         x = self._network.obs_normalizer(seen[rows])
         for layer, inner in zip(self._linear, self._inner):
@@ -165,25 +213,44 @@ class Layers:
     def prepare(self, steps: int) -> None:
         """Begin a way back from this step."""
         for inner, slope in zip(self._inner, self._slope):
-            for x, out in zip(inner[:steps].split(4), slope[:steps].split(4)):  # pieces that caches hold
+            for x, out in zip(
+                inner[:steps].split(4), slope[:steps].split(4)
+            ):  # pieces that caches hold
                 with torch.enable_grad():
-                    out.copy_(torch.autograd.grad(self._network.mlp[1](leaf := x.detach().requires_grad_()).sum(), leaf)[0])
-        spread = self._network.obs_normalizer.std + self._network.obs_normalizer.eps if self._network.obs_normalization else 1.0
+                    out.copy_(
+                        torch.autograd.grad(
+                            self._network.mlp[1](leaf := x.detach().requires_grad_()).sum(), leaf
+                        )[0]
+                    )
+        spread = (
+            self._network.obs_normalizer.std + self._network.obs_normalizer.eps
+            if self._network.obs_normalization
+            else 1.0
+        )
         self._first.copy_(self._linear[0].weight.detach() / spread)
         self.by_seen.zero_()
 
     def back(self, k: int, flown: Tensor) -> None:
-        """From derivatives by the actions of step k to those by its observations, of the flights that flew it, shape (E,)."""
+        """From derivatives by the actions of step k to those by its observations, of the flights
+        that flew it, shape (E,).
+        """
         rows = _picked(flown)
         by = self.by_action[k, rows]
-        for layer, slope, by_inner in reversed(list(zip(self._linear[1:], self._slope, self._by_inner))):
+        for layer, slope, by_inner in reversed(
+            list(zip(self._linear[1:], self._slope, self._by_inner))
+        ):
             by = by_inner[k, rows] = (by @ layer.weight).mul_(slope[k, rows])
         self.by_seen[rows] = by @ self._first
 
     def gradients(self, seen: Tensor, flown: Tensor, shares: Tensor) -> None:
-        """Give the weights their derivatives: seen, shape (T, E, D), at steps that were flown, (T, E); flights count by shares, (E,)."""
+        """Give the weights their derivatives: seen, shape (T, E, D), at steps that were flown, (T,
+        E); flights count by shares, (E,).
+        """
         rows = _picked(flown.flatten())
-        x, shares = self._network.obs_normalizer(seen.flatten(0, 1)[rows]), shares.expand(flown.shape).flatten()[rows, None]
+        x, shares = (
+            self._network.obs_normalizer(seen.flatten(0, 1)[rows]),
+            shares.expand(flown.shape).flatten()[rows, None],
+        )
         for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
             by = by_inner.flatten(0, 1)[rows] * shares
             layer.weight.grad, layer.bias.grad = by.mT @ x, by.sum(0)
@@ -191,5 +258,7 @@ class Layers:
 
 
 def _picked(mask: Tensor) -> Tensor | slice:
-    """Rows where a mask, shape (N,), is not 0; all of them where that is so, and on a GPU, which would have to wait to know."""
+    """Rows where a mask, shape (N,), is not 0; all of them where that is so, and on a GPU, which
+    would have to wait to know.
+    """
     return slice(0, len(mask)) if mask.is_cuda or bool(mask.all()) else mask.nonzero()[:, 0]

@@ -1,17 +1,19 @@
-"""Surrogate of one control step, which first-order training differentiates in the simulator's place.
+"""Surrogate of one control step, which first-order training differentiates in the simulator's
+place.
 
-The simulator flies; every value below is the simulator's own, and the surrogate lends its derivative at that point. With
-the response ``y = (thrust, body rates)``, commands u, vehicle p, v, R, payload q, s and the control period dt:
+The simulator flies; every value below is the simulator's own, and the surrogate lends its
+derivative at that point. With the response ``y = (thrust, body rates)``, commands u, vehicle p, v,
+R, payload q, s and the control period dt:
 
-    y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c         per channel: controller, motors and queue
-    R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2)
-    f      = kappa F z - R diag(drag) R^T v                      F, z: mean thrust and mean body z of the step
-    T      = mu (-a n.f / M + b |u_perp|^2 / l)                  u = s - v; n, l: of the rope as a taut, massless rod
-    v[k+1] = v + dt (f / M + g + T n / M),  s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
+    y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c         per channel: controller, motors and
+    queue R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2) f      = kappa F z - R diag(drag) R^T v
+    F, z: mean thrust and mean body z of the step T      = mu (-a n.f / M + b |u_perp|^2 / l)
+    u = s - v; n, l: of the rope as a taut, massless rod v[k+1] = v + dt (f / M + g + T n / M),
+    s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
 
-and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the simulator under random
-commands by linear least squares; :mod:`visthrow.training.first_order.backward` has the derivatives.
-"""
+and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the
+simulator under random commands by linear least squares;
+:mod:`visthrow.training.first_order.backward` has the derivatives."""
 
 from collections.abc import Callable
 
@@ -27,7 +29,16 @@ from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import Network
 
-EXCITED, KEPT = (0.35, 0.5, 0.5, 0.5, 0.0), 0.7  # random actions of the fit: spread about hover, share of one that the next keeps
+EXCITED, KEPT = (
+    (
+        0.35,
+        0.5,
+        0.5,
+        0.5,
+        0.0,
+    ),
+    0.7,
+)  # random actions of the fit: spread about hover, share of one that the next keeps
 FITTED = 8000  # steps of flight that the fit rests on
 TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
 
@@ -47,7 +58,9 @@ class Course:
 
 
 def course(steps: int, count: int, device: str) -> tuple[dict[str, Tensor], Course]:
-    """Tensors of shape (T + 1, E, 3 or 4) by the names of :class:`Course`, and the same memory for kernels."""
+    """Tensors of shape (T + 1, E, 3 or 4) by the names of :class:`Course`, and the same memory for
+    kernels.
+    """
     x, made = {}, Course()
     for name, field in Course.vars.items():
         x[name] = torch.zeros(steps + 1, count, field.type.dtype._length_, device=device)
@@ -59,22 +72,40 @@ class Flights:
     """Flights without release and the plants that make them.
 
     Attributes:
-        x, course: states and commands; see :func:`course`. obs: what the actor observes, shape (T, E, D).
-        landing, time: of a payload that separates at a state, [m], shape (T + 1, E, 2), and [s], shape (T + 1, E).
-        mass, load_mass: of vehicles with their ropes and of payloads [kg], shape (E,). mount: of the ropes [m], shape (E, 3).
-        flying: whether a flight goes on, int32, shape (E,). steps: until it was over, likewise. last: of the longest.
+        x, course: states and commands; see :func:`course`. obs: what the actor observes, shape (T,
+            E, D).
+        landing, time: of a payload that separates at a state, [m], shape (T + 1, E, 2), and [s],
+            shape (T + 1, E).
+        mass, load_mass: of vehicles with their ropes and of payloads [kg], shape (E,). mount: of
+            the ropes [m], shape (E, 3).
+        flying: whether a flight goes on, int32, shape (E,). steps: until it was over, likewise.
+            last: of the longest.
     """
 
     def __init__(self, env: ThrowEnv, steps: int):
         E, make = env.num_envs, {"device": env.device}
         self.env, (self.x, self.course), self.last = env, course(steps, E, env.device), steps
-        self.obs, self.landing = torch.zeros(steps, E, env.layout.dimension, **make), torch.zeros(steps + 1, E, 2, **make)
-        self.time, self.status = torch.zeros(steps + 1, E, **make), torch.zeros(steps + 1, E, dtype=torch.int32, **make)
+        self.obs, self.landing = (
+            torch.zeros(steps, E, env.layout.dimension, **make),
+            torch.zeros(steps + 1, E, 2, **make),
+        )
+        self.time, self.status = (
+            torch.zeros(steps + 1, E, **make),
+            torch.zeros(steps + 1, E, dtype=torch.int32, **make),
+        )
         self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
         self._mask, (vehicle, rope) = wp.from_torch(self.flying), env.sim.plants()
         above = rope["total_mass"] - rope["payload_mass"]
-        parts = (vehicle["body"]["mass"], above, rope["payload_mass"], rope["mount"], vehicle["thrust"]["k_f"])
-        self._body, self._rope, self.load_mass, self.mount, self._thrust = (torch.tensor(p, dtype=torch.float32, **make) for p in parts)
+        parts = (
+            vehicle["body"]["mass"],
+            above,
+            rope["payload_mass"],
+            rope["mount"],
+            vehicle["thrust"]["k_f"],
+        )
+        self._body, self._rope, self.load_mass, self.mount, self._thrust = (
+            torch.tensor(p, dtype=torch.float32, **make) for p in parts
+        )
         self.mass = self._body + self._rope
 
     def flown(self) -> Tensor:
@@ -82,7 +113,9 @@ class Flights:
         return torch.arange(len(self.obs), device=self.steps.device)[:, None] <= self.steps
 
     def fly(self, act: Callable[[int, Tensor], Tensor | None]) -> None:
-        """Fly from new starts under actions ``act(k, observations)``; where it has none, all flights are over."""
+        """Fly from new starts under actions ``act(k, observations)``; where it has none, all
+        flights are over.
+        """
         env, x, state, out = self.env, self.x, self.env.views.state, self.env.views.out
         loads = {"load_pos": out["payload_pos_w"], "load_vel": out["payload_vel_w"]}
         sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"]} | loads
@@ -94,9 +127,14 @@ class Flights:
                 env.sim.foresee()
             for name, source in sources.items():
                 x[name][k] = source
-            torch.mul(self._thrust, state["motor_speed"].square().sum(-1), out=x["response"][k, :, 0])
+            torch.mul(
+                self._thrust, state["motor_speed"].square().sum(-1), out=x["response"][k, :, 0]
+            )
             x["response"][k, :, 1:], self.status[k] = state["rate_b"], state["status"]
-            self.landing[k], self.time[k] = env.views.foreseen["landing_w"][:, :2], env.views.foreseen["time_to_impact"]
+            self.landing[k], self.time[k] = (
+                env.views.foreseen["landing_w"][:, :2],
+                env.views.foreseen["time_to_impact"],
+            )
             self.last = k
             if k == len(self.obs):
                 break
@@ -106,16 +144,29 @@ class Flights:
             self.steps.add_(self.flying)
             seen = env.carry(action, self._mask)["actor"]
             x["command"][k] = env.views.command
-        flown = (x["pos"][1:], ob.rotation_from_quat(x["quat"][1:]), x["load_pos"][1:], self.status[1:])
+        flown = (
+            x["pos"][1:],
+            ob.rotation_from_quat(x["quat"][1:]),
+            x["load_pos"][1:],
+            self.status[1:],
+        )
         pos, rot, load_pos, status = (value.flatten(0, 1) for value in flown)
-        held, time, height = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(pos[:, 0]), env.cfg.release.landing_height
-        ends = terminations.negative(env.cfg.task.bounds, pos, rot, load_pos, status, held, time, height)
+        held, time, height = (
+            torch.zeros_like(status, dtype=torch.bool),
+            torch.zeros_like(pos[:, 0]),
+            env.cfg.release.landing_height,
+        )
+        ends = terminations.negative(
+            env.cfg.task.bounds, pos, rot, load_pos, status, held, time, height
+        )
         self.steps.clamp_(max=(~ends).view(len(self.obs), -1).int().cumprod(0).sum(0))
 
 
 def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
-    """Fit to random flights, whose observations the network's normaliser is shown: ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4),
-    ``force``, kappa and drag [N s/m], shape (4,), and ``tension``, a and b.
+    """Fit to random flights, whose observations the network's normaliser is shown:
+
+    ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4), ``force``, kappa and drag [N s/m], shape
+    (4,), and ``tension``, a and b.
     """
     period = env.cfg.sim.control_period
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
@@ -135,7 +186,9 @@ def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
     force = _solve(rows["push"].flatten(0, 1), rows["momentum"].flatten())
     pulled = -(rows["along"] * (rows["push"] @ force)).sum(-1) / rows["mass"]
-    tension = _solve(torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"])
+    tension = _solve(
+        torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"]
+    )
     found = (("response", torch.stack(response, -1)), ("force", force), ("tension", tension))
     return {name: value.float().contiguous() for name, value in found}
 
@@ -149,13 +202,17 @@ def _solve(features: Tensor, target: Tensor) -> Tensor:
 
 
 def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]:
-    """Rows of the three regressions from the whole steps of flights; those of the tension count where the rope is taut."""
+    """Rows of the three regressions from the whole steps of flights; those of the tension count
+    where the rope is taut.
+    """
     f, mass, load_mass = flights.x, flights.mass, flights.load_mass
     k = torch.arange(max(lags - 1, 1), len(f["pos"]) - 1, device=mass.device)
     rot, y = ob.rotation_from_quat(f["quat"]), f["response"]
     lagged = [y[k], y[k - 1], *(f["command"][k - j] for j in range(lags)), torch.ones_like(y[k])]
     thrust_w = 0.25 * (y[k, :, :1] + y[k + 1, :, :1]) * (rot[k, :, :, 2] + rot[k + 1, :, :, 2])
-    drag = [-rot[k, :, :, i] * (rot[k, :, :, i] * f["vel"][k]).sum(-1, keepdim=True) for i in range(3)]
+    drag = [
+        -rot[k, :, :, i] * (rot[k, :, :, i] * f["vel"][k]).sum(-1, keepdim=True) for i in range(3)
+    ]
     gravity = torch.tensor([0.0, 0.0, GRAVITY], device=mass.device)
     load_force = load_mass[:, None] * ((f["load_vel"][k + 1] - f["load_vel"][k]) / period + gravity)
     momentum = mass[:, None] * ((f["vel"][k + 1] - f["vel"][k]) / period + gravity) + load_force
@@ -164,8 +221,19 @@ def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]
     length = arm.norm(dim=-1)
     n = arm / length[..., None]
     tension = -(n * load_force).sum(-1)
-    taut, swing = tension > TAUT * GRAVITY * load_mass, (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length
-    rows = {"next": y[k + 1], "lagged": torch.stack(lagged, -2), "push": torch.stack([thrust_w, *drag], -1), "momentum": momentum,
-            "along": n, "mass": mass.expand_as(tension), "reduced": taut * mass * load_mass / (mass + load_mass), "swing": swing,
-            "tension": tension * taut}  # fmt: skip
+    taut, swing = (
+        tension > TAUT * GRAVITY * load_mass,
+        (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length,
+    )
+    rows = {
+        "next": y[k + 1],
+        "lagged": torch.stack(lagged, -2),
+        "push": torch.stack([thrust_w, *drag], -1),
+        "momentum": momentum,
+        "along": n,
+        "mass": mass.expand_as(tension),
+        "reduced": taut * mass * load_mass / (mass + load_mass),
+        "swing": swing,
+        "tension": tension * taut,
+    }
     return {name: row[k[:, None] < flights.steps] for name, row in rows.items()}

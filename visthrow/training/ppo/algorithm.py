@@ -19,36 +19,61 @@ WARM_UP_RATE = 2e-3  # learning rate of a critic that learns alone; nothing that
 
 
 def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
-    """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups are named."""
-    network = {"class_name": Network, "activation": p.activation, "obs_normalization": p.normalize, "bfloat16": p.products == "bfloat16"}
+    """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation
+    groups are named.
+    """
+    network = {
+        "class_name": Network,
+        "activation": p.activation,
+        "obs_normalization": p.normalize,
+        "bfloat16": p.products == "bfloat16",
+    }
     spread = {"class_name": CapturableGaussian, "init_std": p.initial_std, "std_type": "log"}
     algorithm = {
-        "class_name": CapturedPPO, "num_learning_epochs": p.epochs, "num_mini_batches": p.minibatches, "learning_rate": p.learning_rate,
-        "schedule": p.schedule, "desired_kl": p.desired_kl, "gamma": p.discount, "lam": p.gae_lambda, "clip_param": p.clip,
-        "entropy_coef": p.entropy, "value_loss_coef": p.value_coefficient, "max_grad_norm": p.max_grad_norm,
+        "class_name": CapturedPPO,
+        "num_learning_epochs": p.epochs,
+        "num_mini_batches": p.minibatches,
+        "learning_rate": p.learning_rate,
+        "schedule": p.schedule,
+        "desired_kl": p.desired_kl,
+        "gamma": p.discount,
+        "lam": p.gae_lambda,
+        "clip_param": p.clip,
+        "entropy_coef": p.entropy,
+        "value_loss_coef": p.value_coefficient,
+        "max_grad_norm": p.max_grad_norm,
         "use_clipped_value_loss": True,
-    }  # fmt: skip
+    }
     return {
-        "num_steps_per_env": p.steps, "algorithm": algorithm, "multi_gpu": ranks.rsl_rl,
+        "num_steps_per_env": p.steps,
+        "algorithm": algorithm,
+        "multi_gpu": ranks.rsl_rl,
         "actor": {**network, "hidden_dims": list(p.hidden), "distribution_cfg": spread},
         "critic": {**network, "hidden_dims": list(p.critic or p.hidden)},
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
-    }  # fmt: skip
+    }
 
 
 class PPOTraining:
-    """PPO on :class:`ThrowEnv` by rsl_rl's algorithm object, ``alg``; see :class:`visthrow.training.trainer.Algorithm`."""
+    """PPO on :class:`ThrowEnv` by rsl_rl's algorithm object, ``alg``; see
+    :class:`visthrow.training.trainer.Algorithm`.
+    """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         p = experiment.ppo
         if (p.environments * p.steps) % p.minibatches:
-            raise ConfigError(f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches} minibatches")
+            raise ConfigError(
+                f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches}"
+                " minibatches"
+            )
         self.experiment, self.device = experiment, device
         self.iterations = p.iterations
         self.samples = p.environments * p.steps * ranks.world
         self.env = ThrowEnv(experiment, device, seed)
         with contextlib.redirect_stdout(io.StringIO()):
-            self.alg: CapturedPPO = PPO.construct_algorithm(self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device)
+            self.alg: CapturedPPO = PPO.construct_algorithm(
+                self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
+            )
         self.alg.train_mode()
         ranks.share(self.alg.actor, self.alg.critic)
         self._obs = self.env.get_observations()
@@ -67,7 +92,9 @@ class PPOTraining:
                 self._obs[key].copy_(value)
 
     def rollout(self) -> None:
-        """Collect one batch: eagerly the first time (everything is allocated then), from a captured graph afterwards."""
+        """Collect one batch: eagerly the first time (everything is allocated then), from a captured
+        graph afterwards.
+        """
         if not self.device.startswith("cuda") or self._rollouts == 0:
             self._rollout()
         else:
@@ -89,20 +116,28 @@ class PPOTraining:
         return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate}
 
     def _warm_up(self, iteration: int) -> None:
-        """Let the critic alone learn in the first iterations, faster, and the actor from there at the rate that is set."""
+        """Let the critic alone learn in the first iterations, faster, and the actor from there at
+        the rate that is set.
+        """
         first = self.experiment.ppo.critic_first
         if first and iteration in (0, first):
             self.alg.set_rate(WARM_UP_RATE if iteration == 0 else self.experiment.ppo.learning_rate)
         self.alg.actor_learns.fill_(float(iteration >= first))
 
     def export(self, contract: dict, made_by: dict) -> Policy:
-        return Policy.from_actor_state(self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by)
+        return Policy.from_actor_state(
+            self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by
+        )
 
     def take_up(self, policy: Policy) -> None:
         self.alg.actor.take_up(policy)
 
     def state_dict(self) -> dict:
-        return {"networks": self.alg.save(), "env": self.env.state_dict(), "obs": {k: v.clone() for k, v in self._obs.items()}}
+        return {
+            "networks": self.alg.save(),
+            "env": self.env.state_dict(),
+            "obs": {k: v.clone() for k, v in self._obs.items()},
+        }
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         self.alg.load(saved["networks"], None, True)

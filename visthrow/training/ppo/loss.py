@@ -1,8 +1,8 @@
-"""PPO's loss with its gradient, its learning rate and its returns as Warp kernels, a thread a sample, step or environment.
+"""PPO's loss with its gradient, its learning rate and its returns as Warp kernels, a thread a
+sample, step or environment.
 
-In torch each is some dozens of launches of small operations. Formulas are those of rsl_rl 5.5's ``PPO.update`` and
-``PPO.compute_returns``; tests compare the two.
-"""
+In torch each is some dozens of launches of small operations. Formulas are those of rsl_rl 5.5's
+``PPO.update`` and ``PPO.compute_returns``; tests compare the two."""
 
 import warp as wp
 
@@ -11,13 +11,20 @@ from sim.kernels import runtime  # noqa: F401  starts Warp
 LOWEST, HIGHEST = wp.constant(1e-5), wp.constant(1e-2)  # range of the adaptive learning rate
 
 VALUE, SURROGATE, MOVED = wp.constant(0), wp.constant(1), wp.constant(2)
-"""Columns of ``parts``: two losses, A squares of how far the mean moved in spreads, A derivatives by log spreads."""
+"""Columns of ``parts``: two losses, A squares of how far the mean moved in spreads, A derivatives
+by log spreads.
+"""
 
 HALF_LOG_TWO_PI = wp.constant(0.9189385332046727)
 
 
 @wp.func
-def log_density(action: wp.array2d(dtype=float), mean: wp.array2d(dtype=float), std: wp.array(dtype=float), i: int):
+def log_density(
+    action: wp.array2d(dtype=float),
+    mean: wp.array2d(dtype=float),
+    std: wp.array(dtype=float),
+    i: int,
+):
     """Of sample i's action."""
     total = float(0.0)
     for j in range(action.shape[1]):
@@ -62,11 +69,11 @@ def loss(
     value_gradient: wp.array(dtype=float),
     parts: wp.array2d(dtype=float),
 ):
-    """Clipped surrogate and value loss of each of N samples; gradients are those of the minibatch's mean.
+    """Clipped surrogate and value loss of each of N samples; gradients are those of the minibatch's
+    mean.
 
-    ``actor_learns`` is 1, or 0 to leave the actor as it is; the value's steps are not clipped then, for a critic that is
-    far off to get near.
-    """
+    ``actor_learns`` is 1, or 0 to leave the actor as it is; the value's steps are not clipped then,
+    for a critic that is far off to get near."""
     i = wp.tid()
     share = 1.0 / float(mean.shape[0])
     actions = mean.shape[1]
@@ -114,11 +121,11 @@ def spread_and_rate(
     spread_gradient: wp.array(dtype=float),
     totals: wp.array(dtype=float),
 ):
-    """Gradient by the log spreads, rsl_rl's adaptive rate, and running totals of value loss, surrogate and entropy.
+    """Gradient by the log spreads, rsl_rl's adaptive rate, and running totals of value loss,
+    surrogate and entropy.
 
-    ``sums`` are those of ``parts`` over ``count`` samples. The divergence is that of the rollout's Gaussian to this one;
-    where nothing moved it is exactly 0, as rsl_rl's.
-    """
+    ``sums`` are those of ``parts`` over ``count`` samples. The divergence is that of the rollout's
+    Gaussian to this one; where nothing moved it is exactly 0, as rsl_rl's."""
     actions = std.shape[0]
     divergence = float(0.0)
     entropy = float(0.0)

@@ -1,4 +1,6 @@
-"""rsl_rl's network and Gaussian as a CUDA graph can hold them, with products in bfloat16 as a switch."""
+"""rsl_rl's network and Gaussian as a CUDA graph can hold them, with products in bfloat16 as a
+switch.
+"""
 
 import math
 import os
@@ -15,19 +17,29 @@ from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
-ALIGNED = 16  # columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes or multiples
+# columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes
+# or multiples
+ALIGNED = 16
 
-SEEN = 10**8  # observations that a policy's normaliser counts for when it is taken up: about those of its training, which no file tells
+SEEN = (
+    10**8
+    # observations that a policy's normaliser counts for when it is taken up: about those of its
+    # training, which no file tells
+)
 
 
 def normalizer_state(mean: Tensor, std: Tensor) -> dict[str, Tensor]:
-    """State of rsl_rl's normaliser that has seen :data:`SEEN` observations of this mean and spread, shape (D,)."""
+    """State of rsl_rl's normaliser that has seen :data:`SEEN` observations of this mean and spread,
+    shape (D,).
+    """
     state = {"_mean": mean, "_std": std, "_var": std.square()}
     return {name: value[None] for name, value in state.items()} | {"count": torch.tensor(SEEN)}
 
 
 class CapturableGaussian(GaussianDistribution):
-    """rsl_rl's Gaussian with a sample that a CUDA graph can hold: torch.normal copies its spread's minimum to the host."""
+    """rsl_rl's Gaussian with a sample that a CUDA graph can hold: torch.normal copies its spread's
+    minimum to the host.
+    """
 
     def sample(self) -> Tensor:
         """Sample of the current distribution."""
@@ -35,7 +47,9 @@ class CapturableGaussian(GaussianDistribution):
 
 
 class _Layer(torch.autograd.Function):
-    """A linear layer whose bias learns by a product: on an H100 torch's sum over 98,304 samples took two to eight times as long."""
+    """A linear layer whose bias learns by a product: on an H100 torch's sum over 98,304 samples
+    took two to eight times as long.
+    """
 
     @staticmethod
     def forward(ctx, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -50,14 +64,20 @@ class _Layer(torch.autograd.Function):
 
 
 class Network(MLPModel):
-    """rsl_rl's network whose hidden layers multiply in bfloat16 where asked; weights and the last layer stay float32."""
+    """rsl_rl's network whose hidden layers multiply in bfloat16 where asked; weights and the last
+    layer stay float32.
+    """
 
     def __init__(self, *args, bfloat16: bool = False, **kwargs):
         super().__init__(*args, **kwargs)
         self.bfloat16 = bfloat16
 
-    def forward(self, obs: TensorDict, masks=None, hidden_state=None, stochastic_output: bool = False) -> Tensor:
-        """Output for observations; a sample of the distribution where ``stochastic_output`` is set."""
+    def forward(
+        self, obs: TensorDict, masks=None, hidden_state=None, stochastic_output: bool = False
+    ) -> Tensor:
+        """Output for observations; a sample of the distribution where
+        ``stochastic_output`` is set.
+        """
         output = self.output(self.prepared(obs))
         if self.distribution is None or not stochastic_output:
             return output
@@ -65,7 +85,9 @@ class Network(MLPModel):
         return self.distribution.sample()
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """rsl_rl's update of the observations' statistics; it makes a new tensor of the spread, graphs read the old one."""
+        """rsl_rl's update of the observations' statistics; it makes a new tensor of the spread,
+        graphs read the old one.
+        """
         if self.obs_normalization:
             captured = self.obs_normalizer._std
             super().update_normalization(obs)
@@ -73,22 +95,30 @@ class Network(MLPModel):
 
     @torch.no_grad()
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers: its weights, and its normaliser, which hardly moves from there."""
+        """Start from a policy of the same layers: its weights, and its normaliser, which hardly
+        moves from there.
+        """
         layers = [layer for layer in self.mlp if isinstance(layer, torch.nn.Linear)]
         for layer, weight, bias in zip(layers, policy.weights, policy.biases, strict=True):
             layer.weight.copy_(weight)
             layer.bias.copy_(bias)
         if policy.mean is not None:
-            self.obs_normalizer.load_state_dict(normalizer_state(policy.mean, policy.std + (policy.eps - RSL_RL_EPS)))
+            self.obs_normalizer.load_state_dict(
+                normalizer_state(policy.mean, policy.std + (policy.eps - RSL_RL_EPS))
+            )
 
     def prepared(self, obs: TensorDict) -> Tensor:
-        """Normalised observations as :meth:`output` takes them at its fastest, on a GPU filled up with columns of zeros."""
+        """Normalised observations as :meth:`output` takes them at its fastest, on a GPU filled up
+        with columns of zeros.
+        """
         latent = self.get_latent(obs)
         latent = F.pad(latent, (0, -latent.shape[-1] % ALIGNED)) if latent.is_cuda else latent
         return latent.to(torch.bfloat16) if self.bfloat16 else latent
 
     def output(self, latent: Tensor) -> Tensor:
-        """Output of the layers for normalised observations, shape (N, D) or filled up with columns of zeros."""
+        """Output of the layers for normalised observations, shape (N, D) or filled up with columns
+        of zeros.
+        """
         *layers, last = self.mlp
         x = latent.to(torch.bfloat16) if self.bfloat16 else latent
         for layer in layers:
@@ -101,8 +131,12 @@ class Network(MLPModel):
         return last(x.float())
 
 
-def cosine_rate(optimizer: torch.optim.Optimizer, done: float, highest: float, lowest: float) -> float:
-    """Set the learning rate at this share of the training, half a cosine from the highest to the lowest one."""
+def cosine_rate(
+    optimizer: torch.optim.Optimizer, done: float, highest: float, lowest: float
+) -> float:
+    """Set the learning rate at this share of the training, half a cosine from the highest to the
+    lowest one.
+    """
     rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
     for group in optimizer.param_groups:
         group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
@@ -110,11 +144,11 @@ def cosine_rate(optimizer: torch.optim.Optimizer, done: float, highest: float, l
 
 
 def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
-    """Running mean of a module's weights over the last quarter of its updates, ``window`` of them at most.
+    """Running mean of a module's weights over the last quarter of its updates, ``window`` of them
+    at most.
 
-    One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and Juditsky, SIAM J. Control and
-    Optimization 30(4), 1992.
-    """
+    One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and
+    Juditsky, SIAM J. Control and Optimization 30(4), 1992."""
 
     def moved(mean: Tensor, now: Tensor, updates: Tensor) -> Tensor:
         return mean + (now - mean) * torch.clamp(4.0 / (updates + 4.0), min=1.0 / window)

@@ -16,26 +16,44 @@ from visthrow.training.ppo.network import Network
 
 
 class CapturedPPO(PPO):
-    """rsl_rl's PPO of networks without memory and with a Gaussian whose spread is the same for all samples.
+    """rsl_rl's PPO of networks without memory and with a Gaussian whose spread is the same for all
+    samples.
 
-    Log-probabilities of a rollout are computed at its end, samples are gathered in the order of the minibatches once for all
-    epochs, the critic works on a stream of its own, and the adaptive learning rate lives on the device.
-    """
+    Log-probabilities of a rollout are computed at its end, samples are gathered in the order of the
+    minibatches once for all epochs, the critic works on a stream of its own, and the adaptive
+    learning rate lives on the device."""
 
     def __init__(self, actor: Network, critic: Network, storage, **settings):
         super().__init__(actor, critic, storage, **settings)
         make = {"device": self.device, "dtype": torch.float32}
         self._cuda = torch.device(self.device).type == "cuda"
         self._spread = actor.distribution.log_std_param
-        self._layers = [w for w in chain(actor.parameters(), critic.parameters()) if w is not self._spread]
-        self.rate, self.target_kl = torch.tensor([self.learning_rate], **make), torch.tensor([self.desired_kl], **make)
-        self.actor_learns = torch.ones(1, **make)  # 0 holds the actor still, to the bit, while the critic learns
-        self.optimizer = torch.optim.Adam([self._spread, *self._layers], lr=self.rate, fused=True, capturable=self._cuda)
-        samples, actions = storage.num_envs * storage.num_transitions_per_env, storage.actions.shape[-1]
+        self._layers = [
+            w for w in chain(actor.parameters(), critic.parameters()) if w is not self._spread
+        ]
+        self.rate, self.target_kl = (
+            torch.tensor([self.learning_rate], **make),
+            torch.tensor([self.desired_kl], **make),
+        )
+        self.actor_learns = torch.ones(
+            1, **make
+        )  # 0 holds the actor still, to the bit, while the critic learns
+        self.optimizer = torch.optim.Adam(
+            [self._spread, *self._layers], lr=self.rate, fused=True, capturable=self._cuda
+        )
+        samples, actions = (
+            storage.num_envs * storage.num_transitions_per_env,
+            storage.actions.shape[-1],
+        )
         self._minibatch = samples // self.num_mini_batches
         self._order = torch.zeros(samples, device=self.device, dtype=torch.long)
-        storage.distribution_params = tuple(torch.zeros(storage.actions.shape, **make) for _ in range(2))
-        self._old_std, self._last_value = torch.ones(actions, **make), torch.zeros(storage.num_envs, **make)
+        storage.distribution_params = tuple(
+            torch.zeros(storage.actions.shape, **make) for _ in range(2)
+        )
+        self._old_std, self._last_value = (
+            torch.ones(actions, **make),
+            torch.zeros(storage.num_envs, **make),
+        )
         self._totals = torch.zeros(3, **make)
         self._mean_gradient = torch.zeros(self._minibatch, actions, **make)
         self._value_gradient = torch.zeros(self._minibatch, 1, **make)
@@ -47,7 +65,9 @@ class CapturedPPO(PPO):
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
-        """Launch on a stream of its own on a GPU, after what was launched before; :meth:`join` waits for it."""
+        """Launch on a stream of its own on a GPU, after what was launched before; :meth:`join`
+        waits for it.
+        """
         if self._aside is None:
             yield
             return
@@ -61,7 +81,9 @@ class CapturedPPO(PPO):
             torch.cuda.current_stream().wait_stream(self._aside)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions, shape (E, A), and store what the rollout's end needs of them; the critic works beside the simulation."""
+        """Sample actions, shape (E, A), and store what the rollout's end needs of them; the critic
+        works beside the simulation.
+        """
         storage = self.storage
         seen = storage.observations[storage.step]
         for group, values in obs.items():  # one by one: copied at once they took four times as long
@@ -73,13 +95,17 @@ class CapturedPPO(PPO):
         storage.distribution_params[0][storage.step].copy_(self.actor.output_mean)
         return actions
 
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict) -> None:
+    def process_env_step(
+        self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict
+    ) -> None:
         """Store one step's rewards and ends, shape (E,).
 
         Raises ValueError: the environment bootstraps at its time limit, which is not served here.
         """
         if "time_outs" in extras:
-            raise ValueError("time_outs of the environment; expected none; its time limit is an end like others")
+            raise ValueError(
+                "time_outs of the environment; expected none; its time limit is an end like others"
+            )
         storage = self.storage
         storage.rewards[storage.step].copy_(rewards[:, None])
         storage.dones[storage.step].copy_(dones[:, None])
@@ -94,11 +120,23 @@ class CapturedPPO(PPO):
         self._old_std.copy_(self._std())
         storage.distribution_params[1].copy_(self._old_std.expand_as(storage.actions))
         self._launch(
-            loss.log_probabilities, len(self._order), storage.actions.flatten(0, 1), storage.distribution_params[0].flatten(0, 1),
-            self._old_std, storage.actions_log_prob.view(-1),
-        )  # fmt: skip
+            loss.log_probabilities,
+            len(self._order),
+            storage.actions.flatten(0, 1),
+            storage.distribution_params[0].flatten(0, 1),
+            self._old_std,
+            storage.actions_log_prob.view(-1),
+        )
         steps = [t[..., 0] for t in (storage.rewards, storage.dones, storage.values)]
-        self._launch(loss.returns_of, storage.num_envs, self.gamma, self.lam, *steps, self._last_value, storage.returns[..., 0])
+        self._launch(
+            loss.returns_of,
+            storage.num_envs,
+            self.gamma,
+            self.lam,
+            *steps,
+            self._last_value,
+            storage.returns[..., 0],
+        )
         torch.sub(storage.returns, storage.values, out=storage.advantages)
         storage.advantages.sub_(storage.advantages.mean()).div_(storage.advantages.std() + 1e-8)
 
@@ -108,19 +146,27 @@ class CapturedPPO(PPO):
 
     def _launch(self, kernel: wp.Kernel, count: int, *arguments: Tensor | float | int) -> None:
         """Launch a kernel on torch's stream."""
-        given = [wp.from_torch(a.detach(), requires_grad=False) if isinstance(a, Tensor) else a for a in arguments]
+        given = [
+            wp.from_torch(a.detach(), requires_grad=False) if isinstance(a, Tensor) else a
+            for a in arguments
+        ]
         with on_torch_stream(self.device):
             wp.launch(kernel, count, given, device=self.device)
 
     def update(self) -> dict[str, float]:
-        """All epochs over the stored samples; returns mean losses. From the second on a GPU replays a captured graph."""
+        """All epochs over the stored samples; returns mean losses.
+
+        From the second on a GPU replays a captured graph.
+        """
         self.target_kl.fill_(self.desired_kl)
         self._order.copy_(torch.randperm(len(self._order), device=self.device))
         if not self._cuda or self._updates == 0:
             self._epochs()
         else:
             if self._graph is None:
-                self._graph = captured(self._epochs, capture_error_mode="thread_local")  # NCCL's watchdog asks beside
+                self._graph = captured(
+                    self._epochs, capture_error_mode="thread_local"
+                )  # NCCL's watchdog asks beside
             self._graph.replay()
         self._updates += 1
         for model in (self.actor, self.critic):
@@ -128,16 +174,22 @@ class CapturedPPO(PPO):
         self.storage.clear()
         *losses, self.learning_rate = torch.cat([self._totals, self.rate]).tolist()
         count = self.num_learning_epochs * self.num_mini_batches
-        return {name: total / count for name, total in zip(("value", "surrogate", "entropy"), losses)}
+        return {
+            name: total / count for name, total in zip(("value", "surrogate", "entropy"), losses)
+        }
 
     def _epochs(self) -> None:
         """Gather the samples in the order of the minibatches and descend on each, once an epoch."""
         storage = self.storage
         obs = storage.observations.flatten(0, 1)
         stored = (
-            storage.actions, storage.distribution_params[0], storage.actions_log_prob, storage.advantages, storage.returns,
+            storage.actions,
+            storage.distribution_params[0],
+            storage.actions_log_prob,
+            storage.advantages,
+            storage.returns,
             storage.values,
-        )  # fmt: skip
+        )
         with torch.no_grad():
             gathered = [model.prepared(obs)[self._order] for model in (self.actor, self.critic)]
             gathered += [t.flatten(0, 1)[self._order] for t in stored]
@@ -148,26 +200,52 @@ class CapturedPPO(PPO):
                 self._descend(seen, known, samples)
 
     def _descend(self, seen: Tensor, known: Tensor, samples: list[Tensor]) -> None:
-        """One gradient step on a minibatch: the networks' inputs, and what :func:`loss.loss` reads of the samples."""
+        """One gradient step on a minibatch: the networks' inputs, and what :func:`loss.loss` reads
+        of the samples.
+        """
         with self._beside():  # so are their gradients: one multiplies while the other moves memory
             value = self.critic.output(known)
         mean, std = self.actor.output(seen), self._std()
         self.join()
         columns = [t if t.shape[-1] > 1 else t.view(-1) for t in samples]
         self._launch(
-            loss.loss, self._minibatch, self.clip_param, self.value_loss_coef, int(self.use_clipped_value_loss), self.actor_learns,
-            mean, value.view(-1), std, *columns, self._mean_gradient, self._value_gradient.view(-1), self._parts,
-        )  # fmt: skip
+            loss.loss,
+            self._minibatch,
+            self.clip_param,
+            self.value_loss_coef,
+            int(self.use_clipped_value_loss),
+            self.actor_learns,
+            mean,
+            value.view(-1),
+            std,
+            *columns,
+            self._mean_gradient,
+            self._value_gradient.view(-1),
+            self._parts,
+        )
         sums = self._parts.sum(0)
         if self.is_multi_gpu:
             moved = sums[2 : 2 + len(std)]
             torch.distributed.all_reduce(moved)
             moved /= self.gpu_world_size
         self._launch(
-            loss.spread_and_rate, 1, float(self._minibatch), self.entropy_coef, int(self.schedule == "adaptive"), self.target_kl,
-            self.actor_learns, sums, std, self._old_std, self.rate, self._spread.grad, self._totals,
-        )  # fmt: skip
-        gradients = torch.autograd.grad([mean, value], self._layers, [self._mean_gradient, self._value_gradient])
+            loss.spread_and_rate,
+            1,
+            float(self._minibatch),
+            self.entropy_coef,
+            int(self.schedule == "adaptive"),
+            self.target_kl,
+            self.actor_learns,
+            sums,
+            std,
+            self._old_std,
+            self.rate,
+            self._spread.grad,
+            self._totals,
+        )
+        gradients = torch.autograd.grad(
+            [mean, value], self._layers, [self._mean_gradient, self._value_gradient]
+        )
         for layer, gradient in zip(self._layers, gradients):
             layer.grad = gradient
         if self.is_multi_gpu:
@@ -177,7 +255,9 @@ class CapturedPPO(PPO):
         self.optimizer.step()
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are captured anew."""
+        """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are
+        captured anew.
+        """
         result = super().load(loaded_dict, load_cfg, strict)
         self.set_rate(float(self.learning_rate))
         self._graph, self._updates = None, 0

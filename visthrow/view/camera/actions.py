@@ -32,31 +32,54 @@ BLUE, YELLOW = (230, 120, 40), (60, 210, 240)
 SAMPLES = 16  # rays a pixel of a rendered frame
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-SIGNIFICANT = 1e-3  # chance at which a better fit by the eight free numbers of a lens counts as noise (F test)
+# chance at which a better fit by the eight free numbers of a lens counts as noise (F test)
+SIGNIFICANT = 1e-3
 
 
 def board_of(words: list[str] | None) -> BoardParams:
     """Board of the words after ``--board``; ConfigError where they name none."""
     expected = f"--board {BOARD}, for instance: --board chessboard 7 5 0.04"
-    if not words or len(words) < 4 or len(words) > 6 or words[0] not in ("chessboard", "circles", "charuco"):
+    if (
+        not words
+        or len(words) < 4
+        or len(words) > 6
+        or words[0] not in ("chessboard", "circles", "charuco")
+    ):
         raise ConfigError(f"--board {' '.join(words or ['(missing)'])}; expected {expected}")
     try:
-        return BoardParams(int(words[1]), int(words[2]), float(words[3]), words[0], *map(float, words[4:5]), *words[5:])  # type: ignore[arg-type]
+        return BoardParams(
+            int(words[1]),
+            int(words[2]),
+            float(words[3]),
+            words[0],
+            *map(float, words[4:5]),
+            *words[5:],
+        )  # type: ignore[arg-type]
     except ValueError as error:
         raise ConfigError(f"--board {' '.join(words)}: {error}; expected {expected}") from error
 
 
 def pictures_of(names: list[str]) -> tuple[list[Path], list[np.ndarray]]:
-    """Read pictures, and those of folders, as BGR, uint8, shape (H, W, 3); ConfigError where a file is none, or there is none."""
+    """Read pictures, and those of folders, as BGR, uint8, shape (H, W, 3); ConfigError where a file
+    is none, or there is none.
+    """
     paths: list[Path] = []
     for name in map(Path, names):
-        paths += sorted(p for p in name.iterdir() if p.suffix.lower() in PICTURES) if name.is_dir() else [name]
+        paths += (
+            sorted(p for p in name.iterdir() if p.suffix.lower() in PICTURES)
+            if name.is_dir()
+            else [name]
+        )
     images = [cv2.imread(str(path)) if path.is_file() else None for path in paths]
     for path, image in zip(paths, images, strict=True):
         if image is None:
-            raise ConfigError(f"{path}: not a picture that can be read; expected one of {', '.join(PICTURES)}")
+            raise ConfigError(
+                f"{path}: not a picture that can be read; expected one of {', '.join(PICTURES)}"
+            )
     if not paths:
-        raise ConfigError(f"no picture in {', '.join(names)}; expected one of {', '.join(PICTURES)}")
+        raise ConfigError(
+            f"no picture in {', '.join(names)}; expected one of {', '.join(PICTURES)}"
+        )
     return paths, images  # type: ignore[return-value]
 
 
@@ -64,28 +87,43 @@ def calibrate(args: argparse.Namespace) -> int:
     """Write a camera config."""
     out = Path(args.out)
     if out.suffix != ".toml":
-        raise ConfigError(f"--out {out}; expected a file that ends in .toml, as every configuration")
+        raise ConfigError(
+            f"--out {out}; expected a file that ends in .toml, as every configuration"
+        )
     like = config.load(CameraParams, config.find("camera", args.like))
     first = Path(args.source[0])
     if args.board or first.is_dir() or first.suffix.lower() in PICTURES:
         board = board_of(args.board)
         paths, images = pictures_of(args.source)
         lens, report = calibrate_from_boards(images, board, args.fov_deg or 180.0)
-        said = f"calibrated on {len(images)} pictures of a {board.pattern}, reprojection error {report.rms_px:.3f} px rms"
+        said = (
+            f"calibrated on {len(images)} pictures of a {board.pattern}, reprojection error"
+            f" {report.rms_px:.3f} px rms"
+        )
         print("\n".join(_by_picture(paths, report)))
     else:
         if len(args.source) != 1:
-            raise ConfigError(f"{len(args.source)} calibration files came; expected one (or pictures with --board)")
+            raise ConfigError(
+                f"{len(args.source)} calibration files came; expected one (or pictures with"
+                " --board)"
+            )
         name, lens, fit = read(first, args.format, args.camera, args.fov_deg)
         said = f"from {first.name} ({name})"
         if fit.points:
-            said += f", its {fit.model} model fitted to {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most over the image"
+            said += (
+                f", its {fit.model} model fitted to {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at"
+                " most over the image"
+            )
         else:
             said += ", the same model: nothing was fitted"
-    text = f"# Camera {said}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
+    text = (
+        f"# Camera {said}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
+    )
     params = dataclasses.replace(like, fisheye=lens)
     atomic_write(out, (text + config.dumps(params)).encode())
-    print(f"{said}\n{sentence(lens)}\n{out}  train with it: visthrow train vision --set camera={out}")
+    print(
+        f"{said}\n{sentence(lens)}\n{out}  train with it: visthrow train vision --set camera={out}"
+    )
     return 0
 
 
@@ -98,18 +136,23 @@ def check(args: argparse.Namespace) -> int:
     _, best = calibrate_from_boards(images, board, camera.fisheye.fov_deg)
     print("\n".join(_by_picture(paths, given)))
     fits, why = verdict(camera, given, best)
-    print(f"reprojection error {given.rms_px:.3f} px rms; of the lens that fits these pictures best {best.rms_px:.3f} px\n{why}")
+    print(
+        f"reprojection error {given.rms_px:.3f} px rms; of the lens that fits these pictures best"
+        f" {best.rms_px:.3f} px\n{why}"
+    )
     return 0 if fits else 1
 
 
 def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tuple[bool, str]:
     """Tell whether a configured lens fits pictures of a board.
 
-    What the configured lens leaves beyond the best lens is a systematic error. It is accepted where it is not significant
-    (F test of eight free numbers), or below the bias that training draws for each episode (``noise.bias_std``).
+    What the configured lens leaves beyond the best lens is a systematic error. It is accepted where
+    it is not significant (F test of eight free numbers), or below the bias that training draws for
+    each episode (``noise.bias_std``).
 
     Args:
-        camera: the configuration. given: its reprojection errors. best: those of the lens calibrated on the same pictures.
+        camera: the configuration. given: its reprojection errors. best: those of the lens
+            calibrated on the same pictures.
     """
     from scipy.stats import f
 
@@ -120,21 +163,34 @@ def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tupl
     noise = best.rms_px * math.sqrt(8.0 * float(f.isf(SIGNIFICANT, 8, left)) / left)
     learnt = camera.noise.bias_std * math.sqrt(lens.fx * lens.fy) * Fisheye(lens).edge_radius
     limit = max(noise, learnt)
-    reason = "the bias that training draws (noise.bias_std)" if learnt >= noise else "what noise of the corners explains"
+    reason = (
+        "the bias that training draws (noise.bias_std)"
+        if learnt >= noise
+        else "what noise of the corners explains"
+    )
     word = "fits" if excess <= limit else "does NOT fit; calibrate anew"
-    return excess <= limit, f"the configured lens {word}: systematic error {excess:.3f} px, accepted up to {limit:.3f} px: {reason}"
+    return (
+        excess <= limit,
+        (
+            f"the configured lens {word}: systematic error {excess:.3f} px, accepted up to"
+            f" {limit:.3f} px: {reason}"
+        ),
+    )
 
 
 def _by_picture(paths: list[Path], report: BoardReport) -> list[str]:
     lines = zip(paths, report.image_rms_px, strict=True)
-    return [f"{path.name:24s} " + ("no board found" if math.isnan(rms) else f"{rms:.3f} px") for path, rms in lines]
+    return [
+        f"{path.name:24s} " + ("no board found" if math.isnan(rms) else f"{rms:.3f} px")
+        for path, rms in lines
+    ]
 
 
 def sentence(lens: FisheyeParams) -> str:
     k = ", ".join(f"{x:.5g}" for x in lens.coefficients)
     return (
-        f"{lens.width} x {lens.height} px, fx {lens.fx:.2f}, fy {lens.fy:.2f}, cx {lens.cx:.2f}, cy {lens.cy:.2f} px, "
-        f"k {k}, field of view {lens.fov_deg:.1f} deg"
+        f"{lens.width} x {lens.height} px, fx {lens.fx:.2f}, fy {lens.fy:.2f}, cx {lens.cx:.2f}, cy"
+        f" {lens.cy:.2f} px, k {k}, field of view {lens.fov_deg:.1f} deg"
     )
 
 
@@ -145,41 +201,61 @@ def show(args: argparse.Namespace) -> int:
         raise ConfigError(f"--out {out}; expected a picture, one of {', '.join(PICTURES)}")
     params = config.load(CameraParams, config.find("camera", args.config))
     if args.hangs + params.payload_radius > args.height:
-        raise ConfigError(f"--hangs {args.hangs:g} below --height {args.height:g}; expected a payload above the ground [m]")
+        raise ConfigError(
+            f"--hangs {args.hangs:g} below --height {args.height:g}; expected a payload above the"
+            " ground [m]"
+        )
     camera, lens = KeypointCamera(params), Fisheye(params.fisheye)
     pos_w, rot_wb = torch.tensor([0.0, 0.0, args.height]), torch.eye(3)
     ball_w, goal_w = pos_w - torch.tensor([0.0, 0.0, args.hangs]), torch.tensor([*args.target, 0.0])
-    image = pictures_of([args.picture])[1][0] if args.picture else _rendered(params, pos_w, rot_wb, ball_w, goal_w)
+    image = (
+        pictures_of([args.picture])[1][0]
+        if args.picture
+        else _rendered(params, pos_w, rot_wb, ball_w, goal_w)
+    )
     points, valid = keypoints(camera, pos_w[None], rot_wb[None], goal_w[None], ball_w[None])
     drawn = draw_overlay(camera, points[0], valid[0], image)
     if args.board:
         _draw_board(drawn, image, lens, args)
     pictures = {out: drawn}
     if args.straight:
-        pictures[out.with_name(f"{out.stem}_straight{out.suffix}")] = _straight(drawn, lens, args.straight)
+        pictures[out.with_name(f"{out.stem}_straight{out.suffix}")] = _straight(
+            drawn, lens, args.straight
+        )
     for path, picture in pictures.items():
         atomic_write(path, cv2.imencode(path.suffix, picture)[1].tobytes())
     seen = valid[0].tolist()
     print(sentence(params.fisheye))
-    print(f"in view: {sum(seen[:4])} of 4 keypoints of the goal, {sum(seen[4:])} of 4 of the payload")
+    print(
+        f"in view: {sum(seen[:4])} of 4 keypoints of the goal, {sum(seen[4:])} of 4 of the payload"
+    )
     print("\n".join(map(str, pictures)))
     return 0
 
 
 def _rendered(params: CameraParams, *places: torch.Tensor) -> np.ndarray:
-    """Frame of a grey hall with vehicle, ball and goal square at position, attitude, and positions of both, BGR, uint8."""
+    """Frame of a grey hall with vehicle, ball and goal square at position, attitude, and positions
+    of both, BGR, uint8.
+    """
     from camera.detectors.scenes.renderer import Renderer
     from camera.detectors.scenes.scene import posed_scenes
 
     scenes = posed_scenes(params, *(place[None] for place in places), torch.tensor([True]))
-    return np.ascontiguousarray(Renderer(params.fisheye, files=[], samples=SAMPLES).render(scenes)[0].numpy()[..., ::-1])
+    return np.ascontiguousarray(
+        Renderer(params.fisheye, files=[], samples=SAMPLES).render(scenes)[0].numpy()[..., ::-1]
+    )
 
 
-def _draw_board(drawn: np.ndarray, image: np.ndarray, lens: Fisheye, args: argparse.Namespace) -> None:
+def _draw_board(
+    drawn: np.ndarray, image: np.ndarray, lens: Fisheye, args: argparse.Namespace
+) -> None:
     board = board_of(args.board)
     view = find_board(image, board)
     if view is None:
-        raise ConfigError(f"{args.picture or 'the rendered scene'}: no {board.pattern} of {board.columns} x {board.rows} points in it")
+        raise ConfigError(
+            f"{args.picture or 'the rendered scene'}: no {board.pattern} of {board.columns} x"
+            f" {board.rows} points in it"
+        )
     expected = reprojected(lens, view)
     for pixels, colour, size in ((view.pixels, YELLOW, 5), (expected, BLUE, 2)):
         for u, v in pixels:

@@ -1,1 +1,3 @@
-"""Betaflight blackbox logs, raw or decoded to CSV: bit packing, frames, and the channels of a flight log."""
+"""Betaflight blackbox logs, raw or decoded to CSV: bit packing, frames, and the channels of a
+flight log.
+"""

@@ -1,8 +1,7 @@
 """Blackbox logs, raw or decoded to CSV, as flight logs.
 
-Convention: Betaflight's body axes are ours (x forward, y left, z up; a level vehicle at rest feels +1 g along z). Its motors
-are rear right, front right, rear left, front left.
-"""
+Convention: Betaflight's body axes are ours (x forward, y left, z up; a level vehicle at rest feels
++1 g along z). Its motors are rear right, front right, rear left, front left."""
 
 import math
 import re
@@ -17,7 +16,12 @@ from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
 from visthrow.logs.readers.table import Table, make_channel
 from visthrow.logs.units import G
 
-MOTOR_ORDER = (3, 1, 2, 0)  # Betaflight's motor of each of ours: front left, front right, rear left, rear right
+MOTOR_ORDER = (
+    3,
+    1,
+    2,
+    0,
+)  # Betaflight's motor of each of ours: front left, front right, rear left, rear right
 
 _CLOCK_TURN = 2**32
 _UNIT = re.compile(r"\s*\([^()]*\)$")
@@ -30,7 +34,10 @@ def logs_of_blackbox(path: str | Path) -> list[FlightLog]:
     """Read a raw file: one flight log each log in it. Raises LogError as :func:`read_blackbox`."""
     logs = read_blackbox(path)
     tables = [dict(zip(log.names, log.main.T.astype(np.float64))) for log in logs]
-    return [_flight(table, log.header, _raw_meta(log, path, i)) for i, (log, table) in enumerate(zip(logs, tables), start=1)]
+    return [
+        _flight(table, log.header, _raw_meta(log, path, i))
+        for i, (log, table) in enumerate(zip(logs, tables), start=1)
+    ]
 
 
 def is_decoded(table: Table) -> bool:
@@ -40,10 +47,11 @@ def is_decoded(table: Table) -> bool:
 
 
 def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
-    """Make a flight log of a decoded CSV; its units are those of the raw log, or stand in brackets behind the names.
+    """Make a flight log of a decoded CSV; its units are those of the raw log, or stand in brackets
+    behind the names.
 
-    Raises LogError: a column has a unit in brackets that is not known, or the stamps are no numbers.
-    """
+    Raises LogError: a column has a unit in brackets that is not known, or the stamps are no
+    numbers."""
     plain = {}
     for name, values in table.items():
         bare = _UNIT.sub("", name)
@@ -56,21 +64,50 @@ def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
 def _decoded_factor(name: str, unit: str, path: str | Path) -> float:
     """Factor from the bracketed unit to what the raw log holds."""
     known = {
-        "": 1.0, "us": 1.0, "ms": 1e3, "s": 1e6, "deg/s": 1.0, "rad/s": 180 / math.pi, "V": 100.0, "A": 100.0, "g": _ACC_1G,
-        "m/s/s": _ACC_1G / G, "flags": 1.0, "cm": 1.0, "m": 1.0, "mAh": 1.0, "raw": 1.0, "%": 1.0,
-    }  # fmt: skip
+        "": 1.0,
+        "us": 1.0,
+        "ms": 1e3,
+        "s": 1e6,
+        "deg/s": 1.0,
+        "rad/s": 180 / math.pi,
+        "V": 100.0,
+        "A": 100.0,
+        "g": _ACC_1G,
+        "m/s/s": _ACC_1G / G,
+        "flags": 1.0,
+        "cm": 1.0,
+        "m": 1.0,
+        "mAh": 1.0,
+        "raw": 1.0,
+        "%": 1.0,
+    }
     if unit not in known:
         raise LogError(f"{path}: column '{name}' is in '{unit}'; known: {', '.join(known)}")
     return known[unit]
 
 
 def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:
-    keep = ("Firmware revision", "looptime", "I interval", "P interval", "motorOutput", "acc_1G", "vbatref", "motor_poles")
+    keep = (
+        "Firmware revision",
+        "looptime",
+        "I interval",
+        "P interval",
+        "motorOutput",
+        "acc_1G",
+        "vbatref",
+        "motor_poles",
+    )
     return {
-        "source": str(path), "kind": "blackbox", "part": str(number), "frames": log.frames, "corrupt": log.corrupt,
-        "dropped": log.dropped, "complete": log.complete, "events": [[name, *values] for name, values in log.events],
+        "source": str(path),
+        "kind": "blackbox",
+        "part": str(number),
+        "frames": log.frames,
+        "corrupt": log.corrupt,
+        "dropped": log.dropped,
+        "complete": log.complete,
+        "events": [[name, *values] for name, values in log.events],
         "header": {key: log.header[key] for key in keep if key in log.header},
-    }  # fmt: skip
+    }
 
 
 def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
@@ -84,7 +121,14 @@ def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
     meta["ingest"] = {}
     channels: dict[str, Channel] = {}
 
-    def add(name: str, columns: list[str], unit: str, scale: float = 1.0, offset: float = 0.0, frame: str = "") -> None:
+    def add(
+        name: str,
+        columns: list[str],
+        unit: str,
+        scale: float = 1.0,
+        offset: float = 0.0,
+        frame: str = "",
+    ) -> None:
         if not all(column in table for column in columns):
             return
         entry = ChannelMap(name, tuple(columns), unit, scale=scale, offset=offset, frame=frame)

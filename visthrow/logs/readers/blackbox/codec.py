@@ -1,14 +1,29 @@
-"""The byte level of Betaflight's blackbox: variable-length integers, packed groups, and predictions of fields.
+"""The byte level of Betaflight's blackbox: variable-length integers, packed groups, and predictions
+of fields.
 
-Source: Betaflight, "Blackbox logging internals" (docs/development/Blackbox Internals.md), data version 2.
-"""
+Source: Betaflight, "Blackbox logging internals" (docs/development/Blackbox Internals.md), data
+version 2."""
 
 from collections.abc import Callable
 
 import numpy as np
 
-SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = 0, 1, 3, 6, 7, 8, 9, 10
-_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}  # encoding -> largest number of fields packed together
+SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = (
+    0,
+    1,
+    3,
+    6,
+    7,
+    8,
+    9,
+    10,
+)
+_GROUP = {
+    TAG8_8SVB: 8,
+    TAG2_3S32: 3,
+    TAG8_4S16: 4,
+    TAG2_3SVARIABLE: 3,
+}  # encoding -> largest number of fields packed together
 
 _LONGEST_VB = 5  # bytes of a 32-bit number, seven bits a byte
 
@@ -73,7 +88,9 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
 
 
 def _three(one: tuple, two: tuple) -> Callable[["Reader", int], list[int]]:
-    """Three fields by the two highest bits: within a byte, one or two more (where each field's bits end, and how many), or byte by byte."""
+    """Three fields by the two highest bits: within a byte, one or two more (where each field's bits
+    end, and how many), or byte by byte.
+    """
     places = (((4, 2), (2, 2), (0, 2)), one, two)
 
     def decode(r: Reader, count: int) -> list[int]:
@@ -114,8 +131,11 @@ DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
 }
 
 
-def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Callable[[Reader, int], list[int]], int, int]]:
-    """Return decoder, first field and number of fields of each group of fields that are packed together, by the encoding of each field.
+def plan(
+    encodings: list[int], skipped: list[bool]
+) -> list[tuple[Callable[[Reader, int], list[int]], int, int]]:
+    """Return decoder, first field and number of fields of each group of fields that are packed
+    together, by the encoding of each field.
 
     ``skipped`` fields take no bytes at all (those counted up by one).
     """
@@ -126,7 +146,9 @@ def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Callable[[Read
             continue
         code, count = encodings[i], 1
         if code == TAG8_8SVB:
-            while count < _GROUP[code] and i + count < len(encodings) and encodings[i + count] == code:
+            while (
+                count < _GROUP[code] and i + count < len(encodings) and encodings[i + count] == code
+            ):
                 count += 1
         elif code in _GROUP:
             count = min(_GROUP[code], len(encodings) - i)

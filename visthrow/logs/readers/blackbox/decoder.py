@@ -1,10 +1,10 @@
 """Raw Betaflight blackbox files (.bbl, .bfl): headers and frames of every log in the file.
 
-A frame that does not decode is dropped, and nothing is believed until the next frame that stands on its own (I). A file
-may end within a frame.
+A frame that does not decode is dropped, and nothing is believed until the next frame that stands on
+its own (I). A file may end within a frame.
 
-Source: Betaflight, "Blackbox logging internals"; frame checks as in Betaflight's blackbox-log-viewer.
-"""
+Source: Betaflight, "Blackbox logging internals"; frame checks as in Betaflight's
+blackbox-log-viewer."""
 
 import contextlib
 from dataclasses import dataclass, field
@@ -17,14 +17,32 @@ from visthrow.logs.readers.blackbox.codec import DECODERS, Corrupt, EndOfLog, Re
 
 MARKER = b"H Product:Blackbox flight data recorder by Nicholas Sherlock"
 FRAMES = b"IPSGHE"
-ZERO, PREVIOUS, STRAIGHT_LINE, AVERAGE_2, MINTHROTTLE, MOTOR_0, INC, _, P1500, VBATREF, LAST_MAIN_TIME, MINMOTOR = range(12)
+(
+    ZERO,
+    PREVIOUS,
+    STRAIGHT_LINE,
+    AVERAGE_2,
+    MINTHROTTLE,
+    MOTOR_0,
+    INC,
+    _,
+    P1500,
+    VBATREF,
+    LAST_MAIN_TIME,
+    MINMOTOR,
+) = range(12)
 """Predictors; those of GPS frames, which are skipped, do not matter."""
 _LONGEST_FRAME = 256  # bytes
 _LONGEST_GAP_US = 10_000_000
 _MOST_ITERATIONS = 5000 * 10
 _EVENTS = {
-    0: "sync beep", 13: "adjustment", 14: "logging resumes", 15: "disarm", 30: "flight mode", 255: "end of log",
-}  # fmt: skip
+    0: "sync beep",
+    13: "adjustment",
+    14: "logging resumes",
+    15: "disarm",
+    30: "flight mode",
+    255: "end of log",
+}
 
 
 @dataclass
@@ -52,18 +70,25 @@ class BlackboxLog:
 
 
 def read_blackbox(path: str | Path) -> list[BlackboxLog]:
-    """Read every log of a raw file. Raises LogError: no such file, no blackbox file, or none of its logs holds a frame."""
+    """Read every log of a raw file.
+
+    Raises LogError: no such file, no blackbox file, or none of its logs holds a frame.
+    """
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror or error}; expected a blackbox file") from error
+        raise LogError(
+            f"{path}: cannot be read: {error.strerror or error}; expected a blackbox file"
+        ) from error
     starts = []
     at = data.find(MARKER)
     while at >= 0:
         starts.append(at)
         at = data.find(MARKER, at + 1)
     if not starts:
-        raise LogError(f"{path}: no blackbox log in its {len(data)} bytes; expected '{MARKER.decode()}'")
+        raise LogError(
+            f"{path}: no blackbox log in its {len(data)} bytes; expected '{MARKER.decode()}'"
+        )
     logs, problems = [], []
     for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(data)]), start=1):
         try:
@@ -72,7 +97,9 @@ def read_blackbox(path: str | Path) -> list[BlackboxLog]:
             problems.append(f"log {number}: {error}")
     logs = [log for log in logs if len(log.main)]
     if not logs:
-        raise LogError(f"{path}: {len(starts)} log(s), none with a frame in it {'; '.join(problems)}".rstrip())
+        raise LogError(
+            f"{path}: {len(starts)} log(s), none with a frame in it {'; '.join(problems)}".rstrip()
+        )
     return logs
 
 
@@ -110,26 +137,39 @@ class _Decoder:
     def _prepare(self) -> None:
         if "I" not in self.fields or "P" not in self.fields:
             raise LogError("no definition of I and P frames in its header")
-        self.fields["P"].names, self.fields["P"].signed = self.fields["I"].names, self.fields["I"].signed
+        self.fields["P"].names, self.fields["P"].signed = (
+            self.fields["I"].names,
+            self.fields["I"].signed,
+        )
         if self.header.get("Data version", "2") != "2":
             raise LogError(f"data version {self.header['Data version']}; version 2 is read")
         for kind, of in self.fields.items():
             sizes = {len(of.names), len(of.predictor), len(of.encoding)}
             if len(sizes) > 1:
-                raise LogError(f"definition of {kind} frames contradicts itself: {sorted(sizes)} fields")
+                raise LogError(
+                    f"definition of {kind} frames contradicts itself: {sorted(sizes)} fields"
+                )
             unknown = [code for code in of.encoding if code not in DECODERS]
             if unknown:
-                raise LogError(f"{kind} frames use encoding {unknown[0]}; known: {', '.join(map(str, DECODERS))}")
-        self.plans = {kind: plan(of.encoding, [p == INC for p in of.predictor]) for kind, of in self.fields.items()}
+                raise LogError(
+                    f"{kind} frames use encoding {unknown[0]}; known:"
+                    f" {', '.join(map(str, DECODERS))}"
+                )
+        self.plans = {
+            kind: plan(of.encoding, [p == INC for p in of.predictor])
+            for kind, of in self.fields.items()
+        }
         names = self.fields["I"].names
         self.at_time = names.index("time") if "time" in names else None
         self.at_iteration = names.index("loopIteration") if "loopIteration" in names else None
         self.at_motor0 = names.index("motor[0]") if "motor[0]" in names else None
         output = _numbers(self.header.get("motorOutput", "0"), "motorOutput")
         self.constant = {
-            MINTHROTTLE: _int(self.header, "minthrottle"), P1500: 1500, VBATREF: _int(self.header, "vbatref"),
+            MINTHROTTLE: _int(self.header, "minthrottle"),
+            P1500: 1500,
+            VBATREF: _int(self.header, "vbatref"),
             MINMOTOR: output[0],
-        }  # fmt: skip
+        }
         self.interval = max(1, _int(self.header, "I interval", 32))
         num, _, denom = self.header.get("P interval", "1/1").partition("/")
         self.p_num, self.p_denom = (int(num), int(denom)) if denom else (1, max(1, int(num)))
@@ -234,11 +274,15 @@ class _Decoder:
         return next((count for count, keep in enumerate(kept) if keep), self.interval)
 
     def _continuous(self, values: list[int], kind: str) -> bool:
-        """Whether time and iteration go on; one I frame that jumps is refused, and the next one believed wherever it stands."""
+        """Whether time and iteration go on; one I frame that jumps is refused, and the next one
+        believed wherever it stands.
+        """
         steps = []
         if self.at_time is not None and self.last_time is not None:
             passed = values[self.at_time] - self.last_time
-            steps.append((passed + (1 << 32) if passed < -(1 << 31) else passed, _LONGEST_GAP_US))  # the 32-bit clock turned over
+            steps.append(
+                (passed + (1 << 32) if passed < -(1 << 31) else passed, _LONGEST_GAP_US)
+            )  # the 32-bit clock turned over
         if self.at_iteration is not None and self.last_iteration is not None:
             steps.append((values[self.at_iteration] - self.last_iteration, _MOST_ITERATIONS))
         if all(0 <= passed <= most for passed, most in steps):
@@ -258,7 +302,10 @@ def _event(reader: Reader) -> tuple[str, tuple[float, ...]] | None:
         return (_EVENTS[kind], ()) if found else None
     if kind == 13:
         function = reader.byte()
-        return _EVENTS[kind], (function & 127, reader.float32() if function & 128 else reader.signed())
+        return _EVENTS[kind], (
+            function & 127,
+            reader.float32() if function & 128 else reader.signed(),
+        )
     return _EVENTS[kind], tuple(reader.unsigned() for _ in range(2 if kind in (14, 30) else 1))
 
 
@@ -266,7 +313,9 @@ def _numbers(text: str, key: str) -> list[int]:
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:
-        raise LogError(f"header '{key}' is '{text}'; expected whole numbers with commas between") from None
+        raise LogError(
+            f"header '{key}' is '{text}'; expected whole numbers with commas between"
+        ) from None
 
 
 def _int(header: dict[str, str], key: str, default: int = 0) -> int:
