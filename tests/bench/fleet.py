@@ -5,8 +5,7 @@ Errors are in units of the rope: metres at a rope of ``fleet.rope_length``, what
 is.
 
     python -m tests.bench.fleet any any_vision --device cuda
-    python -m tests.bench.fleet any --rivals 20 --minutes 10 --device cuda    # goes on where it
-    stopped
+    python -m tests.bench.fleet any --rivals 20 --minutes 10 --device cuda  # resumes
 """
 
 import argparse

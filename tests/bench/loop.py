@@ -7,10 +7,13 @@ policies meet on the same throws of the plant: the one that knew nothing, the on
 anew in the model extended by the diagnosis, and the oracle, trained in a model that has the hidden
 effect itself.
 
-    python -m tests.bench.loop --hide motor_tau=0.02     a slower motor; minutes on a GPU, hours on
-    a CPU python -m tests.bench.loop --base state_no_motor_lag --policy
-    runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1 python -m tests.bench.loop --show
-    the committed loops python -m tests.bench.loop --show runs/loop/* --picture loops.png
+    python -m tests.bench.loop --hide motor_tau=0.02
+        a slower motor; minutes on a GPU, hours on a CPU
+    python -m tests.bench.loop --base state_no_motor_lag \\
+        --policy runs/state_no_motor_lag-1/policy.npz --hide motor_lag=1
+    python -m tests.bench.loop --show
+        the committed loops
+    python -m tests.bench.loop --show runs/loop/* --picture loops.png
 """
 
 import argparse

@@ -1,9 +1,10 @@
 """What optimised excitation is worth on flights: the optimised manoeuvre beside the best fixed one,
 flown as long, effects hidden.
 
-    python -m tests.diagnose.planned [--seed 1] [--steps 6]            a throw's vehicle, on an
-    independent plant python -m tests.diagnose.planned --setup cf_payload                a setup's,
-    on the training simulator
+    python -m tests.diagnose.planned [--seed 1] [--steps 6]
+        a throw's vehicle, on an independent plant
+    python -m tests.diagnose.planned --setup cf_payload
+        a setup's, on the training simulator
 
 From hovers without hidden effects the next flight is planned for some effects. Then one after the
 other is hidden at 10 floors, both manoeuvres are flown twice beside the hovers, and the search is

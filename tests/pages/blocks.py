@@ -4,11 +4,12 @@ A fence is run by its language: ``sh`` a line at a time, ``python`` as one progr
 with a ``title="NAME"`` becomes the file of that name beside the commands. ``text`` is what a
 command printed. Comments in front of a fence, unseen by a reader, say more:
 
-    <!-- run with: --throws 2 -->            these arguments are added to each visthrow command of
-    the block, to make it cheaper <!-- run train with: --iterations 1 -->  the same for one command
-    alone <!-- terminals -->                       each line is a process of its own, all at once
-    <!-- not run: a GPU -->                  not run, for one of :data:`REASONS`; its visthrow
-    commands are parsed all the same
+    <!-- run with: --throws 2 -->
+        these arguments are added to each visthrow command of the block, to make it cheaper
+    <!-- run train with: --iterations 1 -->  the same for one command alone
+    <!-- terminals -->                       each line is a process of its own, all at once
+    <!-- not run: a GPU -->
+        not run, for one of :data:`REASONS`; its visthrow commands are parsed all the same
 
 The blocks of a page run in order in a folder of the page's own that looks like the root of a clone.
 What another page has run already, with the same arguments and files, is not run again: what it

@@ -1,9 +1,9 @@
 """Landings of throws through the firmware, predicted open loop: by the training's vehicle, by the
 firmware's settings, by what was named.
 
-    visthrow diagnose explain out/firmware/10*/... --plant out/doc.toml --out out/explain      # of
-    other throws python -m tests.sitl.landings out/firmware/11* --diagnosis
-    out/explain/diagnosis.json
+    visthrow diagnose explain out/firmware/10*/... --plant out/doc.toml --out out/explain
+        # of other throws
+    python -m tests.sitl.landings out/firmware/11* --diagnosis out/explain/diagnosis.json
 
 Each folder is a throw of `tests.sitl.direct`, with its run and its blackbox. The settings are those
 in the first blackbox's header, with the hover's share of throttle and the commands' delay; nothing

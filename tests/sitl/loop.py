@@ -1,8 +1,10 @@
 """The loop closed on Betaflight's firmware: throws before, what the diagnosis found, throws after.
 
-    python -m tests.sitl.loop                                                             # the
-    committed record python tests/sitl/alone.py python -m tests.sitl.loop --name after
-    # and again python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision
+    python -m tests.sitl.loop
+        # the committed record
+    python tests/sitl/alone.py python -m tests.sitl.loop --name after
+        # and again
+    python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision
 
 Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1
 mm and 0.2 deg of noise at 100 Hz, and the same throws on our own block with the policy's own

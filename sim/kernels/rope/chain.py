@@ -1,6 +1,6 @@
-"""Rope and payload as a chain of slender rods below the vehicle:
+"""Rope and payload as a chain of slender rods below the vehicle.
 
-O(n) recursion with 3x3 matrices, linearly implicit.
+The recursion is O(n), with 3x3 matrices, and linearly implicit.
 
 A slender rod on a frictionless universal joint passes a force and no moment. Seen from its upper
 joint, everything below rod i therefore asks for a force ``A a + b`` (A: symmetric apparent mass, a:
@@ -9,8 +9,10 @@ dn/dt``, length l, mass m, centre of mass c along n, transverse inertia J about 
 external force f at its centre, joint couples tau, and ``A, b`` of what hangs at its end, with
 ``dn'/dt = beta - |u|^2 n``:
 
-    (J I + l^2 P A P) beta = P [g - B a],   B = c m I + l A,   g = c f - l b + l^2 |u|^2 A n + tau x
-    n A' = m I + A - B Q B,   b' = b - f - |u|^2 B n + B Q g
+    (J I + l^2 P A P) beta = P [g - B a],
+        B = c m I + l A,
+        g = c f - l b + l^2 |u|^2 A n + tau x n
+    A' = m I + A - B Q B,   b' = b - f - |u|^2 B n + B Q g
 
 where Q is the inverse of the left matrix in the plane normal to n. Each rod is solved in a tangent
 basis (e1, e2) of n: with ``b_k = B e_k`` and the 2x2 inverse q, ``c_k = sum_j q_kj b_j`` gives ``B

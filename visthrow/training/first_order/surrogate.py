@@ -5,11 +5,14 @@ The simulator flies; every value below is the simulator's own, and the surrogate
 derivative at that point. With the response ``y = (thrust, body rates)``, commands u, vehicle p, v,
 R, payload q, s and the control period dt:
 
-    y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c         per channel: controller, motors and
-    queue R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2) f      = kappa F z - R diag(drag) R^T v
-    F, z: mean thrust and mean body z of the step T      = mu (-a n.f / M + b |u_perp|^2 / l)
-    u = s - v; n, l: of the rope as a taut, massless rod v[k+1] = v + dt (f / M + g + T n / M),
-    s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
+    y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c
+    R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2)
+    f      = kappa F z - R diag(drag) R^T v
+    T      = mu (-a n.f / M + b |u_perp|^2 / l)
+    v[k+1] = v + dt (f / M + g + T n / M),  s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
+
+The first line holds for each channel: controller, motors and queue. F and z are mean thrust and
+mean body z of the step, u = s - v, n and l are those of the rope as a taut, massless rod,
 
 and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the
 simulator under random commands by linear least squares;
