@@ -1,8 +1,8 @@
 """Where the wall time of a training goes: in an iteration, or to an error over seeds.
 
-    python -m tests.bench.train state --device cuda
-        simulation, environment, inference and learning
-    python -m tests.bench.train laptop --until 0.06 0.04  seconds of whole trainings to these errors
+python -m tests.bench.train state --device cuda
+    simulation, environment, inference and learning
+python -m tests.bench.train laptop --until 0.06 0.04  seconds of whole trainings to these errors
 """
 
 import argparse
