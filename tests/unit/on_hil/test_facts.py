@@ -28,5 +28,5 @@ def test_a_row_without_a_line_is_found():
 
 def test_values_are_those_of_the_rows():
     assert values("crazyflie")["levels_after"] == facts("crazyflie")["levels_after"].value == 0.5
-    with pytest.raises(ConfigError, match="no facts of firmware 'crazyfly'; .*crazyflie"):
+    with pytest.raises(ConfigError, match=r"no facts of firmware 'crazyfly'; .*crazyflie"):
         facts("crazyfly")
