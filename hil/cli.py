@@ -32,7 +32,7 @@ ACTIONS = {
         ),
     ),
     "fake": (
-        "simulated:fake",
+        "rehearsal.fake_command:fake",
         "a fake autopilot with the simulator's vehicle, to throw over the wire",
     ),
 }
@@ -202,7 +202,7 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
         ("fake",),
         "--option",
         "KEY=VALUE",
-        "of hil.fakes.Options: silent_after=12, command_delay=0.03, parameters.GUID_OPTIONS=0, ...",
+        "of hil.rehearsal.fake.Options: silent_after=12, parameters.GUID_OPTIONS=0, ...",
         OVERRIDES,
     ),
     (("fake",), "--out", "FILE", "write the report here", {}),

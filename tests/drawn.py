@@ -1,5 +1,5 @@
-"""A small renderer of fisheye frames in torch, written before `camera.detectors.scenes` and without
-it: one ray a pixel, no noise.
+"""A small renderer of fisheye frames in torch, which shares no code with
+`visthrow.detector_training.scenes`: one ray a pixel, no noise.
 
 Ground plane z = 0 with a chequered texture, goal square, ball.
 """

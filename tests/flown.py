@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 
+from bench.worlds.pilot import FreeFlight, Throw, Tracker
 from sim.effects.effect import apply
 from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
 from tests.plants import EVERYTHING, paper_plant
-from tests.worlds.pilot import FreeFlight, Throw, Tracker
 from visthrow.config.effects import chosen
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.throws.plants import flown

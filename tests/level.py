@@ -16,7 +16,7 @@ MOST_KEPT = 10_000
 
 
 class LevelPlant:
-    """See `hil.fakes.base.WirePlant`.
+    """See `hil.rehearsal.fake.WirePlant`.
 
     Attributes:
         released: when the release came [s]. commands: all that it was told, the last ones of a long
@@ -66,5 +66,5 @@ class LevelPlant:
 
 
 def make(policy: str, seed: int) -> LevelPlant:
-    """The plant, for any policy and seed; see `hil.fakes.process.load_plant`."""
+    """The plant, for any policy and seed; see `hil.rehearsal.process.load_plant`."""
     return LevelPlant()

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.fakes import process
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from hil.rehearsal import process
 from visthrow import cli
 from visthrow.common.errors import suggest
 

@@ -184,7 +184,7 @@ def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):
 
 
 def test_releases_are_those_of_the_throws_and_a_rod_does_not_bow():
-    from tests.bench.releases import releases, row
+    from bench.releases import releases, row
 
     loaded = load_policy("state")
     found = releases(loaded, 2.0, 6, "cpu", 0)

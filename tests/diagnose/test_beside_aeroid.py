@@ -4,7 +4,7 @@ nobody gave.
 
 import pytest
 
-from tests.diagnose import beside_aeroid as beside
+from bench.diagnose import beside_aeroid as beside
 
 pytestmark = pytest.mark.slow
 

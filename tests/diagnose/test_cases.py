@@ -9,11 +9,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from tests.diagnose import altered, cases
-from tests.diagnose.bad import BAD
-from tests.diagnose.degenerate import PAIRS
-from tests.worlds.follow import ALONE, follow, table_of
-from tests.worlds.world import Recipe
+from bench.diagnose import altered, cases
+from bench.diagnose.bad import BAD
+from bench.diagnose.degenerate import PAIRS
+from bench.worlds.follow import ALONE, follow, table_of
+from bench.worlds.world import Recipe
 from visthrow.diagnose.planning.manoeuvres import catalogue
 from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
 from visthrow.diagnose.throw.recorded import carriers, record_of

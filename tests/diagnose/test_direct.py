@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from bench.diagnose.sealed import flight_log
+from bench.worlds.camera import CENTRE, FOCAL, HALF_VIEW, marks
+from bench.worlds.numbers import hide
+from bench.worlds.turns import matrix
+from bench.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
 from camera.keypoints import KeypointCamera, keypoints
 from sim.effects.setting import Setting
-from tests.diagnose.sealed import flight_log
-from tests.worlds.camera import CENTRE, FOCAL, HALF_VIEW, marks
-from tests.worlds.numbers import hide
-from tests.worlds.turns import matrix
-from tests.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
 from visthrow import config
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.throw.cutting import cut

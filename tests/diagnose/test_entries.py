@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.diagnose.sealed import flight_log, model_of
-from tests.worlds.world import Recipe, fly_recipe, recorded
+from bench.diagnose.sealed import flight_log, model_of
+from bench.worlds.world import Recipe, fly_recipe, recorded
 from visthrow import config
 from visthrow.diagnose.reporting import gain
 from visthrow.diagnose.select import search

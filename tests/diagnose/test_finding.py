@@ -1,4 +1,4 @@
-"""What is hidden must be found: the tool passes the suite of :mod:`tests.diagnose.finding`, and
+"""What is hidden must be found: the tool passes the suite of :mod:`bench.diagnose.finding`, and
 four spoilt tools do not.
 """
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.diagnose import finding
+from bench.diagnose import finding
 from visthrow.config.effects import catalogue
 
 SPOILT = {

@@ -5,7 +5,7 @@ answers are judged as they should be.
 import numpy as np
 import pytest
 
-from tests.diagnose import foreign
+from bench.diagnose import foreign
 from visthrow.diagnose.models.flyer import FlyerModel
 
 NOISE = 2e-4 * np.sqrt(2.0)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.diagnose import ledger, sealed
-from tests.diagnose.sealed import NOT_WAITED
-from tests.worlds.world import ALL_FLOORS, FLOORS, ONE_SIDED, dust_of, world_of
+from bench.diagnose import ledger, sealed
+from bench.diagnose.sealed import NOT_WAITED
+from bench.worlds.world import ALL_FLOORS, FLOORS, ONE_SIDED, dust_of, world_of
 
 TRUTH = math.exp((math.log(9.0) + 6.0) / 3.5)
 """Size of the made-up curve at 90 %."""
@@ -170,8 +170,11 @@ def test_limits_stand_in_the_unit_in_which_they_are_asked_for_and_worlds_with_a_
     assert (tmp_path / "completeness.png").stat().st_size > 10_000
 
 
+LEDGERS = Path(ledger.__file__).parent
 SHIPPED = {
-    name: [json.loads(line) for line in (Path(__file__).parent / name).read_text().splitlines()]
+    name: [
+        json.loads(line) for line in (Path(ledger.__file__).parent / name).read_text().splitlines()
+    ]
     for name in ("ledger.jsonl", "ledger-earlier.jsonl")
 }
 PAGE = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis_trust.md").read_text()

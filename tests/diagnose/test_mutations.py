@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.diagnose import sealed, test_cases
+from bench.diagnose import sealed
+from bench.worlds.world import Recipe
+from tests.diagnose import test_cases
 from tests.unit.on_diagnose import test_report as reports
 from tests.unit.on_diagnose import test_search as searches
-from tests.worlds.world import Recipe
 from visthrow.diagnose.likelihood import designs, evidence, marginal, noise
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select import held_out, selector
@@ -132,7 +133,7 @@ def test_the_tool_cannot_ask_the_tests(tmp_path):
     import sys
 
     spoiled = sealed.WITHOUT_TESTS.replace(
-        "from visthrow.cli import main", "import tests.worlds.world\nmain = lambda _: 0"
+        "from visthrow.cli import main", "import bench.worlds.world\nmain = lambda _: 0"
     )
     done = subprocess.run(
         [sys.executable, "-c", spoiled],

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.diagnose import foreign, small
+from bench.diagnose.flown import ball_log, fly
 from sim.params import LawParams
-from tests.diagnose import foreign, small
-from tests.diagnose.flown import ball_log, fly
 from tests.unit.on_diagnose.test_models import BALL, FLYER
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError

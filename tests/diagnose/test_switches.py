@@ -5,8 +5,8 @@ fit and a transient.
 import numpy as np
 import pytest
 
-from tests.diagnose.sealed import flight_log, model_of
-from tests.worlds.world import Recipe, fly_recipe, recorded
+from bench.diagnose.sealed import flight_log, model_of
+from bench.worlds.world import Recipe, fly_recipe, recorded
 from visthrow import config
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.worlds.fly import fly
+from bench.worlds.numbers import nominal
+from bench.worlds.pilot import Throw, Tracker
+from bench.worlds.world import Recipe, draw, fly_recipe, recorded
 from sim.hybrid import HybridSim
 from tests.plants import paper_plant
-from tests.worlds.fly import fly
-from tests.worlds.numbers import nominal
-from tests.worlds.pilot import Throw, Tracker
-from tests.worlds.world import Recipe, draw, fly_recipe, recorded
 
-WORLDS = Path(__file__).resolve().parents[1] / "worlds"
+WORLDS = Path(__file__).resolve().parents[2] / "bench" / "worlds"
 PACKAGES = {"sim", "camera", "visthrow", "hil"}
 AGREEMENT = {
     "rod": 1e-5,  # the same equations for one rod, solved otherwise; RK4 at 0.5 ms
@@ -46,8 +46,8 @@ def imported(source: str) -> set[str]:
 def test_the_worlds_share_no_code_with_the_package():
     for path in WORLDS.glob("*.py"):
         assert not imported(path.read_text()) & PACKAGES, path.name
-        inside = {line for line in path.read_text().splitlines() if line.startswith("from tests.")}
-        assert all(line.startswith("from tests.worlds") for line in inside), path.name
+        inside = {line for line in path.read_text().splitlines() if line.startswith("from bench.")}
+        assert all(line.startswith("from bench.worlds") for line in inside), path.name
 
 
 def test_the_check_of_imports_finds_one():

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hil.errors import RunError
-from hil.fakes.ardupilot import FakeArduPilot
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.mocap import MocapParams
-from hil.fakes.process import load_plant
 from hil.links.backends.ardupilot import GUIDED, LAND_MODE, ArduPilot
 from hil.links.mavlink_link import Link, attitude_target
 from hil.params import HilParams
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_ardupilot import FakeArduPilot
+from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import load_plant
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe, throw

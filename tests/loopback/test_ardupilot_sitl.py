@@ -12,13 +12,13 @@ import threading
 import numpy as np
 import pytest
 
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl import ardupilot
-from hil.fakes.sitl.ardupilot import ArduPilotSitl, outputs
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
+from hil.rehearsal.bridges import ardupilot_bridge as ardupilot
+from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl, outputs
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_mocap import MocapParams
 from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 

@@ -8,13 +8,10 @@ import sys
 import numpy as np
 import pytest
 
+from bench.processes import free_port
 from hil.control.loop import Loop
 from hil.control.runner import Runner
 from hil.errors import LinkError
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.crazyflie import FakeCrazyflie
-from hil.fakes.mocap import MocapParams
-from hil.fakes.process import AnsweringPort
 from hil.links import crtp
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
@@ -23,7 +20,10 @@ from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.poses.sources.opening import open_source
-from tests.bench.processes import free_port
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_crazyflie import FakeCrazyflie
+from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import AnsweringPort
 from tests.hil_flight import AutoOperator
 from tests.sitl.direct import FlightClock
 from visthrow import config

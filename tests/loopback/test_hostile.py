@@ -12,9 +12,9 @@ import time
 import numpy as np
 import pytest
 
+from bench.processes import free_port
 from hil.links.backends.base import FAILED
 from hil.links.pymav import Signed, mav
-from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant

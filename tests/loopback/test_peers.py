@@ -8,6 +8,7 @@ import socket
 
 import pytest
 
+from bench.processes import free_port
 from hil.links.backends import make_backend
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
@@ -17,7 +18,6 @@ from hil.links.roster import SILENT
 from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.opening import open_source
-from tests.bench.processes import free_port
 from tests.hil_runs import record_run, saved_policy
 from visthrow import config
 from visthrow.cli import main

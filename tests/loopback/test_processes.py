@@ -246,7 +246,7 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
 
 
 def test_sigterm_in_mid_throw(tmp_path, never):
-    """What systemd, `timeout` and a shutdown send; `tests.bench.runner --faults` flies the others,
+    """What systemd, `timeout` and a shutdown send; `bench.runner --faults` flies the others,
     in hover and with each kind. Signed.
     """
     key = tmp_path / "key"

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl.sih import Px4Sih
+from bench.processes import free_port
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.params import HilParams
-from hil.simulated import make_ball
-from tests.bench.processes import free_port
+from hil.rehearsal.bridges.px4_bridge import Px4Sih
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_command import make_ball
+from hil.rehearsal.fake_mocap import MocapParams
 from visthrow import config
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

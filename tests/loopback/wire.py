@@ -7,15 +7,15 @@ from collections import deque
 
 from hil.control.loop import Loop
 from hil.control.runner import Runner
-from hil.fakes.base import VEHICLE_ID, Fake, Options
-from hil.fakes.mocap import MocapParams
-from hil.fakes.process import make_fake
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.betaflight import Betaflight
 from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.opening import parties
+from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
+from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import make_fake
 from tests.hil_flight import AutoOperator
 from tests.mocap_faults import MocapFault
 from visthrow import config

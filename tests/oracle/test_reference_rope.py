@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tests.bench.mujoco_c import timed_scene
+from bench.mujoco_c import timed_scene
 from tests.oracle.bare_rope import BareScene
 from tests.oracle.converged import converged
 from tests.oracle.start import hinges_from_directions, matrix_from_quat

@@ -26,18 +26,18 @@ from hil.control.recording.record import Recorder
 from hil.control.recording.report import throw_path
 from hil.control.runner import Runner
 from hil.control.states import State
-from hil.fakes.base import VEHICLE_ID, Fake, Options
-from hil.fakes.mocap import SLACK, MocapParams
-from hil.fakes.process import load_plant
-from hil.fakes.sitl.betaflight import BetaflightSitl, MotorPlant
-from hil.fakes.sitl.firmware import Firmware, needed
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.device import Device, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.poses.sources.base import Source
 from hil.poses.sources.opening import open_source
-from hil.simulated import MOTORS
+from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl, MotorPlant
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
+from hil.rehearsal.fake_command import MOTORS
+from hil.rehearsal.fake_mocap import SLACK, MocapParams
+from hil.rehearsal.process import load_plant
 from tests.hil_flight import AutoOperator
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy

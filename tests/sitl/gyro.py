@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl.betaflight import SAMPLE
-from hil.fakes.sitl.firmware import Firmware, needed
 from hil.params import HilParams
+from hil.rehearsal.bridges.betaflight_bridge import SAMPLE
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.fake_mocap import MocapParams
 from tests.sitl.direct import SETTINGS, throw
 from tests.sitl.landings import BASE, DELAY
 from tests.sitl.test_betaflight import program

@@ -4,7 +4,7 @@ block fitted to them, the rest.
     python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --seconds 36
 
 Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that
-were not fitted, by the shipped block and by the fitted one. ``python -m tests.bench.direct --plant
+were not fitted, by the shipped block and by the fitted one. ``python -m bench.direct --plant
 tests.sitl.identify:make_fitted`` throws with the fitted vehicle. ``doublets.npz`` is the flight as
 motion capture and runner see it: `diagnose explain` takes it with the firmware's blackbox. Commands
 wait as in a throw."""
@@ -19,10 +19,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from hil.fakes.mocap import SLACK, Mocap, MocapParams
 from hil.links.backends.base import Held
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD
+from hil.rehearsal.fake_mocap import SLACK, Mocap, MocapParams
 from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, VehicleParams

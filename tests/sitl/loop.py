@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.fakes.mocap import MocapParams
+from bench.direct import Direct
 from hil.params import HilParams
-from tests.bench.direct import Direct
+from hil.rehearsal.fake_mocap import MocapParams
 from tests.sitl.direct import throw
 from tests.sitl.test_betaflight import program
 from visthrow import config

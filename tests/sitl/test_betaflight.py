@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.mocap import MocapParams
-from hil.fakes.sitl.betaflight import BetaflightSitl
-from hil.fakes.sitl.firmware import Firmware, needed
 from hil.links.backends.base import FOLLOW
 from hil.links.backends.betaflight import Betaflight
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
+from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_mocap import MocapParams
 from tests.loopback import test_endings as endings
 from tests.sitl.direct import opened, throw
 from visthrow import config

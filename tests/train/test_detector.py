@@ -10,16 +10,16 @@ import torch
 
 from camera.detectors.contours import Known
 from camera.detectors.learnt import Networks
-from camera.detectors.scenes.scene import Nuisances, Truth
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from sim.params import RopeParams
 from visthrow import cli, config
-from visthrow.cli import detector
+from visthrow.detector_training import detector_command as detector
+from visthrow.detector_training.eyes import HANGING, Eyes
+from visthrow.detector_training.scenes.scene import Nuisances, Truth
 from visthrow.throws.flight import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
 from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, place_in_hover
-from visthrow.view.eyes import HANGING, Eyes
 
 SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
 NEAR = {"contours": 0.01, "learnt": 0.015}

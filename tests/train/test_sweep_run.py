@@ -12,9 +12,9 @@ import time
 import numpy as np
 import pytest
 
-from visthrow.evidence.sweep.record import collect, status
-from visthrow.evidence.sweep.units import load_list
 from visthrow.onboard.policy import Policy
+from visthrow.paper.sweep.sweep_record import collect, status
+from visthrow.paper.sweep.work_units import load_list
 from visthrow.throws import results
 
 LIST = """
@@ -149,8 +149,8 @@ def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
     iteration.
     """
     pytest.importorskip("submitit")
-    from visthrow.evidence.sweep import pool
-    from visthrow.evidence.sweep.cluster import Cluster
+    from visthrow.paper.sweep import pool
+    from visthrow.paper.sweep.cluster import Cluster
 
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(pool, "BUSY_PAUSE", 0.1)

@@ -26,12 +26,12 @@ COMMANDS = {
     ),
     "detector": (
         "train the keypoint detector on rendered frames, and check it",
-        "visthrow.cli.detector",
+        "visthrow.detector_training.detector_command",
     ),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
     "baseline": (
         "throw with trajectory optimisation and MPC; its front against the policies",
-        "visthrow.cli.baseline",
+        "visthrow.paper.commands.baseline_command",
     ),
     "diagnose": (
         "say what the simulation gets wrong, from measured flights",
@@ -39,22 +39,25 @@ COMMANDS = {
     ),
     "sweep": (
         "work a list of training runs and throws, on several GPUs or a cluster",
-        "visthrow.cli.sweep",
+        "visthrow.paper.commands.sweep_command",
     ),
     "report": (
         "write one page with the paper's tables and figures beside ours",
-        "visthrow.cli.report",
+        "visthrow.paper.commands.report_command",
     ),
     "camera": (
         "make a camera configuration from a calibration, check it, look at what it sees",
         "visthrow.cli.camera",
     ),
-    "bench": ("print what was measured, with command, commit and machine", "visthrow.cli.bench"),
+    "bench": (
+        "print what was measured, with command, commit and machine",
+        "visthrow.paper.commands.bench_command",
+    ),
     "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
 }
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
-_EXTRAS = {"submitit": "slurm", "mujoco": "reference", "piqp": "baseline"}
+_EXTRAS = {"submitit": "slurm", "mujoco": "reference", "piqp": "paper"}
 """Optional packages by import name, and the extra of visthrow that installs them."""
 
 _DESCRIPTION = """\

@@ -3,19 +3,19 @@ durations.
 """
 
 import argparse
-import importlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from visthrow.baseline import NAME
 from visthrow.common.arguments import add_common, add_conditions, add_out
 from visthrow.common.errors import ConfigError
+from visthrow.common.extras import load_extra
 from visthrow.common.storage import writable
 from visthrow.common.workers import status
 from visthrow.onboard.shipped import find_policy
 from visthrow.throws.results import Entry
 
+BASELINE = "baseline"  # trajectory optimisation and MPC, beside the policies
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
 
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         return _from_runs(args)
     check(args.targets, args.throws)
     for name in args.policies or ():
-        if name != NAME:
+        if name != BASELINE:
             find_policy(name)  # said before anything heavy is imported
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import known_plant
@@ -97,11 +97,13 @@ def run(args: argparse.Namespace) -> int:
     loaded = [
         load_policy(name, args.config, args.overrides, args.allow)
         for name in wanted
-        if name != NAME
+        if name != BASELINE
     ]
     writable(Path(args.out))
-    if NAME in wanted:
-        importlib.import_module("piqp")  # said here rather than after all policies have thrown
+    if BASELINE in wanted:  # an error comes before the policies throw
+        rival = load_extra(
+            "visthrow.paper.baseline.rival", "paper", f"the policy '{BASELINE}'", ConfigError
+        )
     if not loaded:
         throws = []
     elif args.plant == "hybrid":
@@ -114,8 +116,8 @@ def run(args: argparse.Namespace) -> int:
         with Throwing(loaded, args.targets, args.throws, args.plant, args.seed) as throwing:
             throws = throwing.results()
     entries = entries_of(loaded, unique_names(loaded), throws)
-    if NAME in wanted:
-        entries += throw_baseline(args)
+    if BASELINE in wanted:
+        entries += rival.throw_baseline(args)
     departures = {item.name: item.departures for item in loaded if item.departures}
     notes = [
         f"; {name} flown with {', '.join(f'{key} = {value!r}' for key, value in of.items())},"
@@ -175,42 +177,6 @@ def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence
     """Entries of learnt policies."""
     layouts = (item.policy.contract["observation"]["layout"] for item in loaded)
     return [Entry(*parts) for parts in zip(names, layouts, throws)]
-
-
-def throw_baseline(args: argparse.Namespace) -> list[Entry]:
-    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each
-    compensation.
-    """
-    import tempfile
-
-    from visthrow.baseline import thrower
-    from visthrow.task.measurement import Throws
-    from visthrow.throws.reference_protocol import FIELDS
-
-    rows, how = (
-        thrower.rows([args.plant]),
-        {
-            "config_name": args.config or "state",
-            "overrides": args.overrides,
-        },
-    )
-    sets = [
-        thrower.units(*row, target, args.throws, args.seed, **how)
-        for row in rows
-        for target in args.targets
-    ]
-    with tempfile.TemporaryDirectory() as folder:
-        found = thrower.flown(sets, folder, status)
-    status("")
-    throws = [
-        Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in found
-    ]
-    each = len(args.targets)
-    layouts = ("TO+MPC" if plant == thrower.OWN else "" for plant, _ in rows)
-    return [
-        Entry(thrower.title_of(*row), layout, throws[i * each : (i + 1) * each])
-        for i, (row, layout) in enumerate(zip(rows, layouts))
-    ]
 
 
 def check(targets: Sequence[float], throws: int) -> None:

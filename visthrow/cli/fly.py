@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     find_policy(args.policy)  # said before anything heavy is imported
     from visthrow.common.errors import ConfigError
+    from visthrow.common.extras import load_extra
     from visthrow.common.storage import writable, write_json
     from visthrow.logs.export import FORMATS
     from visthrow.throws.loading import load_policy
@@ -96,13 +97,14 @@ def run(args: argparse.Namespace) -> int:
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
     eyes, rope = None, loaded.experiment.rope
     if args.pixels is not None:
-        from visthrow.view.eyes import Eyes
-
+        rendered = load_extra(
+            "visthrow.detector_training.eyes", "detector", "--pixels", ConfigError
+        )
         if loaded.policy.contract["observation"]["layout"] != "vision":
             raise ConfigError(
                 f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
             )
-        eyes = Eyes(
+        eyes = rendered.Eyes(
             loaded.experiment.camera,
             rope.mount,
             rope.length + rope.payload_offset,

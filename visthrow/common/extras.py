@@ -7,14 +7,15 @@ from visthrow.common.errors import VisthrowError
 
 
 def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -> ModuleType:
-    """Import a package of an optional extra, which ``what`` needs.
+    """Import a module that needs an optional extra, for ``what``.
 
-    Raises VisthrowError: of the type ``error``: it is not installed; the message names the extra.
+    Raises VisthrowError: of the type ``error``: a package is not installed; the message names it
+    and the extra.
     """
     try:
         return importlib.import_module(module)
-    except ModuleNotFoundError:
-        package = module.partition(".")[0]
+    except ModuleNotFoundError as missing:
+        package = (missing.name or module).partition(".")[0]
         raise error(
             f"{what} needs the package '{package}'; install it with: pip install"
             f" 'visthrow[{extra}]'"

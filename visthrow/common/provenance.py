@@ -59,7 +59,7 @@ def commit() -> str:
 def command() -> str:
     """Return the command line as a shell takes it, with absolute folders left out:
 
-    ``visthrow train``, ``python -m tests.bench.train``.
+    ``visthrow train``, ``python -m bench.train``.
     """
     program, *words = (_FOLDERS.sub("", argument) for argument in sys.argv)
     module = getattr(sys.modules["__main__"], "__spec__", None)

@@ -8,7 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot
 from visthrow.training import terminations
 
-if TYPE_CHECKING:
-    from visthrow.view.eyes import Eyes
-
 FALL_TIME = 1.5
 """Longest flight after separation that is waited for [s]."""
 
@@ -30,6 +27,29 @@ LOOK_EVERY = 8
 
 VIEWS = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
 """What a policy is shown of a vehicle."""
+
+
+class Sight(Protocol):
+    """A camera and a detector on each of E vehicles: keypoints from pictures.
+
+    Attributes:
+        seen: keypoints and validity of the last picture, (E, 8, 2) and (E, 8).
+    """
+
+    seen: tuple[np.ndarray, np.ndarray] | None
+
+    def look(
+        self, now: Snapshot, measured: Snapshot, goal_w: np.ndarray, carried: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Take a picture on each vehicle and return ``seen``.
+
+        Args:
+            now: true states. measured: states that the detector knows attitude and height of.
+            goal_w: goals [m], shape (E, 3), world frame. carried: whether a payload hangs, (E,).
+        """
+
+    def lost(self) -> dict[int, str]:
+        """Return vehicle -> "ball" or "goal", whichever the hover's pictures did not show."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +108,7 @@ class Policies(Pilots):
         goal_w: np.ndarray,
         goal_vel_w: np.ndarray | None = None,
         draws: bool = False,
-        eyes: "Eyes | None" = None,
+        eyes: Sight | None = None,
     ) -> None:
         """Begin with policies that were trained for one plant; goals as of `Pilots`.
 

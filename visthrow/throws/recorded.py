@@ -3,7 +3,7 @@ by.
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,13 +11,10 @@ from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog, FlightRecorder
-from visthrow.throws.flight import Decision, Flight, Phase, Policies, Recorder
+from visthrow.throws.flight import Decision, Flight, Phase, Policies, Recorder, Sight
 from visthrow.throws.loading import Loaded
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes
-
-if TYPE_CHECKING:
-    from visthrow.view.eyes import Eyes
 
 START_SPREAD = 0.10  # of the start about the hover point [m]
 START_SWING = 0.05  # of the rope at the start [rad]
@@ -134,7 +131,7 @@ def fly(
     plant_name: str = "hybrid",
     seed: int = 0,
     device: str = "cpu",
-    eyes: "Eyes | None" = None,
+    eyes: Sight | None = None,
 ) -> FlightLog:
     """Hover until the swing is quiet, throw, and hover again at the start.
 

@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,13 +19,10 @@ from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers, progress
 from visthrow.task import Experiment, plant_of
 from visthrow.task.measurement import Throws, pilots_hover
-from visthrow.throws.flight import Decision, Flight, Policies, Scores, hover, throw
+from visthrow.throws.flight import Decision, Flight, Policies, Scores, Sight, hover, throw
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
 from visthrow.training.device import cores
-
-if TYPE_CHECKING:
-    from visthrow.view.eyes import Eyes
 
 BATCH = 100  # throws that share one plant: about 12 s of one core a batch and 1 s a throw
 
@@ -73,7 +69,7 @@ def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generato
 
 
 def fly_batch(
-    loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: "Eyes | None" = None
+    loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: Sight | None = None
 ) -> dict[str, np.ndarray]:
     """Fly one batch of policies that are trained for one plant, on the rendered pictures of
     ``eyes`` where there are any.

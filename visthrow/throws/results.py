@@ -27,9 +27,6 @@ PROTOCOL = (
     1  # goes up when the same unit would come out otherwise: an older result is then no longer used
 )
 
-RECORDS = Path(__file__).resolve().parents[1] / "evidence" / "records"
-"""Committed records: ``throws`` (packed results), ``training`` (runs), ``findings`` (text)."""
-
 DIGITS = 4  # after the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by
 
 
@@ -139,7 +136,7 @@ def policy_unit(
 
 def columns_of(throws: Any) -> dict[str, np.ndarray]:
     """Per-throw arrays of a dataclass of throws (:class:`visthrow.task.measurement.Throws`,
-    :class:`visthrow.baseline.fly.Flown`).
+    :class:`visthrow.paper.baseline.fly_plan.Flown`).
     """
     count = len(throws.success)
     found = {

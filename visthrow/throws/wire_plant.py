@@ -1,5 +1,5 @@
-"""The training simulator's vehicle for the fake autopilot (`hil.fakes.process`), which takes its
-plant from outside.
+"""The training simulator's vehicle for the fake autopilot (`hil.rehearsal.process`), which takes
+its plant from outside.
 
 ``hil`` imports no simulator; it is given ``"visthrow.throws.wire_plant:make"``.
 """

@@ -3,7 +3,7 @@
 A row names the value, the file and line (``at``) that it was read from, some words of that line
 (``text``), and what it means. ``version`` is the tag of the source, ``repository`` where it is
 published; a row of another version names its own. Back-ends, rehearsal vehicles, audits and pages
-read values from here alone. ``python -m tests.bench.facts`` compares the rows with a checkout.
+read values from here alone. ``python -m bench.facts`` compares the rows with a checkout.
 """
 
 import tomllib

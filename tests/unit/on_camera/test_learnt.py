@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.fit import FitParams, Labels, offsets, other_lens, platt, search_loss
 from camera.detectors.learnt import (
     CELL,
     KINDS,
@@ -22,6 +21,14 @@ from camera.detectors.learnt import (
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
 from visthrow import config
+from visthrow.detector_training.fit_detector import (
+    FitParams,
+    Labels,
+    offsets,
+    other_lens,
+    platt,
+    search_loss,
+)
 
 LENS = Fisheye(FisheyeParams(320, 320, 80.0, 80.0, 159.5, 159.5, k1=0.01, fov_deg=200.0))
 NORTH = torch.tensor([[0.0, -1.0, 0.0]])

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.scenes.renderer import Renderer
-from camera.detectors.scenes.scene import Nuisances, posed_scenes, random_scenes, truth_of
-from camera.detectors.scenes.textures import photographs, pyramid
 from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 from tests.drawn import render_scene
+from visthrow.detector_training.scenes.renderer import Renderer
+from visthrow.detector_training.scenes.scene import Nuisances, posed_scenes, random_scenes, truth_of
+from visthrow.detector_training.scenes.textures import photographs, pyramid
 
 pytest.importorskip("skimage", reason="photographs of visthrow[detector]")
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from tests.diagnose.altered import with_values
-from tests.diagnose.cases import logs_of
-from tests.worlds.world import Recipe
+from bench.diagnose.altered import with_values
+from bench.diagnose.cases import logs_of
+from bench.worlds.world import Recipe
 from visthrow import cli
 from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import FlightLog

@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from tests.diagnose import beside_aeroid
-from tests.diagnose.flown import LATE, G, attitude, ball_log, fly
+from bench.diagnose import beside_aeroid
+from bench.diagnose.flown import LATE, G, attitude, ball_log, fly
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hil.errors import LinkError, RunError
-from hil.fakes.base import Options, Witness
-from hil.fakes.process import ListeningPort, make_fake
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
+from hil.rehearsal.fake import Options, Witness
+from hil.rehearsal.process import ListeningPort, make_fake
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe
 from visthrow import config

@@ -13,18 +13,20 @@ import numpy as np
 import pytest
 
 from hil.errors import RunError
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.mocap import MocapParams
-from hil.fakes.process import ListeningPort
-from hil.fakes.sitl import betaflight, firmware, packets
-from hil.fakes.sitl.betaflight import BetaflightSitl
-from hil.fakes.sitl.firmware import Firmware, needed
 from hil.links import msp
 from hil.links.backends.base import FOLLOW
 from hil.links.backends.betaflight import BOX_ARM, HIGH, LOW, Betaflight
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
+from hil.rehearsal.bridges import betaflight_bridge as betaflight
+from hil.rehearsal.bridges import betaflight_firmware as firmware
+from hil.rehearsal.bridges import packets
+from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import ListeningPort
 from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.processes import free_port
 from hil.errors import LinkError
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, attitude_target, pose_from_message, quaternion_from_euler
@@ -20,7 +21,6 @@ from hil.links.roster import Roster
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.poses.sources.opening import open_source
-from tests.bench.processes import free_port
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from visthrow import config
 

@@ -7,11 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
+from bench.processes import free_port
 from hil.control.recording.record import Recorder, lines, load_run
 from hil.control.runner import OperatorInput, Runner
 from hil.errors import RunError
 from hil.links.backends.base import Status
-from tests.bench.processes import free_port
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main
 from visthrow.common.errors import StorageError

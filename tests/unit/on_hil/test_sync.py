@@ -5,13 +5,13 @@ of another clock.
 import numpy as np
 import pytest
 
-from hil.fakes.ardupilot import FakeArduPilot
-from hil.fakes.base import VEHICLE_ID, Options
-from hil.fakes.mocap import MocapParams
 from hil.links.clock import TimeSync
 from hil.links.mavlink_link import LATE, Link, LinkSync
 from hil.links.pymav import mav
 from hil.poses.sources.mavlink import BodyIds, MavlinkSource
+from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake_ardupilot import FakeArduPilot
+from hil.rehearsal.fake_mocap import MocapParams
 from tests.level import LevelPlant
 from tests.loopback.wire import HERE, pipe
 

@@ -46,15 +46,12 @@ def test_record_is_complete_and_free_of_names(monkeypatch):
 
 def test_a_command_is_one_that_a_shell_takes(monkeypatch):
     main = types.ModuleType("__main__")
-    main.__spec__ = types.SimpleNamespace(name="tests.bench.train")
+    main.__spec__ = types.SimpleNamespace(name="bench.train")
     monkeypatch.setitem(sys.modules, "__main__", main)
     monkeypatch.setattr(
-        sys, "argv", ["/root/tests/bench/train.py", "state", "--set", 'algorithm="first_order"']
+        sys, "argv", ["/root/bench/train.py", "state", "--set", 'algorithm="first_order"']
     )
-    assert (
-        provenance.command()
-        == "python -m tests.bench.train state --set 'algorithm=\"first_order\"'"
-    )
+    assert provenance.command() == "python -m bench.train state --set 'algorithm=\"first_order\"'"
     main.__spec__.name = "visthrow.cli.__main__"
     monkeypatch.setattr(sys, "argv", ["/root/visthrow/cli/__main__.py", "demo"])
     assert provenance.command() == "python -m visthrow.cli demo"

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from tests.bench.processes import side_by_side
+from bench.processes import side_by_side
 from visthrow.common.errors import VisthrowError
 from visthrow.common.workers import Workers, done, progress
 

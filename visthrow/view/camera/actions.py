@@ -25,6 +25,7 @@ from camera.params import CameraParams, FisheyeParams
 from camera.rectify import ViewParams, rectify
 from visthrow import config
 from visthrow.common.errors import ConfigError
+from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write
 from visthrow.view.camera import BOARD
 
@@ -234,16 +235,9 @@ def show(args: argparse.Namespace) -> int:
 
 
 def _rendered(params: CameraParams, *places: torch.Tensor) -> np.ndarray:
-    """Frame of a grey hall with vehicle, ball and goal square at position, attitude, and positions
-    of both, BGR, uint8.
-    """
-    from camera.detectors.scenes.renderer import Renderer
-    from camera.detectors.scenes.scene import posed_scenes
-
-    scenes = posed_scenes(params, *(place[None] for place in places), torch.tensor([True]))
-    return np.ascontiguousarray(
-        Renderer(params.fisheye, files=[], samples=SAMPLES).render(scenes)[0].numpy()[..., ::-1]
-    )
+    """Render a grey hall with vehicle, ball and goal square; BGR, uint8, shape (H, W, 3)."""
+    eyes = load_extra("visthrow.detector_training.eyes", "detector", "a picture", ConfigError)
+    return eyes.render_hall(params, *places, samples=SAMPLES)
 
 
 def _draw_board(

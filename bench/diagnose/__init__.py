@@ -1,0 +1,1 @@
+"""Measurements of the diagnosis on flights whose truth is hidden from it."""

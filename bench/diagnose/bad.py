@@ -1,0 +1,249 @@
+"""Logs that are wrong: a verdict without a name, or an error that says what; kinds of
+:mod:`bench.diagnose.cases`.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.diagnose.altered import later, scrambled, with_values
+from bench.diagnose.cases import command_for, environment, logs_of
+from bench.diagnose.sealed import WITHOUT_TESTS
+from bench.worlds.world import Recipe
+from visthrow.diagnose.reporting.explain_cli import REFUSED
+from visthrow.logs.flightlog import Channel, FlightLog
+
+Logs = list[FlightLog]
+HOURS = 2.0
+GRAVITY, MASS, DRAG = 9.81, 0.21, 0.06
+"""[m/s^2]; of configs/vehicle/paper.toml: [kg], rotor drag [kg/s]."""
+WANDER = 0.15
+"""Of a hover, to either side [m]."""
+FULL_THRUST = 14.0
+"""What the configured controller calls full: four times ``max_thrust`` of configs/vehicle [N]."""
+
+
+def each(change: Callable[[FlightLog], FlightLog]) -> Callable[[Logs], Logs]:
+    """The same change to all logs."""
+    return lambda logs: [change(log) for log in logs]
+
+
+def values(**changes) -> Callable[[Logs], Logs]:
+    """Channels' values changed in all logs."""
+    return each(lambda log: with_values(log, changes))
+
+
+def cut(log: FlightLog, count: int) -> FlightLog:
+    """The first samples of every channel."""
+    return FlightLog(
+        {
+            n: replace(c, time=c.time[:count], values=c.values[:count], valid=c.valid[:count])
+            for n, c in log.channels.items()
+        },
+        {},
+    )
+
+
+def exchanged(log: FlightLog) -> FlightLog:
+    """Vehicle and payload taken for each other."""
+    channels = dict(log.channels)
+    channels["pos_w"], channels["payload_pos_w"] = channels["payload_pos_w"], channels["pos_w"]
+    return FlightLog(channels, {})
+
+
+def late_commands(log: FlightLog) -> FlightLog:
+    """Commands stamped half a second late."""
+    moved = later(FlightLog({n: log[n] for n in ("command", "release_command")}, {}), 0.5)
+    return FlightLog(dict(log.channels) | moved.channels, {})
+
+
+def frozen(log: FlightLog) -> FlightLog:
+    """A tracking system that stops in the middle of the flight."""
+
+    def hold(x: np.ndarray) -> np.ndarray:
+        half = len(x) // 2
+        return np.concatenate((x[:half], np.repeat(x[half : half + 1], len(x) - half, axis=0)))
+
+    return with_values(log, {"pos_w": hold, "quat_wb": hold, "payload_pos_w": hold})
+
+
+def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
+    """A vehicle that does not move, for so long: noise about one place, one command."""
+    rng = np.random.default_rng(1)
+    t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
+    turn = 5e-4 * rng.standard_normal((len(t), 3))
+    command = np.column_stack((np.full(len(sent), thrust), np.zeros((len(sent), 3))))
+    place = np.array([0.0, 0.0, height])
+    return FlightLog(
+        {
+            "pos_w": Channel(t, place + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
+            "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
+            "command": Channel(sent, command, "N, rad/s", "body"),
+        },
+        {},
+    )
+
+
+def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
+    """A hover that is never quite still, for so long: paths, attitudes and commands of a vehicle
+    whose blades do not flap.
+    """
+    rng = np.random.default_rng(1)
+    t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
+    speed, phase = (
+        np.array([0.31, 0.47]),
+        np.array([0.3, 1.1]),
+    )  # of the wander along x and y [rad/s], [rad]
+
+    def lean(time: np.ndarray, rate: bool = False) -> np.ndarray:
+        """Lean along x and y that the wander and the rotors' drag take, or its rate."""
+        angle = speed * time[:, None] + phase + (0.5 * np.pi if rate else 0.0)
+        push = (
+            WANDER
+            * speed
+            * (DRAG * np.cos(angle) - MASS * speed * np.sin(angle))
+            / (MASS * GRAVITY)
+        )
+        return speed * push if rate else push
+
+    x, y = lean(t).T
+    turn = 0.5 * np.column_stack((-y, x, np.zeros(len(t)))) + 2.5e-4 * rng.standard_normal(
+        (len(t), 3)
+    )
+    path = np.column_stack((WANDER * np.sin(speed * t[:, None] + phase), np.full(len(t), 1.5)))
+    rate_x, rate_y = lean(sent, rate=True).T
+    thrust = MASS * GRAVITY * (1.0 + 0.5 * np.sum(lean(sent) ** 2, axis=1))
+    return FlightLog(
+        {
+            "pos_w": Channel(t, path + 5e-4 * rng.standard_normal((len(t), 3)), "m", "world"),
+            "quat_wb": Channel(t, np.column_stack((turn, np.ones(len(t)))), "1", "world"),
+            "command": Channel(
+                sent,
+                np.column_stack((thrust, -rate_y, rate_x, np.zeros(len(sent)))),
+                "N, rad/s",
+                "body",
+            ),
+        },
+        {},
+    )
+
+
+def without(name: str) -> Callable[[Logs], Logs]:
+    """A channel that was not recorded."""
+    return each(lambda log: FlightLog({n: c for n, c in log.channels.items() if n != name}, {}))
+
+
+@dataclass(frozen=True)
+class Bad:
+    """One way in which logs can be wrong."""
+
+    spoil: Callable[[Logs], Logs]
+    cut_to: float = 1.0  # share of each file's bytes that is left
+    flown: bool = True  # whether it needs a world's flights
+    right: frozenset[str] = frozenset()  # effects that the logs really ask for
+
+    def run(self, recipe: Recipe, folder: Path) -> dict:
+        """Fly a world without effect, spoil its logs, ask."""
+        logs = self.spoil(logs_of(recipe) if self.flown else [])
+        place = Path(tempfile.mkdtemp(dir=folder))
+        for i, log in enumerate(logs):
+            path = place / f"flight_{i:02d}.npz"
+            log.save(path)
+            path.write_bytes(path.read_bytes()[: int(self.cut_to * path.stat().st_size)])
+        done = subprocess.run(
+            [sys.executable, "-c", WITHOUT_TESTS, *command_for(len(logs), recipe)],
+            cwd=place,
+            capture_output=True,
+            text=True,
+            timeout=1500.0,
+            env=environment(),
+            check=False,
+        )
+        answer = place / "said.json"
+        verdict = (
+            json.loads(answer.read_text())
+            if answer.exists()
+            else {"overall": "ERROR", "findings": []}
+        )
+        return {
+            "passed": fair(done, verdict, self.right),
+            "said": verdict,
+            "output": (done.stdout + done.stderr)[-600:],
+        }
+
+
+def fair(
+    done: subprocess.CompletedProcess, verdict: dict, right: frozenset[str] = frozenset()
+) -> bool:
+    """No traceback, no name that is not right; and either a verdict or an error of one sentence."""
+    if "Traceback" in done.stderr or set(verdict.get("theta") or {}) - right:
+        return False
+    return (
+        done.returncode == 2 and bool(done.stderr.strip())
+        if verdict["overall"] == "ERROR"
+        else done.returncode in (0, REFUSED)
+    )
+
+
+def doubled(logs: Logs) -> Logs:
+    """Every flight twice."""
+    return [*logs, *[later(log, 1000.0) for log in logs]]
+
+
+def as_they_are(logs: Logs) -> Logs:
+    """Unchanged."""
+    return logs
+
+
+def command_values(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Logs], Logs]:
+    """Commands changed in all logs."""
+    return values(command=change)
+
+
+def standing(_: Sequence[FlightLog]) -> Logs:
+    """On the floor for half a minute, motors idle."""
+    return [still(30.0, 0.3, 0.05)] * 2
+
+
+def hours(_: Sequence[FlightLog]) -> Logs:
+    """One hover of two hours."""
+    return [wandering(3600.0 * HOURS)]
+
+
+def hours_still(_: Sequence[FlightLog]) -> Logs:
+    """One vehicle that stays in its place to the millimetre for two hours."""
+    return [still(3600.0 * HOURS, 2.07, 1.5)]
+
+
+BAD = {
+    "millimetres": Bad(values(pos_w=lambda p: 1e3 * p, payload_pos_w=lambda p: 1e3 * p)),
+    "degrees": Bad(command_values(lambda u: u * [1.0, 57.3, 57.3, 57.3])),
+    "grams": Bad(command_values(lambda u: u * [101.97, 1.0, 1.0, 1.0])),
+    "share_of_thrust": Bad(command_values(lambda u: u * [1.0 / FULL_THRUST, 1.0, 1.0, 1.0])),
+    "roll_for_pitch": Bad(command_values(lambda u: u[:, [0, 2, 1, 3]])),
+    "pitch_reversed": Bad(command_values(lambda u: u * [1.0, 1.0, -1.0, 1.0])),
+    "east_for_north": Bad(
+        values(pos_w=lambda p: p[:, [1, 0, 2]], payload_pos_w=lambda p: p[:, [1, 0, 2]])
+    ),
+    "scalar_first": Bad(values(quat_wb=lambda q: q[:, [3, 0, 1, 2]])),
+    "world_to_body": Bad(values(quat_wb=lambda q: q * [-1.0, -1.0, -1.0, 1.0])),
+    "bodies_exchanged": Bad(each(exchanged)),
+    "late_commands": Bad(each(late_commands)),
+    "frozen": Bad(each(frozen)),
+    "copied": Bad(doubled),
+    "mixed_up": Bad(scrambled),
+    "three_samples": Bad(each(lambda log: cut(log, 3))),
+    "no_commands": Bad(without("command")),
+    "no_attitude": Bad(without("quat_wb")),
+    "truncated": Bad(as_they_are, cut_to=0.6),
+    "empty_files": Bad(as_they_are, cut_to=0.0),
+    "standing": Bad(standing, flown=False),
+    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping"})),
+    "two_hours_still": Bad(hours_still, flown=False),
+}

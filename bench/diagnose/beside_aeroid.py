@@ -1,0 +1,190 @@
+"""The diagnosis beside ``aeroid`` (PyPI, MIT), an output-error estimator for parameters that its
+user names.
+
+Both get the same throws of a ball under motion capture and the same names: drag and wind. Then the
+names are taken away, which leaves the diagnosis alone. Worlds come from scipy's integrator; noise
+is white, or correlated over 30 ms as a tracker's filter leaves it.
+
+    pip install -c constraints.txt "visthrow[beside]"
+    python -m bench.diagnose.beside_aeroid 10 --out bench/diagnose/beside-aeroid.json
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from bench.worlds.world import sensor_noise
+from visthrow.diagnose.inputs import fit as fitting
+from visthrow.diagnose.models.ball import BallModel, BallParams
+from visthrow.diagnose.select import search
+from visthrow.logs.flightlog import Channel, FlightLog
+
+NAMES = ("ball_drag", "wind_x", "wind_y")
+COLOURS = ("", "coloured")
+GRAVITY, RATE, SECONDS, THROWS, SIGMA = 9.81, 200.0, 0.7, 4, 5e-4
+REST = 60  # samples after which a log's ball lies still
+ASSUMED = BallParams(GRAVITY, 0.0, 0.0, 0.3)
+
+
+def world(seed: int) -> tuple[dict[str, float], np.ndarray, np.ndarray]:
+    """Truth, stamps, and paths of all throws, shape (THROWS, T, 3)."""
+    rng = np.random.default_rng(seed)
+    truth = {
+        "ball_drag": float(rng.uniform(0.03, 0.12)),
+        **{name: float(rng.uniform(-0.6, 0.6)) for name in NAMES[1:]},
+    }
+    stamps, paths = np.arange(0.0, SECONDS, 1.0 / RATE), []
+    for heading in rng.uniform(0.0, 2.0 * np.pi, THROWS):
+        speed = rng.uniform(3.0, 6.0)
+        start = [0.0, 0.0, 1.5, speed * np.cos(heading), speed * np.sin(heading), 2.5]
+        path = solve_ivp(
+            lambda _, x: slope(x, truth),
+            (0.0, SECONDS),
+            start,
+            t_eval=stamps,
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        paths.append(path.y[:3].T)
+    return truth, stamps, np.array(paths)
+
+
+def slope(state: np.ndarray, size: dict[str, float]) -> np.ndarray:
+    """Derivative of positions and velocities of balls, shape (..., 6)."""
+    vel = state[3:]
+    air = vel - np.array([size["wind_x"], size["wind_y"], 0.0])
+    return np.append(vel, -size["ball_drag"] * np.sqrt(air @ air) * air - [0.0, 0.0, GRAVITY])
+
+
+def by_aeroid(stamps: np.ndarray, seen: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Estimates and standard errors; what each throw began with is estimated beside the
+    parameters.
+    """
+    import aeroid
+
+    states = [f"{what}{axis}{i}" for i in range(THROWS) for what in ("p", "v") for axis in "xyz"]
+    places = [name for name in states if name.startswith("p")]
+    starts = []
+    for path in seen:
+        line = np.polynomial.polynomial.polyfit(stamps, path, 3)
+        starts += [*line[0], *line[1]]
+    begin = {f"start_{name}": float(value) for name, value in zip(states, starts)}
+
+    def dynamics(_, moved, __, p):
+        full = moved + np.array([p[f"start_{name}"] for name in states])
+        return np.concatenate([slope(full[6 * i : 6 * i + 6], p) for i in range(THROWS)])
+
+    def measured(_, moved, __, p):
+        return [moved[states.index(name)] + p[f"start_{name}"] for name in places]
+
+    guess = {"ball_drag": 0.05, "wind_x": 0.1, "wind_y": 0.1}
+    model = aeroid.Model(
+        states, [], {**guess, **begin}, dynamics, outputs=places, measurement=measured
+    )
+    columns = np.moveaxis(seen, 0, 1).reshape(len(stamps), -1)
+    data = aeroid.FlightData(stamps, dict(zip(places, columns.T)))
+    found = aeroid.identify(model, data, [*NAMES, *begin], x0=np.zeros(len(states)))
+    return {name: (found.parameters[name], found.stderr[name]) for name in NAMES}
+
+
+def model_of(stamps: np.ndarray, seen: np.ndarray) -> BallModel:
+    """The diagnosis' model of the same throws, cut where they fall."""
+    rest = stamps[-1] + np.arange(1, REST) / RATE
+    still = [np.concatenate([path, np.tile(path[-1], (len(rest), 1))]) for path in seen]
+    time = np.append(stamps, rest)
+    return BallModel(
+        [FlightLog({"payload_pos_w": Channel(time, path, "m", "world")}) for path in still], ASSUMED
+    )
+
+
+def by_fit(stamps: np.ndarray, seen: np.ndarray) -> dict[str, tuple[float, float]]:
+    """The same of the diagnosis' estimator, whose names are given."""
+    found = fitting.fit(model_of(stamps, seen), NAMES)
+    return {
+        name: (float(found.theta[i]), float(np.sqrt(found.covariance[i, i])))
+        for i, name in enumerate(NAMES)
+    }
+
+
+def compared(seed: int, colour: str) -> dict:
+    """One world: errors and standard errors of both, seconds, and what the diagnosis says without
+    names.
+    """
+    truth, stamps, paths = world(seed)
+    rng = np.random.default_rng([seed, 1])
+    seen = paths + SIGMA * np.array([sensor_noise(rng, colour, path.shape) for path in paths])
+    line = {"seed": seed, "noise": colour or "white", "truth": truth}
+    for who, ask in (("aeroid", by_aeroid), ("fit", by_fit)):
+        begin = time.perf_counter()
+        found = ask(stamps, seen)
+        line[who] = {
+            name: {"error": value - truth[name], "sd": sd} for name, (value, sd) in found.items()
+        }
+        line[f"{who}_s"] = time.perf_counter() - begin
+    begin = time.perf_counter()
+    verdict = search.explain(model_of(stamps, seen), laws=False)
+    line |= {
+        "explain_s": time.perf_counter() - begin,
+        "overall": verdict.overall,
+        "named": sorted(verdict.theta),
+    }
+    told = {f.name: f for f in verdict.findings if f.verdict in ("FOUND", "CLASS", "CANDIDATE")}
+    line["verdicts"] = {name: f.verdict for name, f in told.items()}
+    line["explain"] = {
+        name: {"error": told[name].estimate - truth[name], "sd": told[name].sd}
+        for name in NAMES
+        if name in told
+    }
+    return line
+
+
+def summary(lines: list[dict]) -> dict:
+    """By noise and estimator: root mean square error of each name, share of 95 % intervals that
+    hold the truth, seconds.
+    """
+    out: dict = {}
+    for noise in sorted({line["noise"] for line in lines}):
+        own = [line for line in lines if line["noise"] == noise]
+        for who in ("aeroid", "fit"):
+            found = [line[who][name] for line in own for name in NAMES]
+            out[f"{noise}: {who}"] = {
+                "worlds": len(own),
+                "rms": {
+                    name: float(np.sqrt(np.mean([line[who][name]["error"] ** 2 for line in own])))
+                    for name in NAMES
+                },
+                "held": f"{sum(abs(f['error']) < 1.96 * f['sd'] for f in found)} of {len(found)}",
+                "seconds": float(np.median([line[f"{who}_s"] for line in own])),
+            }
+        sizes = [found for line in own for found in line["explain"].values()]
+        out[f"{noise}: explain"] = {
+            "worlds": len(own),
+            "known": sum(line["overall"] == "KNOWN" for line in own),
+            "wrong names": sum(bool(set(line["named"]) - set(NAMES)) for line in own),
+            "named": {name: sum(name in line["explain"] for line in own) for name in NAMES},
+            "held": f"{sum(abs(f['error']) < 1.96 * f['sd'] for f in sizes)} of {len(sizes)}",
+            "seconds": float(np.median([line["explain_s"] for line in own])),
+        }
+    return out
+
+
+def main() -> None:
+    """Compare in so many worlds of each noise."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("worlds", type=int)
+    parser.add_argument("--seed", type=int, default=240000001)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    lines = [compared(args.seed + i, colour) for i in range(args.worlds) for colour in COLOURS]
+    args.out.write_text(
+        json.dumps({"seed": args.seed, "summary": summary(lines), "worlds": lines}, indent=1) + "\n"
+    )
+    print(json.dumps(summary(lines), indent=1))
+
+
+if __name__ == "__main__":
+    main()

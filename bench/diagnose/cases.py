@@ -1,0 +1,444 @@
+"""Cases whose right answer follows from another answer: symmetries of sealed worlds, mixed-up logs,
+the model altered.
+
+    python -m bench.diagnose.cases mirror=10 swap=10 idempotence=10 scramble=10 --jobs 8 --ledger
+    cases.jsonl
+
+Each case is a world of its own, on a plant that shares no code with the package; the tool runs
+apart, as in :mod:`bench.diagnose.sealed`."""
+
+import argparse
+import json
+import multiprocessing as mp
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench.diagnose import altered
+from bench.diagnose.sealed import ALIKE, WITHOUT_TESTS, _alone, flight_log, model_of, named_by
+from bench.worlds.world import FLOORS, ONE_SIDED, PLANTS, Recipe, fly_recipe, recorded
+from visthrow.diagnose.reporting.explain_cli import REFUSED
+from visthrow.logs.flightlog import FlightLog
+
+SIZE = dict(free=4, free_seconds=6.0, throws=6)
+"""Flights of a case: fewer than those of the bank, since each is explained twice."""
+NEAR = 4.0
+"""Deviations within which two answers to one question must lie."""
+BASE = "train/state.toml"
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds the package wherever it runs."""
+    root = Path(__file__).resolve().parents[2]
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
+    }
+
+
+def command_for(
+    count: int, recipe: Recipe, action: str = "explain", plant: str | None = None
+) -> list[str]:
+    """Arguments that ask about so many logs of a folder, with the model that is the
+    world's null.
+    """
+    command = [
+        "diagnose",
+        action,
+        *[f"flight_{i:02d}.npz" for i in range(count)],
+        "--device",
+        "cpu",
+        "--json",
+        "said.json",
+    ]
+    command += [
+        "--out",
+        "out",
+        *(["--no-report"] if action == "explain" else []),
+        *(["--plant", plant] if plant else []),
+    ]
+    for item in model_of(recipe):
+        command += ["--set", item]
+    return command
+
+
+def tool(folder: Path, *arguments: str, timeout: float = 1500.0) -> str:
+    """Run ``visthrow`` apart, in a folder, without access to the tests; its output.
+
+    Raises:
+        RuntimeError: It failed.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TESTS, *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        env=environment(),
+        check=False,
+    )
+    if done.returncode not in (0, REFUSED):
+        raise RuntimeError(
+            f"visthrow {' '.join(arguments)} ended with"
+            f" {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}"
+        )
+    return done.stdout
+
+
+def explained(
+    folder: Path,
+    logs: Sequence[FlightLog],
+    recipe: Recipe,
+    plant: str | None = None,
+    action: str = "explain",
+    more: Sequence[str] = (),
+) -> dict:
+    """The tool's JSON about logs.
+
+    Args:
+        folder: to work in; gets a folder of logs.
+        logs: of the flights.
+        recipe: of the world, for the model that is its null.
+        plant: a configuration file on top of which that is done; None for the shipped one.
+        action: ``explain`` or ``plan``.
+        more: arguments; a plan's JSON gets the references' text under ``tables``, by file.
+    """
+    place = Path(tempfile.mkdtemp(dir=folder))
+    for i, log in enumerate(logs):
+        log.save(place / f"flight_{i:02d}.npz")
+    tool(place, *command_for(len(logs), recipe, action, plant), *more)
+    said = json.loads((place / "said.json").read_text())
+    return said | {"tables": {path.name: path.read_text() for path in place.glob("out/*.csv")}}
+
+
+def names(verdict: dict) -> set[str]:
+    """Names of the sizes that a verdict sets."""
+    return set(verdict.get("theta") or {})
+
+
+def is_right(verdict: dict, name: str) -> bool:
+    """One cause named: this one, alone or in a class that holds it, or one that flights of this
+    kind hardly tell from it.
+    """
+    groups = named_by(verdict)
+    near = {name}.union(*(a for a in ALIKE if name in a))
+    return len(groups) == 1 and bool(groups[0] & near)
+
+
+def size_is(verdict: dict, name: str, size: float) -> bool:
+    """Whether a named effect has this size within its deviation; true where another of its class
+    was named.
+    """
+    found = [
+        f for f in verdict["findings"] if f["name"] == name and f["verdict"] in ("FOUND", "CLASS")
+    ]
+    return all(abs(f["estimate"] - size) < NEAR * max(f["sd"], f["floor"]) for f in found)
+
+
+def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: theta) -> bool:
+    """Whether two verdicts name the same effects with the same sizes, and say the same overall."""
+    expected, came = sizes(one.get("theta") or {}), other.get("theta") or {}
+    sd = {f["name"]: max(f["sd"], f["floor"]) for f in other["findings"]}
+    return (
+        one["overall"] == other["overall"]
+        and set(expected) == set(came)
+        and all(abs(came[name] - size) < sd[name] for name, size in expected.items())
+    )
+
+
+def configured(theta: dict[str, float], path: Path) -> str:
+    """Write the configuration in which the model has these effects; the path as text."""
+    from visthrow import config
+    from visthrow.diagnose.extend import patch
+    from visthrow.task import Experiment
+
+    experiment = config.load(Experiment, config.find("train", "state"))
+    zero = [[0.0] * len(theta) for _ in theta]
+    path.write_text(patch.text(BASE, experiment, theta, zero, 1, ()))
+    return str(path)
+
+
+def logs_of(recipe: Recipe) -> list[FlightLog]:
+    """Fly a world."""
+    return [flight_log(record) for record in recorded(recipe, fly_recipe(recipe))]
+
+
+def hidden(recipe: Recipe) -> tuple[str, float]:
+    """The one effect of a world."""
+    return next(iter(recipe.effects.items()))
+
+
+def _bare(recipe: Recipe) -> Recipe:
+    return Recipe(**{**asdict(recipe), "effects": {}, "floors": 0.0})
+
+
+def mirror(recipe: Recipe, folder: Path) -> dict:
+    """The world is nominal and the model has what the recipe says: the opposite correction."""
+    name, size = hidden(recipe)
+    verdict = explained(
+        folder, logs_of(_bare(recipe)), recipe, configured(recipe.effects, folder / "model.toml")
+    )
+    return {"passed": is_right(verdict, name) and size_is(verdict, name, -size), "said": verdict}
+
+
+def swap(recipe: Recipe, folder: Path) -> dict:
+    """The effect is in both: nothing to be found."""
+    verdict = explained(
+        folder, logs_of(recipe), recipe, configured(recipe.effects, folder / "model.toml")
+    )
+    return {"passed": verdict["overall"] == "NO EFFECT", "said": verdict}
+
+
+def idempotence(recipe: Recipe, folder: Path) -> dict:
+    """Found, put into the configuration by ``apply``, and not found again."""
+    logs = logs_of(recipe)
+    first = explained(folder, logs, recipe)
+    (folder / "first.json").write_text(json.dumps(first))
+    tool(folder, "diagnose", "apply", "first.json", "--out", "extended.toml", "--plants", "1")
+    again = (
+        explained(folder, logs, recipe, str(folder / "extended.toml")) if names(first) else first
+    )
+    return {
+        "passed": bool(names(first)) and again["overall"] == "NO EFFECT",
+        "said": again,
+        "before": first,
+    }
+
+
+def scramble(recipe: Recipe, folder: Path) -> dict:
+    """Commands of one flight with poses of another: no name."""
+    verdict = explained(folder, altered.scrambled(logs_of(recipe)), recipe)
+    return {
+        "passed": (
+            not names(verdict) and verdict["overall"] in ("DATA INCONSISTENT", "OUT OF DOMAIN")
+        ),
+        "said": verdict,
+    }
+
+
+def flip(recipe: Recipe, _: Path) -> dict:
+    """Residuals of every other flight turned around: what is common to all flights is gone."""
+    from visthrow import config
+    from visthrow.diagnose.reporting import report
+    from visthrow.diagnose.select import search
+    from visthrow.diagnose.throw.throw_model import ThrowModel
+    from visthrow.task import Experiment, plant_of
+
+    experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))
+    model = ThrowModel(logs_of(recipe), plant_of(experiment))
+    verdict = report.to_json(search.explain(altered.Flipped(model, recipe.seed)))
+    return {"passed": not names(verdict), "said": verdict}
+
+
+def _twice(
+    recipe: Recipe,
+    folder: Path,
+    change: Callable[[list[FlightLog]], list[FlightLog]],
+    sizes=lambda theta: theta,
+) -> dict:
+    logs = logs_of(recipe)
+    first, second = explained(folder, logs, recipe), explained(folder, change(logs), recipe)
+    found = any(
+        is_right(first, name) for name in recipe.effects
+    )  # what is missed here must be missed alike
+    return {"passed": same(first, second, sizes), "found": found, "said": second, "before": first}
+
+
+def turn(recipe: Recipe, folder: Path) -> dict:
+    """Hall turned by a quarter and moved: the wind turns along, all else stays."""
+
+    def sizes(theta):
+        quarter = {"wind_x": ("wind_y", 1.0), "wind_y": ("wind_x", -1.0)}
+        quarter |= {
+            name.replace("wind", "frame_tilt"): (to.replace("wind", "frame_tilt"), s)
+            for name, (to, s) in quarter.items()
+        }
+        return {
+            quarter.get(n, (n, 1))[0]: quarter.get(n, (n, 1))[1] * size for n, size in theta.items()
+        }
+
+    return _twice(
+        recipe,
+        folder,
+        lambda logs: [altered.turned(log, 0.5 * np.pi, (2.0, -1.0, 0.0)) for log in logs],
+        sizes,
+    )
+
+
+def leftright(recipe: Recipe, folder: Path) -> dict:
+    """The flights seen in a mirror: the verdict seen in a mirror."""
+    return _twice(
+        recipe, folder, lambda logs: [altered.mirrored(log) for log in logs], altered.mirrored_theta
+    )
+
+
+def permute(recipe: Recipe, folder: Path) -> dict:
+    """Flights in another order."""
+    order = np.random.default_rng(recipe.seed).permutation(recipe.free + recipe.throws)
+    return _twice(recipe, folder, lambda logs: [logs[i] for i in order])
+
+
+def shift(recipe: Recipe, folder: Path) -> dict:
+    """All clocks of each flight set forward, each by its own time."""
+    return _twice(
+        recipe,
+        folder,
+        lambda logs: [altered.later(log, 1234.5 + 77.7 * i) for i, log in enumerate(logs)],
+    )
+
+
+def copy(recipe: Recipe, folder: Path) -> dict:
+    """A flight handed over twice, its clock set forward, counts once."""
+    out = _twice(recipe, folder, lambda logs: [*logs, altered.later(logs[-1], 50.0)])
+    sd = [
+        {f["name"]: f["sd"] for f in verdict["findings"]}
+        for verdict in (out["before"], out["said"])
+    ]
+    alike = all(
+        abs(sd[1][name] / sd[0][name] - 1.0) < 0.02 for name in names(out["said"]) if name in sd[0]
+    )
+    copied = out["said"].get("duplicates")
+    return out | {"passed": bool(out["passed"] and alike and copied), "copied": copied}
+
+
+KINDS = {
+    f.__name__: f
+    for f in (mirror, swap, idempotence, scramble, flip, turn, leftright, permute, shift, copy)
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A case to be run."""
+
+    kind: str
+    recipe: Recipe
+    until: float
+
+
+def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
+    """World of a case: an effect and a plant from a seed; nothing where logs are spoiled, in a pair
+    what belongs to it.
+    """
+    from bench.diagnose.bad import BAD
+    from bench.diagnose.degenerate import PAIRS
+
+    rng = np.random.default_rng(seed)
+    if kind == "scramble" or kind in BAD:
+        return Recipe(seed, str(rng.choice(PLANTS)), **SIZE)
+    if kind in PAIRS:
+        pair = PAIRS[kind]
+        return Recipe(
+            seed,
+            str(rng.choice(("rod", "string"))),
+            {pair.effect: pair.size * float(rng.choice(pair.signs))},
+            **SIZE,
+        )
+    name = str(rng.choice(list(FLOORS)))
+    sign = 1.0 if name in ONE_SIDED else float(rng.choice([-1.0, 1.0]))
+    return Recipe(
+        seed, str(rng.choice(PLANTS)), {name: sign * floors * FLOORS[name]}, floors, **SIZE
+    )
+
+
+def brief(verdict: dict) -> dict:
+    """What a ledger keeps of a verdict."""
+    found = [f for f in verdict["findings"] if f["verdict"] in ("FOUND", "CLASS")]
+    keep = ("name", "verdict", "estimate", "sd", "partners")
+    return {
+        "overall": verdict["overall"],
+        "reasons": verdict.get("reasons"),
+        "theta": verdict.get("theta"),
+        "findings": [{k: f[k] for k in keep} for f in found],
+        "seconds": verdict.get("seconds"),
+    }
+
+
+def run_case(task: Task) -> dict | None:
+    """One case: a line of the ledger; None where it is too late to begin."""
+    if time.time() > task.until:
+        return None
+    begin = time.perf_counter()
+    line = {"kind": task.kind, "recipe": asdict(task.recipe), "truth_sha256": task.recipe.digest()}
+    try:
+        with tempfile.TemporaryDirectory() as name:
+            line |= run_kind(task.kind)(task.recipe, Path(name))
+    except Exception:  # a case that fails is a line of the ledger that says how
+        line |= {"passed": False, "error": traceback.format_exc()[-2000:]}
+    line |= {key: brief(line[key]) for key in ("said", "before") if key in line}
+    return line | {"seconds": round(time.perf_counter() - begin, 1)}
+
+
+def run_kind(kind: str) -> Callable[[Recipe, Path], dict]:
+    """The function of a kind of case."""
+    from bench.diagnose.bad import BAD
+    from bench.diagnose.degenerate import PAIRS
+
+    return KINDS[kind] if kind in KINDS else {**PAIRS, **BAD}[kind].run
+
+
+def main() -> None:
+    """Run cases and add them to a ledger; cases that are there are not run again."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("cases", nargs="+", metavar="KIND=COUNT", help=f"of {', '.join(KINDS)}")
+    parser.add_argument(
+        "--seed", type=int, help="of the first; drawn by the system where not given"
+    )
+    parser.add_argument("--ledger", type=Path, default=Path("cases.jsonl"))
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument(
+        "--slot",
+        type=int,
+        default=0,
+        help="which of the machine's cores the first job takes (default: 0)",
+    )
+    parser.add_argument("--minutes", type=float, default=1e6, help="begin no case later than this")
+    args = parser.parse_args()
+    first = int.from_bytes(os.urandom(4), "little") if args.seed is None else args.seed
+    print(f"first seed {first}", flush=True)
+    until = time.time() + 60.0 * args.minutes
+    tasks = []
+    for k, (kind, count) in enumerate(item.split("=") for item in args.cases):
+        tasks += [
+            (i, Task(kind, draw(kind, first + 10_000 * k + 10 * i), until))
+            for i in range(int(count))
+        ]
+    done = set()
+    if args.ledger.exists():
+        done = {
+            (line["kind"], line["truth_sha256"])
+            for line in map(json.loads, args.ledger.read_text().splitlines())
+        }
+    tasks = [
+        task for _, task in sorted(tasks, key=lambda item: item[0])
+    ]  # one of each kind before the second of any
+    tasks = [task for task in tasks if (task.kind, task.recipe.digest()) not in done]
+    tally: dict[str, Counter] = {}
+    context = mp.get_context("spawn")
+    with context.Pool(args.jobs, _alone, (context.Value("i", args.slot),)) as pool:
+        for line in pool.imap_unordered(run_case, tasks):
+            if line is None:
+                continue
+            with args.ledger.open("a") as out:
+                out.write(json.dumps(line) + "\n")
+            tally.setdefault(line["kind"], Counter()).update(
+                ["cases"] + ["passed"] * bool(line["passed"])
+            )
+            said = line.get("said", {})
+            told = said.get("overall"), said.get("theta"), line["seconds"], line.get("error", "")
+            world = line["recipe"]["plant"], line["recipe"]["effects"]
+            print("ok  " if line["passed"] else "FAIL", line["kind"], *world, *told, flush=True)
+    for kind, count in tally.items():
+        print(f"{kind}: {count['passed']} of {count['cases']}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""How long a diagnosis takes: reading and the fit of initial states, the verdicts, the report; on
+the logs of one's own flights.
+
+python -m bench.explain flights/*.npz --no-report
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench import start
+from bench.report import Report, Table, add_arguments_of_measurements, finish
+from sim.cores import cores
+from visthrow.diagnose.inputs import opening
+from visthrow.diagnose.reporting import explain_cli
+from visthrow.diagnose.select import search
+from visthrow.training.device import resolve
+
+VERDICT_S = {"cpu": 90.0, "cuda": 5.0}
+"""Bars for ten throws and a minute of flight with the whole catalogue: two quiet CPU cores, an
+H200.
+"""
+REPORT_S = 120.0
+"""What the report may take on top."""
+
+
+def measure(args: argparse.Namespace) -> dict[str, float]:
+    """Seconds of each stage of one diagnosis, and what was looked at."""
+    begun = time.perf_counter()
+    model, logs = opening.open_model(args)
+    opened = time.perf_counter()
+    diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without, logs))
+    explained = time.perf_counter()
+    found = {
+        "open": opened - begun,
+        "explain": explained - opened,
+        "verdict": explained - begun,
+        "logs": len(logs),
+        "effects": len(model.effects),
+        "windows": diagnosis.windows,
+        "named": len(diagnosis.theta),
+    }
+    if not args.no_report and diagnosis.work is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            explain_cli.write_report(Path(folder), diagnosis, model, logs, args.seed)
+        found["report"] = time.perf_counter() - explained
+    return found
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print, keep."""
+    runs = [measure(args) for _ in range(args.repeats)]
+    stages = [stage for stage in ("open", "explain", "verdict", "report") if stage in runs[0]]
+    bar = VERDICT_S["cuda" if resolve(args.device).startswith("cuda") else "cpu"]
+    bars = {"verdict": f"{bar:g}", "report": f"{REPORT_S:g}"}
+    rows = tuple(
+        (stage, *(f"{found[stage]:.1f}" for found in runs), bars.get(stage, "")) for stage in stages
+    )
+    header = ("stage [s]", *(f"run {i + 1}" for i in range(len(runs))), "bar")
+    first = runs[0]
+    title = (
+        f"{first['logs']} logs, {first['windows']} windows, {first['effects']} effects,"
+        f" {first['named']} named"
+    )
+    notes = (
+        (
+            f"Device {resolve(args.device)}, {cores()} CPU cores. Wall time without Python's start;"
+            " a first run may compile kernels."
+        ),
+        (
+            "verdict = open + explain. The bars hold for ten throws and a minute of flight, on two"
+            " quiet cores or an H200."
+        ),
+    )
+    return finish(
+        Report(
+            "explain",
+            "How long a diagnosis takes",
+            (Table(title, header, rows),),
+            notes,
+            {"runs": runs},
+        ),
+        args,
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    parser = start.parser_of(__doc__, record=False)
+    opening.add_arguments(parser)
+    parser.add_argument("--no-report", action="store_true", help="measure the verdicts only")
+    add_arguments_of_measurements(parser, 2)
+    parser.set_defaults(device="cpu")
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

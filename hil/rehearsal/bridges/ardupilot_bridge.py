@@ -1,0 +1,160 @@
+"""The bridge:
+
+ArduPilot's software in the loop flies the simulator's vehicle, rope and ball by its JSON interface.
+
+ArduPilot (``sim_vehicle.py -v ArduCopter -f json:127.0.0.1``, or ``arducopter --model
+json:127.0.0.1``) sends its servo outputs and waits for a state, by which its clock goes; so the two
+are in lock step. The runner speaks MAVLink to it by itself; the release is read from the
+mechanism's output. A frame that comes twice is answered twice and flown once; one with a smaller
+number says that ArduPilot was started again.
+
+Convention: forward, right, down in the body; north, east, down in the world: our x, -y, -z in both.
+
+Source: ardupilot, libraries/SITL/examples/JSON/readme.md, libraries/SITL/SIM_JSON.h
+(servo_packet_16, servo_packet_32)."""
+
+import json
+import select
+import socket
+import struct
+from typing import Any
+
+import numpy as np
+
+from hil.errors import LinkError
+from hil.links.backends.ardupilot import ArduPilotParams
+from hil.links.device import LARGEST_DATAGRAM
+from hil.links.mavlink_link import Link
+from hil.rehearsal.bridges.betaflight_bridge import MotorPlant
+from hil.rehearsal.fake import Bridge, Options
+from hil.rehearsal.fake_mocap import MocapParams
+
+SERVOS = 9002  # UDP port on which ArduPilot finds the simulation
+HEAD = struct.Struct(
+    "<HHI"
+)  # magic, frames a second that it would like, number of the frame; outputs [us] follow
+MAGIC = {18458: 16, 29569: 32}  # outputs of a packet by its magic
+
+OURS = (2, 0, 1, 3)
+"""Where front left, front right, rear left, rear right stand among the outputs of a quadrotor X
+(FRAME_CLASS 1, FRAME_TYPE 1).
+"""
+
+LOW, HIGH, NEAR = (
+    1000.0,
+    2000.0,
+    50.0,
+)  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
+# for a frame, after which the wall's clock goes on without one [s]: ArduPilot sleeps, or is not
+# there yet
+PATIENCE = 0.05
+
+FLIP = np.array([1.0, -1.0, -1.0])
+
+
+def outputs(packet: bytes) -> tuple[int, np.ndarray] | None:
+    """Number of a frame and its servo outputs [us], shape (16,) or (32,); None where the packet
+    holds none.
+    """
+    if len(packet) < HEAD.size:
+        return None
+    magic, _, number = HEAD.unpack_from(packet)
+    count = MAGIC.get(magic, 0)
+    if not count or len(packet) != HEAD.size + 2 * count:
+        return None
+    return number, np.frombuffer(packet, "<u2", count, HEAD.size).astype(float)
+
+
+def state_line(time: float, plant: MotorPlant) -> bytes:
+    """The state of a vehicle as ArduPilot takes it, a line of JSON between two line feeds."""
+    now, (x, y, z, w) = plant.state, plant.quat_wb.tolist()
+    told = {
+        "timestamp": time,
+        "imu": {
+            "gyro": (FLIP * plant.rate_b).tolist(),
+            "accel_body": (FLIP * plant.force_b).tolist(),
+        },
+        "position": (FLIP * now["pos_w"]).tolist(),
+        "velocity": (FLIP * now["vel_w"]).tolist(),
+        "quaternion": [w, x, -y, -z],
+    }
+    return b"\n" + json.dumps(told).encode() + b"\n"
+
+
+class ArduPilotSitl(Bridge):
+    """See the head of this module; ``frames`` were flown, ``repeated`` came again, ``restarts`` of
+    ArduPilot.
+    """
+
+    unknown = (*Bridge.unknown, "armed")
+
+    def __init__(
+        self,
+        plant: MotorPlant,
+        link: Link,
+        mocap: MocapParams | None,
+        seed: int,
+        options: Options,
+        params: ArduPilotParams,
+    ) -> None:
+        """Listen for ArduPilot; ``params`` of the back-end say which output opens the mechanism.
+        Raises `LinkError`: the port is taken.
+        """
+        super().__init__(plant, link, mocap, seed, options)
+        self.params, self._number = params, -1
+        self.motors, self.frames, self.repeated, self.restarts = np.zeros(4), 0, 0, 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(("127.0.0.1", SERVOS))
+        except OSError as error:
+            self._socket.close()
+            raise LinkError(
+                f"cannot listen on udp port {SERVOS}: {error.strerror}; ArduPilot looks for its"
+                " simulation there"
+            ) from error
+        self._socket.setblocking(False)
+        self.port = self._socket
+
+    def fly(self) -> None:
+        """Fly a period by the next frame's outputs, and the state after it in answer; without a
+        frame, a period as it was.
+        """
+        frame, to = self._frame()
+        if frame is None:
+            super().fly()
+            return
+        number, servos = frame
+        if number == self._number:
+            self.repeated += 1
+        else:
+            self.restarts += number < self._number
+            self._number, self.frames = number, self.frames + 1
+            self.motors = np.clip((servos[list(OURS)] - LOW) / (HIGH - LOW), 0.0, 1.0)
+            at, opens = self.params.servo_output - 1, self.params.servo_open_us
+            self.output(0 <= at < len(servos) and abs(servos[at] - opens) <= NEAR, self.plant.time)
+            super().fly()
+        self._socket.sendto(state_line(self.plant.time, self.plant), to)
+
+    def _frame(self) -> tuple[tuple[int, np.ndarray] | None, Any]:
+        while select.select([self._socket], [], [], PATIENCE)[0]:
+            packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
+            frame = outputs(packet)
+            if frame is not None:
+                return frame, sender
+        return None, None
+
+    def flown(self) -> np.ndarray:
+        return self.motors
+
+    def report(self) -> dict[str, Any]:
+        counts = {
+            "held": self.plant.held,
+            "frames": self.frames,
+            "repeated": self.repeated,
+            "restarts": self.restarts,
+        }
+        return super().report() | counts
+
+    def close(self) -> None:
+        super().close()
+        self._socket.close()

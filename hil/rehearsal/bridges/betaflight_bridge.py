@@ -1,0 +1,146 @@
+"""The bridge:
+
+Betaflight's firmware flies the simulator's vehicle, rope and ball by its own motor outputs.
+
+Each period of the vehicle the firmware gets gyro, accelerometer and attitude, and answers with four
+motor commands. The release is read from the firmware's own channels by MSP on its second serial
+port. The runner speaks to the first one; the bridge sends the poses of both bodies beside it. Until
+the rotors carry it the vehicle hangs in a stand."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hil.links import msp
+from hil.links.backends.betaflight import BOX_ARM, HIGH, NEAR, STICKS, BetaflightParams
+from hil.links.device import Device, TcpPort, chunks
+from hil.links.mavlink_link import Link
+from hil.rehearsal.bridges.betaflight_firmware import PORTS
+from hil.rehearsal.bridges.packets import Sensors
+from hil.rehearsal.fake import Bridge, Options, WirePlant
+from hil.rehearsal.fake_mocap import SLACK, MocapParams
+
+ASK = {msp.RC: 0.002, msp.STATUS: 0.1}  # what the firmware is asked for, and how often [s]
+
+SAMPLE = 0.0005
+"""Between two samples of the sensors [s]: 2000 a second for loops of 8 kHz.
+
+Of one sample in 2 ms, held so long, the firmware's D is a spike, and motors taken at the first loop
+after each sample miss 17 % of it and see the gyro 1.2 ms later.
+"""
+
+SLOW = 0.01  # share of late periods above which the machine is too slow for real time
+
+
+class MotorPlant(WirePlant):
+    """What flies behind the firmware: steps are taken under motor commands."""
+
+    held: bool
+    quat_wb: np.ndarray
+    rate_b: np.ndarray
+    force_b: np.ndarray
+
+
+class BetaflightSitl(Bridge):
+    """See the head of this module; ``motors``: outputs, 0 to 1, mean of the last period, shape
+    (4,), in our order; ``answered``: periods in which the firmware put out motors.
+    """
+
+    def __init__(
+        self,
+        plant: MotorPlant,
+        link: Link,
+        mocap: MocapParams | None,
+        seed: int,
+        options: Options,
+        params: BetaflightParams,
+        stands: int,
+    ) -> None:
+        """Connect to a firmware that runs; ``params`` of the back-end say which channel opens the
+        mechanism, ``stands``: see `Sensors`.
+        """
+        super().__init__(plant, link, mocap, seed, options)
+        self.params, self.armed = params, False
+        self.port, self.sensors = TcpPort(Device("tcp", "127.0.0.1", PORTS[1])), Sensors(stands)
+        self._parser, self._asked = msp.Parser(), dict.fromkeys(ASK, -1e9)
+        self._boxes: tuple[int, ...] = ()
+        self.motors = np.zeros(4)
+        self.answered = 0
+        self.cycles: list[int] = []
+        self._outputs: list[np.ndarray] = []
+        self._samples = round(plant.period / SAMPLE)
+        self._rate_b, self._sent = (
+            plant.rate_b,
+            0,
+        )  # at the beginning of the last period; samples sent in this one
+
+    def run_on(self, when: float) -> None:
+        """Send samples by the rates at the period's beginning and their last change."""
+        plant, step = self.plant, self.plant.period / self._samples
+        due = np.arange(
+            self._sent,
+            min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), self._samples),
+        )
+        if len(due):
+            rates_b = plant.rate_b + due[:, None] * ((plant.rate_b - self._rate_b) / self._samples)
+            self._outputs.append(self.sensors.send(rates_b, plant.force_b, plant.quat_wb, step))
+            self._sent += len(due)
+
+    def fly(self) -> None:
+        self.run_on(self.plant.time + self.plant.period)
+        self._rate_b, self._sent = self.plant.rate_b, 0
+        super().fly()
+
+    def hear(self) -> None:
+        super().hear()
+        for data in chunks(self.port):
+            self.heard = self.wall()
+            for frame in self._parser.parse(data):
+                self._hear(frame)
+
+    def _hear(self, frame: msp.Frame) -> None:
+        if frame.command == msp.BOXIDS:
+            self._boxes = tuple(frame.payload)
+        elif frame.command == msp.STATUS and self._boxes:
+            self._hear_status(frame)
+        elif frame.command == msp.RC:
+            channels, at = frame.words(), STICKS + self.params.release_channel - 1
+            self.output(at < len(channels) and abs(channels[at] - HIGH) <= NEAR, self.heard)
+
+    def _hear_status(self, frame: msp.Frame) -> None:
+        flags, cycle = frame.number("<I", 6) or 0, frame.number("<H", 0)
+        armed = BOX_ARM in self._boxes and bool(flags >> self._boxes.index(BOX_ARM) & 1)
+        if armed != self.armed:
+            self.happened("armed" if armed else "disarmed")
+        self.armed = armed
+        if armed and cycle:
+            self.cycles.append(cycle)
+
+    def flown(self) -> np.ndarray:
+        came, self._outputs = np.concatenate(self._outputs), []
+        if len(came):
+            self.motors, self.answered = came.mean(axis=0, dtype=float), self.answered + 1
+        return self.motors
+
+    def speak(self) -> None:
+        plant = self.plant
+        for command, period in ASK.items():
+            if plant.time - self._asked[command] >= period:
+                self._asked[command] = plant.time
+                self.port.write(msp.pack(msp.Frame(command)))
+        if not self._boxes and self._asked[msp.STATUS] == plant.time:
+            self.port.write(msp.pack(msp.Frame(msp.BOXIDS)))
+
+    def report(self) -> dict[str, Any]:
+        loop = float(np.median(self.cycles)) if self.cycles else None
+        return super().report() | {
+            "held": self.plant.held,
+            "motor_packets": self.answered,
+            "loop_us": loop,
+        }
+
+    def close(self) -> None:
+        super().close()
+        for port in (self.port, self.sensors):
+            port.close()

@@ -1,0 +1,358 @@
+"""Betaflight in software as a process: start it, write its settings over its command line, read
+them back, end it.
+
+The firmware keeps its settings (``eeprom.bin``) and its blackbox (``LOG00001.BFL``) in the folder
+that it runs in. It ends itself where a board would restart, so it is started anew after ``save``.
+It answers on its command line only while it is fed with samples of its sensors
+(`hil.rehearsal.bridges.packets`), and listens on every address of the machine: keep it in a network
+namespace (``unshare -rn``), or on a machine that nobody else reaches.
+
+Source: betaflight 4.6, src/platform/SIMULATOR/sitl.c, src/main/cli/cli.c, src/main/msp/msp_box.c.
+"""
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from hil.errors import RunError
+from hil.links.backends.betaflight import STICKS, BetaflightParams
+from hil.rehearsal.bridges.packets import at_rest, stood
+
+PORTS = (
+    5761,
+    5762,
+)  # TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
+START, ANSWER, END = (
+    20.0,
+    20.0,
+    10.0,
+)  # time for a start, for an answer of the command line and for the process's end [s]
+FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
+
+GAINS = {
+    "p_roll": 5,
+    "i_roll": 2,
+    "d_roll": 5,
+    "d_max_roll": 5,
+    "p_pitch": 5,
+    "i_pitch": 2,
+    "d_pitch": 5,
+    "d_max_pitch": 5,
+    "p_yaw": 45,
+    "i_yaw": 8,
+}
+"""Those of the training's rate controller by `sim.effects.firmware.controller_of`, in whole
+numbers: 0.0080 N m s/rad, 0.024 N m/rad and 1.3e-4 N m s^2/rad about roll and pitch. A policy that
+was trained on one response is flown on that response, not on a stiffer one: at p_roll = 11 the
+shipped one swung from stop to stop.
+"""
+
+FOR_THUMBS = {
+    "rc_smoothing": "OFF",  # three filters of 18 Hz at 50 commands a second: 13 ms later
+    "f_roll": "0",
+    "f_pitch": "0",
+    "f_yaw": "0",  # feedforward takes the steps of 50 commands a second for flicks of a stick
+    "anti_gravity_gain": "0",
+    "throttle_boost": (
+        "0"
+    ),  # they add to P, I and throttle where the throttle moves, as it does in a throw
+    "tpa_rate": "0",
+    "tpa_low_rate": "0",  # D goes with the throttle
+    "gyro_lpf1_dyn_min_hz": "0",
+    "dterm_lpf1_dyn_min_hz": "0",  # filters that go with the throttle: static ones in their place
+    "dterm_lpf1_static_hz": "0",  # of two filters of D the second is left, 150 Hz
+    "yaw_lowpass_hz": (
+        "0"
+        # P of yaw alone is smoothed by it, the command's steps as well; the gyro has filters of its
+        # own
+    ),
+    "pidsum_limit": "1000",
+    "pidsum_limit_yaw": "1000",  # the mixer knows how much the motors can
+}
+"""What the firmware does for a pilot's thumbs or with the throttle, and is better off where a
+computer commands: the vehicle then is the same at any command, and a policy can be trained in it.
+"""
+
+LOCKSTEP = Path(__file__).with_name("lockstep.c")
+
+PR_SET_PDEATHSIG = 1  # of prctl
+
+_LIBC = ctypes.CDLL(None)
+
+PROMPT = b"\n# "
+
+
+def needed(params: BetaflightParams) -> dict[str, str]:
+    """Return the settings that a throw needs, by the name or the first words that the command line
+    prints them under.
+    """
+    rates = params.rates
+    out = {
+        "serial UART2": "1 115200 57600 0 115200",  # MSP for the bridge, beside the runner's
+        "serial_update_rate_hz": (
+            "1000"
+        ),  # one MSP command a turn: 100 of them cannot take commands and questions at 50 Hz each
+        "small_angle": "180",  # it hangs in a stand: any attitude may arm
+        "rates_type": rates.type.upper(),
+        "min_check": str(params.minimum_us),
+        "deadband": "0",
+        "yaw_deadband": "0",
+        "thr_expo": "0",
+        "blackbox_device": "VIRTUAL",
+        "blackbox_sample_rate": "1/8",  # 1 kHz of 8
+    }
+    out |= {name: str(value) for name, value in GAINS.items()} | FOR_THUMBS
+    for i, axis in enumerate(("roll", "pitch", "yaw")):
+        out |= {
+            f"{axis}_rc_rate": str(rates.rc_rates[i]),
+            f"{axis}_srate": str(rates.rates[i]),
+            f"{axis}_expo": str(rates.expo[i]),
+        }
+    if params.arm_channel:
+        out["aux 0"] = f"0 {params.arm_channel - 1} 1700 2100 0 0"
+    else:  # a receiver has all channels; the switch of MSP OVERRIDE is on AUX 2
+        mask = (1 << STICKS) - 1 | 1 << STICKS + params.release_channel - 1
+        out |= {
+            "aux 0": "0 0 1700 2100 0 0",
+            "aux 1": "50 1 1700 2100 0 0",
+            "msp_override_channels_mask": str(mask),
+        }
+    return out
+
+
+def line_of(name: str, value: str) -> str:
+    """What sets a value: ``serial``, ``aux`` and ``feature`` have their own commands."""
+    return f"{name} {value}" if " " in name else f"set {name} = {value}"
+
+
+class Firmware:
+    """One process of the firmware, in a ``folder`` of settings, blackbox and what it prints
+    (``firmware.txt``).
+    """
+
+    def __init__(self, program: str | Path, folder: str | Path) -> None:
+        """Name program and folder; nothing runs yet.
+
+        Raises `RunError`: there is no such program.
+        """
+        self.program, self.folder = Path(program).resolve(), Path(folder)
+        if not self.program.is_file():
+            raise RunError(
+                f"no firmware at {program}; expected Betaflight's program for a PC, as `make"
+                " TARGET=SITL` builds it"
+            )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._process: subprocess.Popen | None = None
+        self.stands: int | None = None
+
+    def start(self) -> None:
+        """Start it, its clock by the stamps of its samples, and wait until it is ready for them:
+        one that came before its sensors are begun would stop it for ever. Raises `RunError` where
+        it ends, does not listen in time, or another one is there.
+        """
+        end = time.monotonic() + FREED
+        while "failed" in (
+            words := self._started()
+        ):  # a connection of the last one may still be in TIME_WAIT
+            self.stop()
+            if time.monotonic() > end:
+                raise RunError(f"the firmware cannot listen: {words!r}")
+            time.sleep(1.0)
+        if not stood(self.stands, START):
+            self.stop()
+            raise RunError(
+                f"the firmware does not come to stand {START:g} s after its start; its words:"
+                f" {words!r}"
+            )
+
+    def _started(self) -> str:
+        """Start the process; its words once it listens, or cannot."""
+        try:  # nothing is connected, as the firmware serves one peer
+            socket.create_server(("127.0.0.1", PORTS[0])).close()
+        except OSError:
+            raise RunError(
+                f"something listens on port {PORTS[0]} already; expected no other firmware beside"
+                " this one"
+            ) from None
+        self.stands, said = os.pipe()
+        library = compiled(
+            self.folder
+        ).name  # by its place in the folder that it runs in: a path may hold no space
+        environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(said)}
+        told = (
+            self.folder / "firmware.txt"
+        )  # its errors; of what it prints, most are the words of its memory
+        with open(told, "wb") as errors:
+            self._process = subprocess.Popen(
+                [self.program],
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                preexec_fn=_end_with_parent,
+                env=environment,
+                pass_fds=[said],
+            )
+        os.close(said)
+        end = time.monotonic() + START
+        while f"bind port {PORTS[0]} for UART1" not in (words := told.read_text(errors="replace")):
+            if not self.runs or time.monotonic() > end:
+                self.stop()
+                raise RunError(
+                    f"the firmware does not listen on port {PORTS[0]}; its words: {words[-200:]!r}"
+                )
+            time.sleep(0.02)
+        return words
+
+    @property
+    def runs(self) -> bool:
+        """Whether the process is there."""
+        return self._process is not None and self._process.poll() is None
+
+    def stop(self) -> None:
+        """End it."""
+        self._end()
+        if self.stands is not None:
+            os.close(self.stands)
+            self.stands = None
+
+    def _end(self) -> None:
+        """End the process, politely, then for good; whoever feeds it hears of it by its pipe."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def set_up(self, settings: dict[str, str]) -> dict[str, str]:
+        """Write settings, start anew, and return them as read back, then end; raises `RunError` for
+        one that is not kept.
+        """
+        try:
+            kept = self._written(settings)
+        finally:
+            self.stop()
+        wrong = [
+            f"{name} is {kept[name]!r}, expected {value!r}"
+            for name, value in settings.items()
+            if kept[name] != value
+        ]
+        if wrong:
+            raise RunError(f"the firmware did not keep its settings: {'; '.join(wrong)}")
+        return kept
+
+    def _written(self, settings: dict[str, str]) -> dict[str, str]:
+        self.start()
+        with at_rest(self.stands), CommandLine() as line:
+            for name, value in settings.items():
+                line.ask(line_of(name, value))
+            line.save()
+            self._end()
+        self.stop()
+        self.start()
+        with at_rest(self.stands), CommandLine() as line:
+            return {name: line.read(name) for name in settings}
+
+
+def compiled(folder: Path) -> Path:
+    """Return the library of ``lockstep.c``, compiled into a folder where it is not there yet;
+    raises `RunError` without a compiler.
+    """
+    library = folder.resolve() / "lockstep.so"
+    if not library.exists():
+        command = [
+            os.environ.get("CC", "gcc"),
+            "-O2",
+            "-shared",
+            "-fPIC",
+            "-o",
+            library,
+            LOCKSTEP,
+            "-lpthread",
+        ]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            told = getattr(error, "stderr", "") or error
+            raise RunError(
+                f"cannot compile {LOCKSTEP.name}: {told}; expected a C compiler, as the firmware's"
+                " own build has one"
+            ) from error
+    return library
+
+
+class CommandLine:
+    """The firmware's command line on its first serial port."""
+
+    def __init__(self) -> None:
+        """Connect and enter it. Raises `RunError`: nobody answers."""
+        self._socket = socket.create_connection(("127.0.0.1", PORTS[0]), timeout=ANSWER)
+        self._socket.sendall(b"#")
+        self._heard()
+
+    def __enter__(self) -> "CommandLine":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def _heard(self, last: bytes = PROMPT) -> str:
+        """What is said up to the next prompt, or to other last words."""
+        data, end = b"", time.monotonic() + ANSWER
+        while not data.endswith(last):
+            self._socket.settimeout(max(end - time.monotonic(), 1e-3))
+            try:
+                chunk = self._socket.recv(65536)
+            except TimeoutError:
+                chunk = b""
+            if not chunk:
+                raise RunError(
+                    f"the firmware's command line does not answer; last words {data[-80:]!r}"
+                )
+            data += chunk
+        return data.decode("ascii", "replace")
+
+    def ask(self, text: str) -> str:
+        """Give a command; what it says. Raises `RunError`: it is refused."""
+        self._socket.sendall(text.encode() + b"\n")
+        answer = self._heard()
+        if "###ERROR" in answer:
+            raise RunError(
+                f"the firmware refuses {text!r}: {answer[answer.index('###') :].splitlines()[0]}"
+            )
+        return answer
+
+    def read(self, name: str) -> str:
+        """Value of a setting as the firmware prints it; empty where it prints none."""
+        command = name.split()[0]
+        answer = self.ask(command if " " in name else f"get {name}")
+        start = f"{name} " if " " in name else f"{name} = "
+        for text in answer.splitlines():
+            if text.startswith(start):
+                return text[len(start) :].strip()
+        return ""
+
+    def save(self) -> None:
+        """Keep the settings: they are in its file when it says that it restarts.
+
+        Raises `RunError`: it does not.
+        """
+        self._socket.sendall(b"save\n")
+        self._heard(b"Rebooting")
+
+
+def _end_with_parent() -> None:
+    """Where the system can (Linux), the firmware ends when the process that started it is gone,
+    however that ended.
+    """
+    if sys.platform == "linux":
+        _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

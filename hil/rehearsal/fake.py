@@ -1,0 +1,514 @@
+"""What all fakes share: plant, motion capture on the wire, a queue of things that take their time,
+a hold of their own.
+"""
+
+import heapq
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from hil.links.backends.thrust import ThrustParams
+from hil.links.device import Port, chunks
+from hil.links.mavlink_link import Link
+from hil.links.pymav import mav
+from hil.links.roster import SIMULATED
+from hil.poses.frames import FrameParams, Frames
+from hil.poses.pose import PAYLOAD, Pose
+from hil.rehearsal.fake_mocap import SLACK, Mocap, MocapParams
+from visthrow.config.bounds import Bounded, NotNegative
+from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
+
+VEHICLE_ID, PAYLOAD_ID = (
+    (1, 1),
+    (
+        1,
+        25,
+    ),
+)  # MAVLink system and component that poses of vehicle and payload come from
+MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were trained with [rad/s]
+
+MOST_EVENTS = 200
+ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
+MOST_KEPT = 100  # breaches
+ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm` asks for [s]
+DESCENT, TOUCH = (
+    0.4,
+    0.12,
+)  # set-point of a landing below the vehicle [m]; height that counts as down [m]
+
+
+class WirePlant(Protocol):
+    """What flies behind the wire."""
+
+    period: float
+    time: float
+    home_w: np.ndarray
+    mass: tuple[float, float]
+    max_thrust: float
+
+    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+        """Advance one period under collective thrust [N] and body rates [rad/s]; the first release
+        trips so long into it [s].
+        """
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached."""
+
+    @property
+    def landing(self) -> dict[str, Any]:
+        """landing_w, landing_time, separation_time."""
+
+
+@dataclass(frozen=True)
+class Options(Bounded):
+    """How a fake behaves."""
+
+    # To a release; "stuck" says accepted and moves nothing, and nobody but "accepted" moves
+    # anything.
+    answer: Literal["accepted", "in-progress", "denied", "silent", "stuck"] = "accepted"
+    armed: bool = True  # at the start
+    arming: bool = True  # whether it can be armed
+    mode: int | None = None  # custom mode at the start, where there are modes; None: the usual one
+    parameters: dict[str, float] = field(
+        default_factory=dict
+    )  # that differ from a well set-up vehicle's
+    command_delay: NotNegative | None = (
+        None  # from a set-point's arrival to its effect [s]; None: the kind's
+    )
+    answer_delay: NotNegative = 0.002  # 1 to 3 ms were measured [s]
+    servo_delay: NotNegative = (
+        0.002  # from a release to the output's movement; 1 to 3 ms were measured [s]
+    )
+    timesync_delay: float = (
+        0.0  # of an answer to TIMESYNC; 1.3 to 10.5 ms were measured, of which the best counts [s]
+    )
+    # from a release to the latch of the plant, whose own lag, the output's movement in it, follows
+    # [s]
+    mechanism: NotNegative = 0.0
+    clock_offset: float = 0.0  # of its clock [s]
+    silent_after: float = float("inf")  # it says nothing any more from this time on [s]
+    taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
+    pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = (
+        "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
+    )
+    prompt: bool | None = (
+        # a heartbeat follows a change of mode at once, or only when it is due; None: as of the kind
+        None
+    )
+    all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
+
+
+class SetPoints:
+    """Set-points that begin to act at any time, flown by a plant in periods of its own: those that
+    came, and from when on they act.
+    """
+
+    def __init__(self) -> None:
+        self._acting: np.ndarray | None = None
+        self._coming: deque[tuple[float, np.ndarray]] = deque()
+
+    def add(self, when: float, target: np.ndarray) -> None:
+        """Take a set-point, thrust [N] and body rates [rad/s], that acts from a time on [s], later
+        than those before.
+        """
+        self._coming.append((when, target))
+
+    def forget(self) -> None:
+        """Forget what came so far."""
+        self._acting = None
+        self._coming.clear()
+
+    def flown(self, begin: float, period: float) -> np.ndarray | None:
+        """Return what acts in the period from a time on [s]: the mean, where it changes within it;
+        None before the first one.
+        """
+        mean, since = np.zeros(4), begin
+        while self._coming and self._coming[0][0] < begin + period - SLACK:
+            when, target = self._coming.popleft()
+            if self._acting is not None:
+                mean += (max(when, begin) - since) / period * self._acting
+                since = max(when, begin)
+            self._acting = target
+        return (
+            None
+            if self._acting is None
+            else mean + (begin + period - since) / period * self._acting
+        )
+
+
+@dataclass
+class Witness:
+    """Notes what must never arrive at a vehicle, from the vehicle's side.
+
+    Attributes:
+        limits: largest thrust [N] and body rates [rad/s] that may be asked for.
+        fence: corners of the box that the payload may be released in [m], world frame.
+        breaches: what happened, with its time; empty after a good run.
+        commands, releases: how many came.
+        worst: largest sizes that came, of thrust [N] and rates [rad/s].
+    """
+
+    limits: tuple[float, float, float, float]
+    fence: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+        (-3.0, -3.0, -0.05),
+        (3.0, 3.0, 3.0),
+    )
+    breaches: list[str] = field(default_factory=list)
+    commands: int = 0
+    releases: int = 0
+    worst: list[float] = field(default_factory=lambda: [0.0] * 4)
+    _answered: bool = False
+
+    def command(self, time: float, command: tuple[float, ...]) -> None:
+        """Note a set-point: thrust [N], body rates [rad/s]."""
+        self.commands += 1
+        if not all(map(math.isfinite, command)):
+            self._note(time, f"command {command} is not finite")
+            return
+        self.worst = [max(w, abs(c)) for w, c in zip(self.worst, command)]
+        if command[0] < 0.0 or any(abs(c) > ROOM * most for c, most in zip(command, self.limits)):
+            self._note(time, f"command {command} beyond {self.limits}")
+
+    def release(self, time: float, armed: bool, payload_w: np.ndarray) -> None:
+        """Note a command to open the mechanism."""
+        self.releases += 1
+        low, high = self.fence
+        if self._answered:
+            self._note(time, "released again after the answer")
+        if not armed:
+            self._note(time, "released while disarmed")
+        if not all(a <= x <= b for a, x, b in zip(low, payload_w, high)):
+            self._note(
+                time,
+                f"released with the payload at {np.round(payload_w, 2).tolist()}, outside of its"
+                " fence",
+            )
+
+    def answered(self) -> None:
+        """Note that the release was acknowledged: none may follow."""
+        self._answered = True
+
+    def _note(self, time: float, text: str) -> None:
+        if len(self.breaches) < MOST_KEPT:
+            self.breaches.append(f"{time:.3f} s: {text}")
+
+
+class Fake(ABC):
+    """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
+
+    Attributes:
+        last_thrust: of the last period [N]. wall: the time now, within a period as well [s].
+            events: times and what happened.
+        port: that commands come by. witness: of what came. spoil: what becomes of measured poses at
+            a time [s], as the source writes them.
+        followed, ignored: set-points. release_time: when the mechanism's output moved.
+    """
+
+    thrust_map: ThrustParams
+    # The real autopilots took 70 to 79 ms (ArduPilot), 86 to 98 ms (PX4) and 55 to 90 ms
+    # (Betaflight) from a set-point to half of a step of 1.5 rad/s; the training simulator's own
+    # vehicle takes 75 ms. What is missing is this delay [s].
+    usual_delay = 0.0
+    usually_prompt = True  # with its heartbeat after a change of mode
+
+    def __init__(
+        self,
+        plant: WirePlant,
+        link: Link,
+        mocap: MocapParams | None = None,
+        seed: int = 0,
+        options: Options | None = None,
+        port: Port | None = None,
+    ) -> None:
+        """Begin in the hands of a pilot; poses go out on the link, with the vehicle's ids, commands
+        come by the port, or on the link.
+        """
+        self.plant, self.link, self.options = plant, link, options or Options()
+        self.port: Any = port or link.port
+        self.mocap = Mocap(mocap or MocapParams(), seed)
+        self.spoil: Callable[[list[Pose], float], list[Pose]] = lambda poses, time: poses
+        self.witness = Witness((plant.max_thrust, *MAX_RATES))
+        # Out there the world is x north, y east, z down, the body forward, right, down, quaternions
+        # w first.
+        ned = Frames(FrameParams("x,-y,-z", "x,-y,-z", "wxyz", 0.0, (0.0, 0.0, 0.0)))
+        self._to_source: Callable[[Pose], Pose] = ned.source_from_pose
+        self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), plant.period)
+        self._payload_sender = link.packer(*PAYLOAD_ID)
+        self._announced = -np.inf
+        self._later: list[tuple[float, int, Callable[[], None]]] = []
+        self._set_points = SetPoints()
+        self._count = 0
+        self.armed = self.options.armed
+        self._place = np.array(plant.home_w, dtype=float)
+        self._target: np.ndarray | None = None  # of the set-points that act in this period
+        self._last_command = float("-inf")  # when the last set-point was followed [s]
+        self._trip: float | None = None  # when the latch of the plant trips [s]
+        self.followed = self.ignored = 0
+        self.release_time: float | None = None
+        self.last_thrust = 0.0
+        self.wall: Callable[[], float] = lambda: self.plant.time
+        self.heard = 0.0  # when the message that is being taken came [s]
+        # In lock step an answer is heard a period after its question: this makes the question come
+        # in the middle [s].
+        self.question_lag = 0.5 * plant.period
+        self.events: list[tuple[float, str]] = []
+        self._going_on: dict[str, float] = {}
+        self.taken = self._open = False
+
+    def happened(self, text: str) -> None:
+        """Note something that the autopilot did by itself, or was told; what goes on from one
+        period to the next is one event.
+        """
+        goes_on = self.plant.time - self._going_on.get(text, -1e9) < 1.5 * self.plant.period
+        self._going_on[text] = self.plant.time
+        if len(self.events) < MOST_EVENTS and not goes_on:
+            self.events.append((round(self.plant.time, 3), text))
+
+    def later(self, delay: float, what: Callable[[], None]) -> None:
+        """Do something after a delay [s]; at once, still within this period, where it is 0."""
+        if delay <= 0.0:
+            what()
+            return
+        self._count += 1
+        heapq.heappush(self._later, (self.plant.time + delay, self._count, what))
+
+    def clock(self) -> float:
+        """Return the time on the vehicle's own clock [s]."""
+        return self.plant.time + self.options.clock_offset
+
+    @property
+    def silent(self) -> bool:
+        """Whether the autopilot has fallen silent; the motion capture goes on."""
+        return self.plant.time >= self.options.silent_after
+
+    def set_point(self, command: tuple[float, ...], listens: bool) -> None:
+        """Take a set-point that was just heard, thrust [N] and body rates [rad/s], and follow it or
+        not; what is no number is 0.
+        """
+        self.witness.command(self.plant.time, command)
+        if not listens:
+            self.ignored += 1
+            return
+        self.followed += 1
+        self._last_command = self.plant.time
+        delay = self.options.command_delay
+        delay = self.usual_delay if delay is None else delay
+        self._set_points.add(self.heard + delay, np.nan_to_num(np.array(command)))
+
+    def stay(self) -> None:
+        """Hold this place from now on."""
+        self._place = self.plant.state["pos_w"].astype(float)
+
+    def forget(self) -> None:
+        """Follow no set-point that came before: another one flies from now on."""
+        self._target = None
+        self._set_points.forget()
+
+    def open_mechanism(self) -> None:
+        """Move the output; what hangs on it lets go some time later. With "accepted" alone."""
+        if self.options.answer != "accepted" or self.release_time is not None:
+            return
+        self.release_time = self.heard + self.options.servo_delay
+        self._trip = self.heard + self.options.mechanism
+
+    @property
+    def moved(self) -> bool:
+        """Whether the mechanism's output has moved."""
+        return self.release_time is not None and self.plant.time >= self.release_time
+
+    def note_release(self) -> None:
+        """Note that a release command has come."""
+        self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
+
+    def output(self, is_open: bool, when: float) -> bool:
+        """Take the mechanism's output, or its channel, as seen at a time [s]; whether it has opened
+        now, which releases.
+        """
+        opens = is_open and not self._open
+        self._open = is_open
+        if opens:
+            self.heard = when
+            self.note_release()
+            self.open_mechanism()
+        return opens
+
+    def weight(self) -> float:
+        """Return the weight of what flies now [N]."""
+        return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
+
+    def hold(self, goal_w: np.ndarray) -> np.ndarray:
+        """Return the command that holds a place [m]: of the autopilot, or of the pilot's hands."""
+        now = self.plant.state
+        views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
+        return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
+
+    def descend(self) -> np.ndarray:
+        """Return the command that lands where the vehicle is; it disarms once it is down."""
+        pos = self.plant.state["pos_w"]
+        if pos[2] < TOUCH:
+            self.armed = False
+            self.happened("landed, disarmed")
+        return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, 0.05)]))
+
+    @abstractmethod
+    def take(self) -> None:
+        """Let the pilot take the vehicle over, and hold it."""
+
+    @abstractmethod
+    def flown(self) -> np.ndarray:
+        """Return the command of this period, by whoever flies."""
+
+    def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
+        """Say what is due: heartbeats, streams."""
+
+    def hear(self) -> None:
+        """Take in what has come."""
+        self.link.pump(self.wall)
+
+    def deliver(self, time: float) -> None:
+        """Do what was put off until a time [s]."""
+        while self._later and self._later[0][0] <= time + SLACK:
+            heapq.heappop(self._later)[2]()
+
+    def run_on(self, when: float) -> None:  # noqa: B027  most fakes have no clock of their own
+        """Let the autopilot work up to a time within this period [s], where its clock is ours: what
+        comes then was not there before.
+        """
+
+    def fly(self) -> None:
+        """Hear what has come, and fly one period."""
+        self.hear()
+        self.deliver(self.plant.time)
+        if not self.taken and self.plant.time >= self.options.taken_after:
+            self.taken = True
+            self.take()
+        self._target = self._set_points.flown(self.plant.time, self.plant.period)
+        command = self.flown()
+        self.last_thrust = command[0]
+        after = 0.0 if self._trip is None else self._trip - self.plant.time
+        opens = self._trip is not None and after < self.plant.period - SLACK
+        self.plant.step(command, opens, max(after, 0.0) if opens else 0.0)
+
+    def emit(self) -> None:
+        """Measure and send what is due now."""
+        if self.mocap.due(self.plant.time):
+            written = [
+                self._to_source(pose)
+                for pose in self.mocap.measure(self.plant.time, self.plant.state)
+            ]
+            for pose in self.spoil(written, self.plant.time):
+                self._post(pose)
+        if self.plant.time - self._announced >= ANNOUNCED:
+            self._announced = self.plant.time
+            self.link.send(
+                mav.MAVLink_named_value_int_message(
+                    int(1e3 * self.plant.time), SIMULATED.encode(), 1
+                )
+            )
+        self.deliver(self.plant.time)
+        if not self.silent:
+            self.speak()
+
+    def step(self) -> None:
+        """Fly one period."""
+        self.fly()
+        self.emit()
+
+    def _post(self, pose: Pose) -> None:
+        """Put a pose, as the source writes it, on its way."""
+        stamp = int((pose.stamp + self.options.clock_offset) * 1e6)
+        if self.options.pose_message == "ODOMETRY":
+            unknown = [float("nan")] * 6
+            message = mav.MAVLink_odometry_message(
+                stamp,
+                mav.MAV_FRAME_LOCAL_FRD,
+                mav.MAV_FRAME_BODY_FRD,
+                *pose.pos,
+                list(pose.quat),
+                *unknown,
+                [float("nan")] * 21,
+                [float("nan")] * 21,
+                pose.reset % 256,
+            )
+        else:
+            message = mav.MAVLink_att_pos_mocap_message(stamp, list(pose.quat), *pose.pos)
+        self.later(pose.arrival - self.plant.time, lambda: self._send_pose(message, pose.body))
+
+    def _send_pose(self, message: Any, body: str) -> None:
+        if body == PAYLOAD:
+            self.link.port.write(message.pack(self._payload_sender))
+            self._payload_sender.seq = (self._payload_sender.seq + 1) % 256
+        else:
+            self.link.send(message)
+
+    def report(self) -> dict[str, Any]:
+        """Return what happened to the payload, on the plant's clock, and to the messages."""
+        w, last = self.witness, self._last_command
+        return {
+            **self.plant.landing,
+            "followed": self.followed,
+            "ignored": self.ignored,
+            "releases": w.releases,
+            "release_time": self.release_time,
+            "armed": self.armed,
+            "commands": w.commands,
+            "worst": w.worst,
+            "breaches": w.breaches,
+            "events": self.events,
+            "last_command": last if math.isfinite(last) else None,
+            "end_w": self.plant.state["pos_w"].tolist(),
+            "time": self.plant.time,
+        }
+
+    def close(self) -> None:
+        """Give the ports back."""
+        self.link.close()
+
+
+class PortFake(Fake):
+    """An autopilot whose commands come by a port of its own, beside the link of the
+    motion capture.
+    """
+
+    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+
+    @abstractmethod
+    def came(self, data: bytes) -> None:
+        """Take what came on the port."""
+
+    def hear(self) -> None:
+        for data in chunks(self.port):
+            self.heard = self.wall()
+            self.came(data)
+        super().hear()
+
+    def close(self) -> None:
+        super().close()
+        self.port.close()
+
+
+class Bridge(Fake):
+    """A real autopilot in software flies; it speaks for itself, and the runner's link passes this
+    process by.
+    """
+
+    unknown = (
+        "followed",
+        "ignored",
+        "commands",
+        "worst",
+        "breaches",
+        "last_command",
+    )  # of a report
+
+    def take(self) -> None:
+        """Do nothing: the pilot is the autopilot's."""
+
+    def report(self) -> dict[str, Any]:
+        return {name: value for name, value in super().report().items() if name not in self.unknown}

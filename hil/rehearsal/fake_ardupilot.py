@@ -1,0 +1,91 @@
+"""A fake ArduCopter.
+
+It follows SET_ATTITUDE_TARGET only in GUIDED or GUIDED_NOGPS, armed, for its own system id and with
+a type mask of 128 alone, and ignores all else without a word; it takes a NaN thrust and falls;
+without bit 3 of GUID_OPTIONS thrust is a climb rate; with ATC_ANGLE_BOOST it grows with tilt;
+silence of GUID_TIMEOUT levels it; DO_SET_SERVO is accepted on an output that has a function, and
+moves nothing. Until the first command it holds its place."""
+
+from typing import Any
+
+import numpy as np
+
+from hil.links.backends.ardupilot import (
+    BRAKE,
+    GUIDED,
+    GUIDED_NOGPS,
+    LAND_MODE,
+    LOITER,
+    SERVO_GRIPPER,
+    THRUST_AS_THRUST,
+)
+from hil.links.backends.thrust import ThrustParams
+from hil.links.pymav import mav
+from hil.rehearsal.fake_mavlink import SERVO, FakeMavlink
+from visthrow.common.rotations import matrix_of_quat
+from visthrow.onboard.hover import GRAVITY
+
+FULL_CLIMB = (
+    2.5  # climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]
+)
+CLIMB_GAIN = 5.0  # gain of the climb rate's loop, PSC_VELZ_P's default [1/s]
+ANSWERS = {
+    "denied": mav.MAV_RESULT_DENIED,
+    "in-progress": mav.MAV_RESULT_IN_PROGRESS,
+}  # to a release, where it is not accepted
+
+
+class FakeArduPilot(FakeMavlink):
+    """See the head of this module."""
+
+    autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+    modes = (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE)
+    usual_mode, pilots_mode = GUIDED, LOITER
+    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+    defaults = {  # noqa: RUF012 - copied by each instance
+        "GUID_OPTIONS": 8.0,
+        "ATC_ANGLE_BOOST": 0.0,
+        "GUID_TIMEOUT": 0.5,
+        "EK3_SRC1_POSXY": 6.0,
+        "GRIP_ENABLE": 1.0,
+        f"SERVO{SERVO}_FUNCTION": float(SERVO_GRIPPER),
+    }
+
+    def listens(self) -> bool:
+        return self.armed and self.mode in (GUIDED, GUIDED_NOGPS)
+
+    def is_release(self, message: Any) -> bool:
+        servo = message.command == mav.MAV_CMD_DO_SET_SERVO and message.param1 == SERVO
+        return servo or super().is_release(message)
+
+    def answer_release(self, message: Any) -> None:
+        servo, function = (
+            message.command == mav.MAV_CMD_DO_SET_SERVO,
+            self.parameters[f"SERVO{SERVO}_FUNCTION"],
+        )
+        able = servo or bool(self.parameters["GRIP_ENABLE"])
+        if able and function == (0.0 if servo else SERVO_GRIPPER):
+            self.open_mechanism()
+        result = mav.MAV_RESULT_ACCEPTED if able else mav.MAV_RESULT_FAILED
+        self.acknowledge(message.command, ANSWERS.get(self.options.answer, result))
+
+    def flown(self) -> np.ndarray:
+        if self.mode == LAND_MODE:
+            return self.descend()
+        if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:
+            return self.hold(self._place)
+        if self.plant.time - self._last_command > self.parameters["GUID_TIMEOUT"]:
+            self.happened("levelled: no set-points")
+            return np.array([self.weight(), 0.0, 0.0, 0.0])
+        return self._meant(self._target)
+
+    def _meant(self, target: np.ndarray) -> np.ndarray:
+        """Return the set-point as the parameters make it mean."""
+        out, now = target.copy(), self.plant.state
+        if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
+            climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)
+            out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / GRAVITY)
+        elif self.parameters["ATC_ANGLE_BOOST"]:
+            out[0] /= max(matrix_of_quat(now["quat_wb"][None].astype(float))[0, 2, 2], 0.5)
+        out[0] = min(max(out[0], 0.0), self.plant.max_thrust)
+        return out

@@ -1,0 +1,248 @@
+"""A fake Betaflight on an MSP port; the poses come from the motion capture's bridge, a MAVLink peer
+beside it.
+
+A pilot holds it until stick frames come; then the override switch goes on (or, with all channels by
+MSP, the arming channel takes it). With the override the pilot's own sticks count again after 0.3 s
+of silence; with all channels by MSP 0.36 s idle the motors, 1.6 s disarm, and an arming channel
+that is high when the receiver comes back arms nothing before it was low. Pitch stick forward is
+nose down. Outputs of CHANNEL_FORWARDING are not in MSP_SERVO. It hears no poses."""
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hil.links import msp
+from hil.links.backends.betaflight import (
+    BOX_ARM,
+    BOX_OVERRIDE,
+    FORWARDING,
+    HIGH,
+    LOW,
+    SETTINGS,
+    STICKS,
+)
+from hil.links.backends.rates import RATES_TYPES, RatesParams, Sticks
+from hil.rehearsal.fake import PortFake
+
+IDLE_AFTER, DISARM_AFTER = (
+    0.36,
+    1.6,
+)  # silence after which the motors idle, and after which it disarms, with all channels by MSP [s]
+OVERRIDE_GONE = (
+    0.3  # silence after which the receiver's channels count again, under MSP OVERRIDE [s]
+)
+RECEIVER_LOST, LOW_FIRST, ARM_SWITCH = 1 << 2, 1 << 3, 1 << 29  # bits of the arming-disabled flags
+REACTION = 0.5  # of the pilot, from the first stick frame to the override switch [s]
+BOXES = (
+    BOX_ARM,
+    1,
+    27,
+    BOX_OVERRIDE,
+)  # permanent ids in the order of the flags: arm, angle, failsafe, MSP override
+ORDER = (0, 1, 3, 2)  # rcmap AETR: where roll, pitch, yaw, throttle stand in a frame
+
+RELEASE_AUX, ARM_AUX, MINIMUM = 4, 1, 1050
+
+SIZES = {
+    msp.RC_TUNING: 24,
+    msp.RC_DEADBAND: 5,
+    msp.RX_CONFIG: 7,
+    msp.FAILSAFE_CONFIG: 8,
+}  # bytes of the answers that tell settings
+
+
+class FakeBetaflight(PortFake):
+    """See the head of this module."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.parser = msp.Parser()
+        if self.options.all_channels:
+            self.armed = False
+        tuning = {
+            "rates_type": RATES_TYPES["actual"],
+            "roll_rc_rate": 60,
+            "pitch_rc_rate": 60,
+            "yaw_rc_rate": 30,
+            "roll_rate": 60,
+            "pitch_rate": 60,
+            "yaw_rate": 30,
+            "roll_expo": 0,
+            "pitch_expo": 0,
+            "yaw_expo": 0,
+        }
+        self.parameters: dict[str, float] = {
+            "deadband": 0,
+            "yaw_deadband": 0,
+            "min_check": MINIMUM,
+            "mid_rc": 1500,
+            "failsafe_delay": 0.4,
+            "channel_forwarding": 0,
+            **tuning,
+            **self.options.parameters,
+        }
+        self._set_rates()
+        self.channels: list[int] = []
+        self.override = False
+        self._first: float | None = None
+        self._heard = -np.inf
+        self._low_first = self._disarmed = False
+
+    def _set_rates(self) -> None:
+        p, axes = self.parameters, ("roll", "pitch", "yaw")
+        kinds = {number: name for name, number in RATES_TYPES.items()}
+        three = (
+            [int(p[f"{axis}_{what}"]) for axis in axes] for what in ("rc_rate", "rate", "expo")
+        )
+        self._sticks = Sticks(RatesParams(kinds[int(p["rates_type"])], *map(tuple, three)))
+
+    def came(self, data: bytes) -> None:
+        for frame in self.parser.parse(data):
+            if frame.direction == msp.TO_CONTROLLER and not self.silent:
+                self._hear(frame)
+
+    def _hear(self, frame: msp.Frame) -> None:
+        answers: dict[int, Callable[[], bytes]] = {
+            msp.API_VERSION: lambda: bytes([0, 1, 47]),
+            msp.FC_VARIANT: lambda: b"BTFL",
+            msp.STATUS: self._status,
+            msp.RX_MAP: lambda: bytes([*ORDER, 4, 5, 6, 7]),
+            msp.BOXIDS: lambda: bytes(BOXES),
+            msp.RC: self._rc,
+            msp.SERVO: self._servo,
+            msp.ANALOG: lambda: struct.pack("<BHHhH", 111, 0, 0, 0, 1110),
+            msp.MODE_RANGES: self._ranges,
+            msp.EEPROM_WRITE: lambda: b"",
+            msp.FEATURE_CONFIG: lambda: struct.pack(
+                "<I", FORWARDING if self.parameters["channel_forwarding"] else 0
+            ),
+        }
+        answer, direction = b"", msp.ANSWER
+        if frame.command == msp.SET_RAW_RC:
+            self._sticks_came(list(frame.words()))
+        elif frame.command == msp.SET_RC_TUNING and not self.armed:
+            told = {
+                name: told.at for name, told in SETTINGS.items() if told.command == msp.RC_TUNING
+            }
+            self.parameters.update(
+                {name: frame.payload[at] for name, at in told.items() if at < len(frame.payload)}
+            )
+            self._set_rates()
+        elif frame.command in SIZES:
+            answer = self._settings(frame.command)
+        elif frame.command in answers:
+            answer = answers[frame.command]()
+        else:
+            direction = msp.REFUSAL
+        out = msp.pack(msp.Frame(frame.command, answer, direction))
+        self.later(self.options.answer_delay, lambda: self.port.write(out))
+
+    def _settings(self, command: int) -> bytes:
+        out = bytearray(SIZES[command])
+        for name, told in SETTINGS.items():
+            if told.command == command:
+                struct.pack_into(
+                    told.code, out, told.at, round(self.parameters.get(name, 0) / told.scale)
+                )
+        return bytes(out)
+
+    def _sticks_came(self, channels: list[int]) -> None:
+        if len(channels) < STICKS:
+            return
+        if any(not 885 <= c <= 2115 for c in channels):
+            self.witness.command(self.plant.time, (float("nan"),) * 4)
+            return
+        roll, pitch, yaw, throttle = (channels[at] for at in ORDER)
+        rates = tuple(self._sticks.rate(i, us) for i, us in enumerate((roll, pitch, yaw)))
+        share = min(max((throttle - MINIMUM) / (HIGH - MINIMUM), 0.0), 1.0)
+        idle = throttle <= MINIMUM
+        back = self.plant.time - self._heard > IDLE_AFTER
+        self.channels, self._heard = channels, self.plant.time
+        self._low_first |= back and not self.armed and channels[STICKS + ARM_AUX - 1] > 1700
+        self._first = self.plant.time if self._first is None else self._first
+        if self.options.all_channels:
+            high = channels[STICKS + ARM_AUX - 1] > 1700
+            self._low_first &= high
+            if high and not (self.armed or self._low_first) and idle and self.options.arming:
+                self.armed = self.override = True
+            elif not high:
+                self.armed = self.override = False
+        self.set_point((0.0 if idle else self.thrust_map.thrust(share), *rates), self.override)
+        at = STICKS + RELEASE_AUX - 1
+        opened = (
+            self.override and at < len(channels) and channels[at] > 1700
+        )  # while the channels are ours
+        if self.output(opened, self.heard) and self.options.answer not in ("silent", "denied"):
+            self.witness.answered()
+
+    def _status(self) -> bytes:
+        failsafe = self.plant.time - self._heard > IDLE_AFTER
+        on = {BOX_ARM: self.armed, BOX_OVERRIDE: self.override, 27: failsafe and self.armed}
+        flags = sum(1 << i for i, box in enumerate(BOXES) if on.get(box, False))
+        blocks = 0 if self.armed or self.options.arming else 1 << 8
+        if self.options.all_channels and not self.armed:
+            blocks |= (
+                RECEIVER_LOST * (self.plant.time - self._heard > IDLE_AFTER)
+                | (LOW_FIRST | ARM_SWITCH) * self._low_first
+            )
+        return struct.pack("<HHHIBHHBBI", 125, 0, 33, flags, 0, 10, 0, 0, 29, blocks)
+
+    def _rc(self) -> bytes:
+        throttle = round(MINIMUM + self.thrust_map.share(self.last_thrust) * (HIGH - MINIMUM))
+        channels = [1500, 1500, 1500, throttle, *([LOW] * 8)]  # the pilot's
+        if self.override and self.channels:
+            channels = [self.channels[at] for at in ORDER] + self.channels[STICKS:]
+        if self.options.answer in (
+            "silent",
+            "denied",
+        ):  # the channel is not in the mask: it never arrives
+            channels[STICKS + RELEASE_AUX - 1] = LOW
+        return struct.pack(f"<{len(channels)}H", *channels)
+
+    def _servo(self) -> bytes:
+        shown = 1500 if self.parameters["channel_forwarding"] else HIGH if self.moved else LOW
+        return struct.pack("<8H", shown, *([1500] * 7))
+
+    def _ranges(self) -> bytes:
+        arm = [BOX_ARM, ARM_AUX - 1, 28, 48]
+        switch = [] if self.options.all_channels else [BOX_OVERRIDE, 2, 28, 48]
+        return bytes([*arm, *switch, 0, 0, 0, 0])
+
+    def take(self) -> None:
+        """Switch the override off."""
+        self.override = False
+        self.stay()
+        self.happened("override off")
+
+    def flown(self) -> np.ndarray:
+        quiet = self.plant.time - self._heard
+        if (
+            not (self.options.all_channels or self.taken)
+            and self._first is not None
+            and self.plant.time - self._first >= REACTION
+        ):
+            self.override = self.armed
+        if not self.override or self._target is None:
+            gone = (
+                self._first is not None
+                and not self.armed
+                and (self._disarmed or not self.options.all_channels)
+            )
+            return np.zeros(4) if gone else self.hold(self._place)
+        if not self.options.all_channels:
+            if quiet <= OVERRIDE_GONE:
+                self.stay()
+                return self._target
+            self.happened("override: the pilot's sticks count again")
+            return self.hold(self._place)
+        if quiet > IDLE_AFTER:
+            self.happened("failsafe: motors idle")
+        if quiet > DISARM_AFTER:
+            self.armed, self.override, self._disarmed = False, False, True
+            self.happened("failsafe: disarmed")
+        return np.zeros(4) if quiet > IDLE_AFTER else self._target
+
+    def report(self) -> dict[str, Any]:
+        return {**super().report(), "override": self.override, "parameters": self.parameters}

@@ -1,0 +1,150 @@
+"""``visthrow hil fake``: the simulated vehicle over the wire, and behind a firmware in software."""
+
+import argparse
+import json
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.errors import RunError
+from hil.flight import key_of
+from hil.links.clock import MonotonicClock
+from hil.links.device import check_device, open_port
+from hil.links.mavlink_link import Link
+from hil.params import HilParams
+from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl
+from hil.rehearsal.bridges.betaflight_bridge import SLOW, BetaflightSitl
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.bridges.px4_bridge import HangingBall, Px4Sih
+from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
+from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import KINDS, AnsweringPort, ListeningPort, load_plant, make_fake, serve
+from visthrow import config
+from visthrow.common.errors import suggest
+from visthrow.common.storage import writable
+from visthrow.onboard.policy import Policy, find_policy
+
+PLANT, MOTORS, BALL = (
+    "visthrow.throws.wire_plant:make",
+    "visthrow.throws.wire_plant:make_motors",
+    "hil.rehearsal.fake_command:make_ball",
+)
+"""What makes the vehicle behind a fake, and behind a firmware; the ball below a firmware's own
+vehicle.
+"""
+
+SITL = {"betaflight-sitl": MOTORS, "ardupilot-sitl": MOTORS, "px4-sih": BALL}
+"""Kinds of fake that are a bridge to a firmware in software, and what makes the vehicle behind it.
+"""
+
+MSP_PORT = (  # of one that is taken
+    "--msp-port PORT, and in the run --set {kind}.device={device}:127.0.0.1:PORT"
+)
+BRIDGE_ID = (254, 190)  # MAVLink ids of the bridge where it listens to an autopilot itself
+# from the mechanism's output to separation below PX4's vehicle [s], as
+# `visthrow.throws.wire_plant.MECHANISM`
+BALL_LAG = 0.06
+
+
+def fake(args: argparse.Namespace) -> int:
+    """Fly a fake autopilot, or a bridge to a firmware in software, and print its report."""
+    out = None if args.out is None else Path(args.out)
+    options = config.loads(
+        Options, "", [*args.overrides, f"answer={args.answer}"], "options of the fake"
+    )
+    mocap = MocapParams(rate=args.rate)
+    if args.kind not in {*KINDS, *SITL}:
+        raise RunError(f"--kind {args.kind}; {suggest(args.kind, {*KINDS, *SITL})}")
+    plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
+    if out is not None:
+        writable(out.parent)
+    link = Link(
+        open_port(check_device(args.device), "--device udpout:127.0.0.1:PORT"),
+        *VEHICLE_ID,
+        key=key_of(args),
+    )
+    with ExitStack() as ends:
+        if args.kind in SITL:
+            flown = _bridge(args, (plant, link, mocap, args.seed, options), ends)
+        else:
+            port, other = (
+                None,
+                MSP_PORT.format(
+                    kind=args.kind, device="tcp" if args.kind == "betaflight" else "udpout"
+                ),
+            )
+            if args.kind == "betaflight":
+                port = ListeningPort(args.msp_port, other)
+            elif args.kind == "crazyflie":
+                port = AnsweringPort(check_device(f"udp:127.0.0.1:{args.msp_port}"), other)
+            flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
+            print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
+        ends.callback(flown.close)
+        report = serve(flown, MonotonicClock(args.speed), args.seconds, out, args.after)
+    periods = report["time"] / plant.period
+    if args.kind in SITL and report["late_periods"] > SLOW * periods:
+        print(
+            f"this machine is too slow: {report['late_periods']} of {periods:.0f} periods were"
+            f" late; slow both clocks, --speed {args.speed / 2:g} here and of the run",
+            file=sys.stderr,
+        )
+    print(json.dumps(report, indent=2))
+    return 0
+
+
+def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack) -> Fake:
+    """Return the bridge to a firmware: its outputs fly the plant, or the ball hangs below PX4's own
+    vehicle.
+    """
+    params = config.load(HilParams, config.find("hil", args.config))
+    flown: Fake
+    if args.kind == "betaflight-sitl":
+        if args.firmware is None:
+            raise RunError(
+                "--kind betaflight-sitl without --firmware; expected Betaflight's program for a PC"
+            )
+        firmware = Firmware(args.firmware, args.folder)
+        ends.callback(firmware.stop)
+        kept = firmware.set_up(needed(params.betaflight))
+        firmware.start()
+        print(
+            "".join(f"{name:28} {value}\n" for name, value in kept.items()), end="", file=sys.stderr
+        )
+        flown = BetaflightSitl(*vehicle, params.betaflight, firmware.stands)
+        flown.sensors.start()
+        said = "the firmware has its settings; it flies"
+    elif args.kind == "ardupilot-sitl":
+        flown, said = (
+            ArduPilotSitl(*vehicle, params.ardupilot),
+            "waiting for ArduPilot: --model json:127.0.0.1",
+        )
+    else:
+        flown = Px4Sih(
+            *vehicle,
+            params.px4,
+            Link(
+                open_port(check_device(args.autopilot), "--autopilot udp:127.0.0.1:PORT"),
+                *BRIDGE_ID,
+            ),
+        )
+        said = f"waiting for PX4 on {args.autopilot}"
+    print(said, file=sys.stderr, flush=True)
+    return flown
+
+
+def make_ball(policy: str, seed: int) -> HangingBall:
+    """Return the rope and ball that a policy was trained with, below a vehicle that is told where
+    it is.
+    """
+    contract = Policy.load(find_policy(policy)).contract
+    rope, alone = contract["rope"], contract["vehicle"]["body"]["mass"]
+    return HangingBall(
+        np.array(rope["mount"]),
+        rope["length"] + rope["payload_offset"],
+        BALL_LAG,
+        (alone + rope["rope_mass"] + rope["payload_mass"], alone),
+        contract["action"]["max_thrust"],
+    )

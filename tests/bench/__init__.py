@@ -1,4 +1,0 @@
-"""Measurements that stand behind records of this repository:
-
-``python -m tests.bench.NAME --help``.
-"""

@@ -1,0 +1,52 @@
+"""The baseline beside the policies: units, rows of compare."""
+
+import json
+
+import pytest
+
+from visthrow import cli
+from visthrow.cli import compare
+from visthrow.paper.baseline import spline, thrower
+from visthrow.throws import results
+from visthrow.throws.reference_protocol import BATCH
+
+pytest.importorskip("piqp")
+
+
+def test_units_are_cut_into_batches_on_reference_plants_alone():
+    assert [u["throws"] for u in thrower.units("hybrid", "both", 2.0, 2 * BATCH + 1)] == [
+        2 * BATCH + 1
+    ]
+    cut = thrower.units("reference", "both", 2.0, 2 * BATCH + 1)
+    assert [(u["throws"], u["batch"]) for u in cut] == [(BATCH, 0), (BATCH, 1), (1, 2)]
+    assert len({results.key_of(u) for u in cut}) == 3
+
+
+def test_a_unit_knows_its_plant():
+    light = thrower.unit("hybrid", "both", 2.0, 1, overrides=["vehicle.body.mass=0.2"])
+    plain = thrower.unit("hybrid", "both", 2.0, 1)
+    assert light["conditions"] != plain["conditions"]
+    assert plain["speed"] == pytest.approx(2.935)
+    assert plain["w_t"] == spline.PlanParams().duration
+
+
+def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
+    monkeypatch.setattr("visthrow.training.device.cores", lambda: 1)
+    out = tmp_path / "rows.json"
+    words = ["compare", "state", "baseline", "--throws", "2", "--targets", "1.5", "--device", "cpu"]
+    assert cli.main([*words, "--out", str(tmp_path), "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    own = thrower.title_of(thrower.OWN, "none")
+    assert [row["policy"] for row in rows] == [
+        "state",
+        own,
+        *(thrower.title_of("hybrid", c) for c in thrower.MADE_UP),
+    ]
+    printed = capsys.readouterr().out
+    (line,) = [line for line in printed.splitlines() if own in line]
+    assert "0.127 ± 0.019" in line, "the paper's TO+MPC stands beside our own-model row"
+    assert sum("0.127 ± 0.019" in line for line in printed.splitlines()) == 1, "and beside no other"
+    assert next(row for row in rows if row["policy"] == own)["error_mean"] < 0.05
+    assert (tmp_path / "compare-hybrid.csv").read_text().count("TO+MPC") == 8
+    assert compare.rows_of([compare.Entry("a", "state", [])]) == []

@@ -1,0 +1,170 @@
+"""The baseline's plan: projectile motion, septic spline, flatness, bounds."""
+
+import numpy as np
+import pytest
+
+from visthrow.common.errors import ConfigError
+from visthrow.logs.flightlog import FlightRecorder
+from visthrow.paper.baseline import pendulum_model as pm
+from visthrow.paper.baseline import spline as sp
+from visthrow.paper.baseline.pendulum_model import Pendulum
+from visthrow.paper.baseline.spline import PlanError, PlanParams
+from visthrow.paper.baseline.throw_plan import (
+    default_release,
+    landing_point,
+    plan_throw,
+    read_release,
+    release_for,
+)
+
+MODEL = Pendulum(0.212, 0.060, 0.363)
+
+JOINT = 1e-6
+"""Jump of a derivative where segments meet, relative to its largest value: rounding of a 32 x 32
+system.
+"""
+
+OPEN_LOOP = 2e-3
+"""State error of the flat inputs flown open loop at 2 ms, held constant over each step (measured
+2e-4).
+"""
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return plan_throw(MODEL, 2.0, 1.13, 2.2, PlanParams(), 0.04, lag=0.11)
+
+
+def test_the_release_lands_on_the_target():
+    release = release_for(2.0, 1.13, 2.2, 0.04)
+    point, time = landing_point(release.pos_w, release.vel_w, 0.04)
+    assert point == pytest.approx([2.0, 0.0])
+    assert time == pytest.approx(np.sqrt(2.0 * (1.13 - 0.04) / 9.81))
+    assert release.fall_time == pytest.approx(time)
+
+
+def test_landing_by_hand():
+    """Upwards at 2 m/s from 1 m to the ground: 4.905 t^2 - 2 t - 1 = 0, t = 0.69925 s."""
+    point, time = landing_point(np.array([0.5, 0.1, 1.0]), np.array([3.0, -1.0, 2.0]), 0.0)
+    assert time == pytest.approx((2.0 + np.sqrt(4.0 + 19.62)) / 9.81)
+    assert point == pytest.approx([0.5 + 3.0 * time, 0.1 - time])
+    assert np.isnan(landing_point(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.5]), 1.0)[1])
+
+
+def test_release_is_read_off_a_flight():
+    recorder = FlightRecorder({"times": {"separation": 0.5}})
+    for time, height, speed in ((0.4, 1.0, 2.0), (0.6, 1.2, 3.0)):
+        recorder.add(
+            time,
+            payload_pos_w=np.array([0.0, 0.0, height]),
+            payload_vel_w=np.array([speed, 0.0, 0.0]),
+        )
+    assert read_release(recorder.log()) == pytest.approx((1.1, 2.5))
+    with pytest.raises(ConfigError, match="let nothing go"):
+        read_release(FlightRecorder({"result": {"failure": "the vehicle tilted too far"}}).log())
+
+
+def test_defaults_lie_between_what_was_measured():
+    near, middle, far = (default_release(x) for x in (1.5, 1.75, 2.0))
+    assert middle == pytest.approx(np.mean([near, far], axis=0))
+    assert default_release(0.5) == near
+
+
+@pytest.mark.parametrize(("height", "speed"), [(0.04, 2.0), (1.0, 0.0), (1.0, float("nan"))])
+def test_impossible_releases_are_refused(height, speed):
+    with pytest.raises(ConfigError, match="expected"):
+        release_for(2.0, height, speed, 0.04)
+
+
+def through(start, waypoints, end, velocity, times):
+    """Spline from rest at a start [m], shape (3,), through waypoints, shape (3, 3), in segments of
+    these times [s], shape (4,).
+    """
+    solved = sp._coefficients(start, waypoints[None], end, velocity, times[None])[0]
+    return sp.Spline(times, solved / (times[:, None] ** np.arange(sp.ORDER))[:, :, None])
+
+
+def test_spline_meets_ends_waypoints_and_itself():
+    rng = np.random.default_rng(0)
+    start, end, velocity = rng.standard_normal((3, 3))
+    points, times = rng.standard_normal((3, 3)), np.array([0.2, 0.35, 0.3, 0.25])
+    path = through(start, points, end, velocity, times)
+    knots = np.cumsum(times)
+    assert np.allclose(path.sample(knots[:3], 2)[:, 0], points)
+    begin, finish = path.sample(np.array([0.0]))[0], path.sample(knots[-1:])[0]
+    assert np.allclose(begin, [start, *np.zeros((5, 3))], atol=1e-6)
+    assert np.allclose(finish[:2], [end, velocity])
+    scale = np.abs(path.sample(np.linspace(0.0, 1.1, 200))).max(axis=(0, 2))
+    assert np.all(np.abs(finish[2:5]) < JOINT * scale[2:5, None])
+    for knot in knots[:3]:
+        left, right = path.sample(np.array([knot - 1e-12, knot + 1e-12]))
+        assert np.all(np.abs(left - right) < JOINT * scale[:, None])
+
+
+def test_derivatives_of_the_spline_are_its_slopes():
+    path = through(
+        np.zeros(3), np.arange(9.0).reshape(3, 3), np.ones(3), np.ones(3), np.full(4, 0.3)
+    )
+    time, h = np.array([0.1, 0.5, 0.95]), 1e-6
+    slopes = (path.sample(time + h) - path.sample(time - h)) / (2 * h)
+    assert np.allclose(slopes[:, :5], path.sample(time)[:, 1:], rtol=1e-4, atol=1e-3)
+
+
+def test_past_its_end_the_path_goes_on_straight(plan):
+    beyond = plan.path.sample(np.array([plan.path.duration + 0.3]))[0]
+    assert np.allclose(beyond[0], plan.release.pos_w + 0.3 * plan.release.vel_w)
+    assert np.allclose(beyond[2:], 0.0)
+
+
+def test_plan_ends_in_the_release_on_the_grid_and_within_bounds(plan):
+    end = plan.path.sample(np.array([plan.path.duration]))[0]
+    assert np.allclose(end[:2], [plan.release.pos_w, plan.release.vel_w], atol=1e-9)
+    latch = (plan.path.duration - 0.11) / 0.02
+    assert latch == pytest.approx(round(latch), abs=1e-9)
+    path = plan.path.sample(np.arange(0.0, plan.path.duration, 0.005))
+    bounds, soft = plan.params, 1.05  # soft bounds: a few per cent past them
+    assert np.linalg.norm(path[:, 1], axis=1).max() < soft * bounds.max_speed
+    assert np.linalg.norm(path[:, 2], axis=1).max() < soft * bounds.max_acceleration
+    assert path[:, 0, 2].min() > bounds.floor
+    states, inputs = plan.reference(0.0, 0.005, 150)
+    assert np.all(pm.tension(MODEL, states[:-1], inputs) > 0.0)
+    assert inputs[:, 0].max() < soft * bounds.max_thrust
+
+
+def test_flat_inputs_flown_open_loop_stay_on_the_path(plan):
+    step = 0.002
+    count = round(plan.path.duration / step)
+    states, inputs = plan.reference(0.0, step, count)
+    state = states[0]
+    for control in inputs:
+        state = pm.step(MODEL, state, control, step)
+    assert np.abs(state - states[-1]).max() < OPEN_LOOP
+
+
+def test_a_heavier_duration_weight_makes_shorter_plans(monkeypatch):
+    monkeypatch.setattr(sp, "LONGEST", (1.6,))  # one start of the optimisation instead of five
+    durations = [
+        plan_throw(MODEL, 2.0, 1.13, 1.7, PlanParams(w, rho), 0.04).path.duration
+        for w, rho in ((3e3, 0.3), (5e4, 0.005))
+    ]
+    assert durations[1] < durations[0] - 0.2
+
+
+def test_with_bounds_on_the_payload_alone_plans_outrun_the_vehicle(plan, monkeypatch):
+    monkeypatch.setattr(sp, "LONGEST", (1.4,))  # one start of the optimisation instead of five
+    free = plan_throw(MODEL, 2.0, 1.13, 2.2, sp.payload_bounds_only(plan.params), 0.04, lag=0.11)
+    assert free.path.duration < plan.path.duration - 0.05
+    turns = [np.abs(one.reference(0.0, 0.005, 130)[1][:, 1:]).max() for one in (plan, free)]
+    assert turns[0] < 1.2 * plan.params.max_turn
+    assert turns[1] > 1.5 * plan.params.max_turn
+
+
+def test_bad_plans_are_refused():
+    with pytest.raises(PlanError, match="horizontal"):
+        sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([0.0, 0.0, 1.0]), PlanParams())
+    with pytest.raises(PlanError, match="beside the plane"):
+        sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([1.0, 0.0, 0.0]), PlanParams())
+    falling = np.zeros((1, 6, 3))
+    falling[0, 2, 2] = -9.81
+    with pytest.raises(PlanError, match="falls freely"):
+        sp.flat_reference(MODEL, falling)

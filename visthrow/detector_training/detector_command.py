@@ -1,0 +1,522 @@
+"""``visthrow detector``: train the learnt keypoint detector on rendered frames, and hold it against
+OpenCV's.
+"""
+
+import argparse
+import math
+import sys
+import time
+from dataclasses import fields, replace
+from functools import partial
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow import config
+from visthrow.common.arguments import ABOVE_ZERO, NUMBER, WHOLE, add_common
+from visthrow.common.errors import VisthrowError
+from visthrow.training.device import resolve
+
+LEVELS = {
+    "clean": {},
+    "blur": {"blur": 1.0},
+    "motion": {"motion": 1.0},
+    "noise": {"noise": 1.0},
+    "light": {"light": 1.0},
+    "colours": {"look": 1.0},
+    "photographs": {"ground": 1.0},
+    "clutter": {"clutter": 1.0},
+    "rope": {"parts": 1.0},
+    "all, half": dict.fromkeys(
+        ("blur", "motion", "noise", "light", "look", "ground", "clutter", "parts"), 0.5
+    ),
+    "all": dict.fromkeys(
+        ("blur", "motion", "noise", "light", "look", "ground", "clutter", "parts"), 1.0
+    ),
+}
+"""Nuisances one by one, and together."""
+
+OTHER_LENS = "all, half; another lens"
+LEVELS[OTHER_LENS] = LEVELS["all, half"]
+BENT = {"fx": 232.0, "fy": 232.0, "k1": 0.05, "k2": -0.006, "fov_deg": 145.0}
+"""A lens beyond those of the training: longer by 1.4, where they reach 1.35, and bent outwards by
+0.05, where they reach 0.02.
+"""
+
+HIT = 4.0  # a detection whose points are off by more than this on average is of something else [px]
+
+KNOWN = ("nothing", "pose", "track")
+"""What detectors are told besides the picture: nothing; attitude and height; also where the ball
+was a frame ago, and how far it can be while it hangs. The runner tells all of it.
+"""
+
+TRACK_ERROR = math.radians(
+    4.0
+)  # of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s
+
+TOGETHER = 20  # throws in one process at a time
+
+CHECKPOINT, WEIGHTS = "checkpoint.pt", "learnt.npz"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    train = actions.add_parser("train", help="train it; rendering and learning on one device")
+    train.add_argument(
+        "name",
+        nargs="?",
+        default="small",
+        metavar="NAME",
+        help="of configs/detector, or a file (default: small)",
+    )
+    train.add_argument(
+        "--out",
+        default="runs/detector",
+        metavar="FOLDER",
+        help="for checkpoint and weights (default: runs/detector)",
+    )
+    train.add_argument(
+        "--textures",
+        metavar="FOLDER",
+        help="photographs for ground and walls (default: those of scikit-image)",
+    )
+    train.add_argument(
+        "--minutes", type=ABOVE_ZERO, metavar="N", help="stop after so long; --resume goes on"
+    )
+    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    add_common(train, json=False)
+    check = actions.add_parser(
+        "check", help="recall and pixel error by nuisance, beside the OpenCV detector"
+    )
+    check.add_argument(
+        "--weights",
+        metavar="FILE",
+        help="of visthrow detector train (default: those that are shipped)",
+    )
+    check.add_argument(
+        "--frames", type=int, default=100, metavar="N", help="a nuisance (default: 100)"
+    )
+    check.add_argument(
+        "--known",
+        default="pose",
+        choices=KNOWN,
+        help="what the detectors are told; track: as in flight (default: pose)",
+    )
+    check.add_argument(
+        "--textures",
+        metavar="FOLDER",
+        help="photographs (default: those of scikit-image that were not trained on)",
+    )
+    check.add_argument("--seed", type=WHOLE, default=0, help="of the scenes")
+    check.add_argument(
+        "--out",
+        metavar="FILE",
+        help="picture of the first frames of each nuisance with what was found, .png",
+    )
+    add_common(check)
+    throw = actions.add_parser(
+        "throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate"
+    )
+    throw.add_argument(
+        "--policy",
+        default="vision",
+        metavar="POLICY",
+        help="a shipped name or a file (default: vision)",
+    )
+    throw.add_argument(
+        "--by",
+        default="contours",
+        choices=("learnt", "contours"),
+        help="detector (default: contours)",
+    )
+    throw.add_argument(
+        "--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)"
+    )
+    throw.add_argument(
+        "--target", type=NUMBER, default=2.0, metavar="M", help="distance (default: 2.0)"
+    )
+    throw.add_argument(
+        "--throws",
+        type=int,
+        default=20,
+        metavar="N",
+        help="each in a hall of its own (default: 20)",
+    )
+    throw.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="processes; the throws do not depend on them (default: 1)",
+    )
+    throw.add_argument(
+        "--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic"
+    )
+    throw.add_argument(
+        "--nuisances",
+        type=NUMBER,
+        default=0.5,
+        metavar="X",
+        help="0: clean, 1: as bad as in training (default: 0.5)",
+    )
+    throw.add_argument("--seed", type=WHOLE, default=0, help="of everything random")
+    add_common(throw)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, check, or throw."""
+    return {"train": train, "check": check, "throw": throw}[args.action](args)
+
+
+def throw(args: argparse.Namespace) -> int:
+    """Throw on pictures and print the landing errors; VisthrowError for no throws, no such plant,
+    or a policy that sees no keypoints.
+    """
+    from visthrow.common.workers import done
+    from visthrow.task.measurement import Throws
+    from visthrow.throws.loading import load_policy
+    from visthrow.throws.plants import known_plant
+    from visthrow.throws.reference_protocol import plan
+
+    known_plant(args.plant)
+    loaded = load_policy(args.policy, None, args.overrides)
+    if (
+        min(args.throws, args.jobs) < 1
+        or loaded.policy.contract["observation"]["layout"] != "vision"
+    ):
+        given = f"--throws {args.throws}, --jobs {args.jobs} with policy '{loaded.name}'"
+        raise VisthrowError(f"{given}; expected 1 or more of each, and a vision policy")
+    looks = {
+        "device": resolve(args.device),
+        "by": args.by,
+        "weights": args.weights,
+        "nuisances": args.nuisances,
+    }
+    jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
+    parts = [
+        part
+        for _, part in sorted(
+            done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs), key=itemgetter(0)
+        )
+    ]
+    columns = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
+    found = {name: sum(part[1][name] for part in parts) for name in parts[0][1]}
+    share = {name: found[name] / max(found["frames"], 1) for name in ("ball", "goal")}
+    figures = Throws(args.target, **columns).summary() | share | {"refused": found["refused"]}
+    error = columns["error"][np.isfinite(columns["error"])]
+    width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error)) if len(error) > 1 else math.nan
+    print(
+        f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of"
+        f" {args.throws} landed, {found['refused']} refused, error"
+        f" {error.mean() if len(error) else math.nan:.3f} +- {width:.3f} m (95 %), ball found in"
+        f" {100 * figures['ball']:.1f} %, goal in {100 * figures['goal']:.1f} % of"
+        f" {found['frames']} frames"
+    )
+    if args.json is not None:
+        from visthrow.common.storage import write_json
+
+        write_json(args.json, figures | {"errors": error.tolist()})
+    return 0
+
+
+def _thrown(
+    loaded, plant: str, looks: dict[str, Any], job
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Throws of one batch, in halls of their own, and what was found in how many frames."""
+    from visthrow.detector_training.eyes import Eyes
+    from visthrow.detector_training.scenes.scene import Nuisances
+    from visthrow.throws.reference_protocol import fly_batch
+
+    bad = Nuisances(*(looks["nuisances"],) * len(fields(Nuisances)))
+    camera, rope, halls = (
+        loaded.experiment.camera,
+        loaded.experiment.rope,
+        1000 * job.seed + job.batch,
+    )
+    eyes = Eyes(
+        camera,
+        rope.mount,
+        rope.length + rope.payload_offset,
+        job.count,
+        halls,
+        **looks | {"nuisances": bad},
+    )
+    return fly_batch([loaded], plant, job, eyes), eyes.found
+
+
+def train(args: argparse.Namespace) -> int:
+    """Train and write the weights; VisthrowError where the folder holds a training already, or none
+    to go on from.
+    """
+    from camera.params import CameraParams
+    from visthrow.detector_training.fit_detector import Fit, FitParams
+    from visthrow.detector_training.scenes.textures import photographs
+
+    params = config.load(FitParams, config.find("detector", args.name), args.overrides)
+    folder = Path(args.out)
+    saved = folder / CHECKPOINT
+    if saved.exists() != args.resume:
+        there = (
+            "holds a training; go on with --resume, or name another folder"
+            if saved.exists()
+            else "no checkpoint to resume from"
+        )
+        raise VisthrowError(f"{folder}: {there}")
+    files = None if args.textures is None else photographs(args.textures)
+    fit = Fit(
+        params,
+        config.load(CameraParams, config.find("camera", "fisheye")),
+        resolve(args.device),
+        files,
+    )
+    if args.resume:
+        fit.load(saved)
+    folder.mkdir(parents=True, exist_ok=True)
+    begin, first = time.monotonic(), fit.step
+
+    def tell(step: int, losses: dict[str, float]) -> None:
+        spent = time.monotonic() - begin
+        words = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
+        print(
+            f"step {step} of {params.steps}, {spent:.0f} s, {1e3 * spent / (step - first):.0f} ms a"
+            f" step: {words}",
+            flush=True,
+        )
+
+    done = fit.run(
+        tell, begin + 60.0 * args.minutes if args.minutes is not None else math.inf, saved
+    )
+    figures = fit.calibrate()
+    fit.networks.made_by = {
+        "config": config.to_dict(params),
+        "steps": fit.step,
+        "calibration": figures,
+    }
+    fit.networks.save(folder / WEIGHTS)
+    print(
+        f"{'trained' if done else 'stopped'} at step {fit.step}; calibration"
+        f" {figures}\n{folder / WEIGHTS}"
+    )
+    return 0
+
+
+def check(args: argparse.Namespace) -> int:
+    """Detect in frames of each nuisance with both detectors and print what became of them;
+    VisthrowError for numbers that make no sense.
+    """
+    from camera.detectors.contours import Detector
+    from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
+    from camera.fisheye import Fisheye
+    from camera.params import CameraParams
+    from visthrow.detector_training.scenes.renderer import Renderer
+    from visthrow.detector_training.scenes.textures import HELD_OUT, photographs
+
+    if args.frames < 1 or Path(args.out or "sheet.png").suffix != ".png":
+        raise VisthrowError(
+            f"--frames {args.frames}, --out {args.out}; expected 1 or more, and a .png"
+        )
+    camera = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
+    renderer = Renderer(camera.fisheye, resolve(args.device), photographs(args.textures, HELD_OUT))
+    networks, table, rows = Networks.load(args.weights or SHIPPED), {}, []
+
+    def both(camera: CameraParams) -> dict[str, Detector]:
+        parts = Fisheye(camera.fisheye), camera.payload_radius, camera.goal_side
+        return {"learnt": LearntDetector(*parts, networks=networks), "opencv": Detector(*parts)}
+
+    detectors = both(camera)
+    for level, nuisances in LEVELS.items():
+        if level == OTHER_LENS:
+            camera = replace(camera, fisheye=replace(camera.fisheye, **BENT))
+            detectors = both(camera)
+        table[level], pictures = counted(
+            camera, renderer, detectors, nuisances, args.frames, args.seed, args.known
+        )
+        rows.append(pictures)
+        _print(level, table[level], first=len(rows) == 1)
+    table["neither"] = mistaken(detectors)
+    print(
+        f"of {table['neither']['looks']} looks at photographs with neither: "
+        + ", ".join(
+            f"{name} reported {table['neither'][name]['ball']} balls and"
+            f" {table['neither'][name]['goal']} squares"
+            for name in detectors
+        )
+    )
+    if args.out is not None:
+        import cv2
+
+        from visthrow.common.storage import atomic_write
+
+        atomic_write(
+            args.out, cv2.imencode(".png", np.vstack([np.hstack(row) for row in rows]))[1].tobytes()
+        )
+    if args.json is not None:
+        from visthrow.common.storage import write_json
+
+        write_json(args.json, table)
+    return 0
+
+
+def mistaken(detectors: dict) -> dict[str, Any]:
+    """Balls and squares that detectors report in photographs that show neither, nine cuts of each;
+    nothing is told to them.
+    """
+    import cv2
+
+    from visthrow.detector_training.scenes.textures import HELD_OUT, TRAINING, photographs
+
+    found: dict[str, Any] = {"looks": 0} | {name: {"ball": 0, "goal": 0} for name in detectors}
+    for path in photographs(names=TRAINING + HELD_OUT):
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        height, width = picture.shape[0] * 2 // 3, picture.shape[1] * 2 // 3
+        for k in range(9):
+            top, left = (
+                (picture.shape[0] - height) * (k // 3) // 2,
+                (picture.shape[1] - width) * (k % 3) // 2,
+            )
+            cut = cv2.resize(
+                picture[top : top + height, left : left + width],
+                (640, 640),
+                interpolation=cv2.INTER_AREA,
+            )
+            found["looks"] += 1
+            for name, detector in detectors.items():
+                seen = detector.detect(np.ascontiguousarray(cut))
+                for kind in ("ball", "goal"):
+                    found[name][kind] += getattr(seen, kind) is not None
+    return found
+
+
+def figures_of(
+    rows: list[tuple[str, bool, bool, float, float]], spent: list[float]
+) -> dict[str, float]:
+    """Recall, precision, median and 95th percentile of the pixel error by kind; median time [s];
+    mean probability less the hits.
+
+    Args:
+        rows: of each frame and kind: the kind, whether it was there, whether it was reported, the
+            mean error of its points [px], and the probability that was reported.
+        spent: times of the frames [s].
+    """
+    found: dict[str, float] = {}
+    hits = np.array([there and reported and off < HIT for _, there, reported, off, _ in rows])
+    _, was_there, reports, errors, probabilities = map(np.array, zip(*rows))
+    for kind in ("ball", "goal"):
+        own = np.array([row[0] == kind for row in rows])
+        off = errors[own & hits] if np.any(own & hits) else np.array([math.nan])
+        there, reported, hit = (int(np.sum(own & of)) for of in (was_there, reports, hits))
+        found |= {
+            f"{kind}_there": there,
+            f"{kind}_recall": hit / max(there, 1),
+            f"{kind}_precision": hit / max(reported, 1),
+            f"{kind}_median_px": float(np.median(off)),
+            f"{kind}_p95_px": float(np.percentile(off, 95)),
+        }
+    over = (
+        float(probabilities[reports].mean() - hits[reports].mean()) if np.any(reports) else math.nan
+    )
+    return found | {"seconds": float(np.median(spent)), "overconfidence": over}
+
+
+def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator):
+    """What a detector is told of scene e; see :data:`KNOWN`."""
+    from camera.detectors.contours import Known
+    from visthrow.detector_training.eyes import HANGING
+
+    rot_wc, distance = truth.rot_wc[e].numpy(), float(truth.ball_c[e].norm())
+    pose = {"up_c": rot_wc[2], "height": height, "north_c": rot_wc[0]} if known != "nothing" else {}
+    if known != "track":
+        return Known(**pose)
+    ray = truth.ball_ray[e].numpy() + TRACK_ERROR / math.sqrt(2.0) * rng.standard_normal(3)
+    return Known(
+        **pose,
+        ball_ray_c=ray / np.linalg.norm(ray),
+        ball_distance=HANGING if distance < HANGING[1] else None,
+    )
+
+
+def counted(
+    camera,
+    renderer,
+    detectors: dict,
+    nuisances: dict[str, float],
+    frames: int,
+    seed: int,
+    known: str,
+) -> tuple[dict[str, dict[str, float]], list]:
+    """Figures of each detector in random frames, and pictures of the first four with what the first
+    detector found.
+    """
+    from camera.detectors.contours import detected_keypoints
+    from camera.fisheye import Fisheye
+    from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, payload_keypoints
+    from camera.mount import nominal_rot_cb
+    from camera.overlay import draw_overlay
+    from visthrow.detector_training.scenes.scene import Nuisances, random_scenes, truth_of
+
+    lens, eyes = (
+        Fisheye(camera.fisheye),
+        KeypointCamera(replace(camera, noise=replace(camera.noise, invalid_reads="edge"))),
+    )
+    none = dict.fromkeys(Nuisances.__dataclass_fields__, 0.0)
+    rows, spent, pictures = {name: [] for name in detectors}, {name: [] for name in detectors}, []
+    for first in range(0, frames, 8):
+        number = 7_000_000 + 1000 * seed + first
+        scenes = random_scenes(
+            camera, renderer.textures, min(8, frames - first), number, Nuisances(**none | nuisances)
+        )
+        truth, images = truth_of(scenes, lens), renderer.render(scenes, seed).cpu().numpy()
+        corners, _ = lens.project(truth.corners_c)
+        box, _ = payload_keypoints(eyes, truth.ball_c.float())
+        true = np.concatenate([corners.numpy(), lens.denormalize(box).numpy()], 1)
+        for e, image in enumerate(images[..., ::-1]):
+            rot_wc = truth.rot_wc[e].numpy()
+            knows = known_of(
+                known, truth, float(scenes.pose[e, 2]), e, np.random.default_rng([number, e])
+            )
+            for name, detector in detectors.items():
+                begin = time.perf_counter()
+                seen = detector.detect(image, knows)
+                spent[name].append(time.perf_counter() - begin)
+                points, valid = detected_keypoints(
+                    eyes, seen, rot_wc @ nominal_rot_cb(camera.mount).numpy()
+                )
+                off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)
+                for kind, part in (
+                    ("ball", slice(GOAL_KEYPOINTS, None)),
+                    ("goal", slice(0, GOAL_KEYPOINTS)),
+                ):
+                    thing, there = getattr(seen, kind), bool(getattr(truth, f"{kind}_seen")[e])
+                    rows[name].append(
+                        (
+                            kind,
+                            there,
+                            thing is not None,
+                            float(off[part].mean()),
+                            getattr(thing, "score", 0.0),
+                        )
+                    )
+                if name == next(iter(detectors)) and len(pictures) < 4:
+                    pictures.append(draw_overlay(eyes, points, valid, np.ascontiguousarray(image)))
+    return {name: figures_of(rows[name], spent[name]) for name in detectors}, pictures
+
+
+def _print(level: str, figures: dict[str, dict[str, float]], first: bool) -> None:
+    """A line a detector."""
+    if first:
+        print(
+            "| nuisance | detector | ball: recall, precision | error: median, p95 | goal: recall,"
+            " precision | error | a frame |"
+        )
+        print("|---|---|---|---|---|---|---|")
+    for name, f in figures.items():
+        parts = [
+            f"{f[f'{kind}_recall']:.3f}, {f[f'{kind}_precision']:.3f} |"
+            f" {f[f'{kind}_median_px']:.2f}, {f[f'{kind}_p95_px']:.2f} px"
+            for kind in ("ball", "goal")
+        ]
+        print(f"| {level} | {name} | {' | '.join(parts)} | {1e3 * f['seconds']:.0f} ms |")
+    sys.stdout.flush()

@@ -1,0 +1,246 @@
+"""Keypoints from rendered pictures: what a camera on each vehicle of a plant would take, and what a
+detector makes of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from camera.detectors.contours import Detector, Seen, detected_keypoints
+from camera.detectors.following import Following
+from camera.detectors.learnt import LearntDetector, Networks
+from camera.fisheye import Fisheye
+from camera.keypoints import KEYPOINTS, KeypointCamera
+from camera.params import CameraParams
+from visthrow.common.storage import atomic_write
+from visthrow.detector_training.scenes.renderer import Renderer
+from visthrow.detector_training.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
+from visthrow.detector_training.scenes.textures import HELD_OUT, photographs
+from visthrow.onboard.observations import rotation_from_quat
+
+HANGING = (0.2, 0.6)  # distance of a hanging ball from the lens [m]
+
+SURE = 0.5  # share of the looks in a hover in which ball and goal must be found
+
+BY = ("learnt", "contours")  # detectors
+
+THINGS = ("ball", "goal")  # what they look for
+
+
+def render_hall(
+    params: CameraParams,
+    pos_w: torch.Tensor,
+    rot_wb: torch.Tensor,
+    ball_w: torch.Tensor,
+    goal_w: torch.Tensor,
+    samples: int,
+) -> np.ndarray:
+    """Render a grey hall with vehicle, ball and goal square.
+
+    Args:
+        pos_w: position of the vehicle [m], shape (3,), world frame. rot_wb: its attitude, (3, 3).
+        ball_w, goal_w: positions [m], shape (3,), world frame. samples: rays a pixel.
+
+    Returns a picture, BGR, uint8, shape (H, W, 3).
+    """
+    places = (place[None] for place in (pos_w, rot_wb, ball_w, goal_w))
+    scenes = posed_scenes(params, *places, torch.tensor([True]))
+    picture = Renderer(params.fisheye, files=[], samples=samples).render(scenes)[0].numpy()
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+class Eyes:
+    """A camera, a hall and a detector for each of E vehicles; the halls were not seen in the
+    detector's training.
+
+    Attributes:
+        frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2),
+            validity (8,).
+        seen: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
+        found: how often ball and goal were found, frames looked at, and throws that were refused.
+    """
+
+    def __init__(
+        self,
+        params: CameraParams,
+        mount_b: Sequence[float],
+        below: float,
+        count: int,
+        seed: int,
+        device: str = "cpu",
+        by: str = "learnt",
+        samples: int = 4,
+        nuisances: Nuisances | None = None,
+        weights: str | None = None,
+        keep: bool = False,
+    ) -> None:
+        """Draw the halls; ValueError for another detector, no weights, no photographs.
+
+        Args:
+            params: camera. mount_b: of the rope [m], body frame. below: the ball's centre hangs so
+                far below it [m].
+            count: E. seed: of halls and sensors. device: of the renderer. by: one of `BY`. samples:
+                rays a pixel.
+            nuisances: left out, all. weights: of the learnt detector; left out, those that are
+                shipped. keep: whether frames are kept.
+        """
+        if by not in BY:
+            raise ValueError(f"detector '{by}'; expected one of {', '.join(BY)}")
+        self.params, self.count, self._keep = params, count, keep
+        self._mount_b, self._below = np.array(mount_b, float), below
+        self.renderer = Renderer(params.fisheye, device, photographs(names=HELD_OUT), samples)
+        self._draw, self._nuisances = (count, seed), nuisances or Nuisances()
+        lens = Fisheye(params.fisheye)
+        if by == "learnt":
+            networks = Networks.load(weights) if weights else Networks.load()
+            self.detector: Detector = LearntDetector(
+                lens, params.payload_radius, params.goal_side, networks=networks
+            )
+        else:
+            self.detector = Detector(lens, params.payload_radius, params.goal_side)
+        self.camera, self._looks = KeypointCamera(params), 0
+        self._hall: Scenes | None = None
+        self._followed: list[Following] = []
+        self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
+        self.seen: tuple[np.ndarray, np.ndarray] | None = None
+        self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
+        self._hits = {
+            name: np.zeros(count, int) for name in THINGS
+        }  # looks of each vehicle in which it was found
+
+    def look(
+        self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Take and look at a picture of each vehicle: normalised keypoints, float32, shape (E, 8,
+        2), and validity, shape (E, 8).
+
+        Args:
+            now: truth, a `visthrow.throws.plants.Snapshot`. measured: likewise, what poses tell:
+                attitude and height help the detector.
+            goal_w: [m], shape (E, 3). carried: which payloads hang, shape (E,).
+        """
+        pictures = (
+            self.renderer.render(self._scenes(now, goal_w, np.asarray(carried)), self._looks)
+            .cpu()
+            .numpy()
+        )
+        self._looks += 1
+        points, valid = (
+            np.zeros((self.count, KEYPOINTS, 2), np.float32),
+            np.zeros((self.count, KEYPOINTS), bool),
+        )
+        rots = rotation_from_quat(torch.from_numpy(np.array(measured.quat_wb, float))).numpy()
+        if not self._followed:
+            self._followed = [self._hanging(rot) for rot in rots]
+        for e in range(self.count):
+            picture = np.ascontiguousarray(pictures[e, ..., ::-1])
+            seen = self._looked(
+                picture, e, measured.pos_w[e], rots[e], bool(carried[e]), float(measured.time)
+            )
+            one, ok = detected_keypoints(self.camera, seen, rots[e])
+            points[e], valid[e] = one.numpy(), ok.numpy()
+            if e == 0 and self._keep:
+                self.frames.append((picture, one, ok))
+        self.seen = points, valid
+        return points, valid
+
+    def lost(self) -> dict[int, str]:
+        """By vehicle, which of ball and goal was found too seldom to throw with; asked
+        in a hover.
+        """
+        lost = {
+            int(e): name
+            for name in THINGS
+            for e in np.flatnonzero(self._hits[name] < SURE * self._looks)
+        }
+        self.found["refused"] = len(lost)
+        return lost
+
+    def _hanging(self, rot_wb: np.ndarray) -> Following:
+        """A ball that hangs still below a vehicle: where it is looked for first."""
+        from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
+        return Following(
+            self.params.payload_radius, self.params.goal_side, from_lens - [0.0, 0.0, self._below]
+        )
+
+    def _looked(
+        self,
+        picture: np.ndarray,
+        e: int,
+        pos_w: np.ndarray,
+        rot_wb: np.ndarray,
+        carried: bool,
+        stamp: float,
+    ) -> Seen:
+        """What the detector finds, or of a ball that it misses where it is predicted; vehicle e and
+        its measured pose at a time [s].
+        """
+        rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
+        eye_w = pos_w + rot_wb @ np.array(self.params.mount.position_b)
+        seen = self.detector.detect(
+            picture,
+            self._followed[e].known(
+                rot_wc, rot_wb[:, 2], eye_w, HANGING if carried else None, stamp
+            ),
+        )
+        self.found["frames"] += 1
+        for name in THINGS:
+            self._hits[name][e] += getattr(seen, name) is not None
+            self.found[name] += getattr(seen, name) is not None
+        return self._followed[e].take(seen, rot_wc, stamp)
+
+    def sheet(self, path: Path) -> Path:
+        """Draw six of the kept frames, spread over the throw, with what was found; returns the
+        path.
+        """
+        import cv2
+
+        from camera.overlay import draw_overlay
+
+        chosen = [
+            self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 6).round().astype(int)
+        ]
+        drawn = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]
+        sheet = np.vstack([np.hstack(drawn[:3]), np.hstack(drawn[3:])])
+        atomic_write(path, cv2.imencode(".png", sheet)[1].tobytes())
+        return path
+
+    def _scenes(self, now: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
+        """The halls with vehicles, balls and squares where they are."""
+        tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
+        rot = rotation_from_quat(tensor(now.quat_wb))
+        plain = posed_scenes(
+            self.params,
+            tensor(now.pos_w),
+            rot,
+            tensor(now.payload_pos_w),
+            tensor(goal_w),
+            torch.from_numpy(carried),
+        )
+        hall = self._hall = self._hall or dressed(
+            plain, Draw(*self._draw), self.renderer.textures, self._nuisances
+        )
+        rate = tensor(now.rate_b)
+        turned = rate @ self.camera.rot_cb.T
+        lens = torch.linalg.cross(rate, self.camera.position_b.expand(self.count, 3))
+        vel = tensor(now.vel_w) + torch.einsum("eij,ej->ei", rot, lens)
+        rope = torch.cat(
+            [
+                plain.rope[:, :3],
+                hall.rope[:, 3:4] * torch.from_numpy(carried)[:, None],
+                hall.rope[:, 4:],
+            ],
+            -1,
+        )
+        ball = torch.cat([plain.ball[:, :4], tensor(now.payload_vel_w), hall.ball[:, 7:]], -1)
+        return replace(
+            hall,
+            pose=torch.cat([plain.pose[:, :7], vel, turned], -1),
+            ball=ball,
+            rope=rope,
+            goal=torch.cat([plain.goal[:, :2], hall.goal[:, 2:]], -1),
+        )

@@ -1,0 +1,545 @@
+"""Training of the learnt detector on rendered frames, on the CPU or a GPU, and the calibration of
+its confidences.
+
+Frames are rendered as the training goes, into a pool that forgets the oldest; each step takes some
+of the pool. Where rendering is cheap (a GPU) every frame is new. kornia varies colours and
+sharpness once more, on the device."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from camera.detectors.learnt import (
+    CELL,
+    KINDS,
+    LEAST_REACH,
+    PATCH,
+    REACH,
+    Networks,
+    Views,
+    halved,
+    log_size,
+    looked,
+    patches_of,
+    places_of,
+    spread_of,
+    views_about,
+)
+from camera.fisheye import Fisheye
+from camera.params import CameraParams
+from visthrow.detector_training.scenes.renderer import Renderer
+from visthrow.detector_training.scenes.scene import Truth, lens_row, random_scenes, truth_of
+
+NEAR = 0.5  # a finding within this many sizes of the thing is of it
+
+
+@dataclass(frozen=True)
+class FitParams:
+    """A training; one file of ``configs/detector``.
+
+    Raises ValueError: a count below 1, or more fresh frames than the pool holds.
+    """
+
+    steps: int
+    batch: int  # frames a step
+    patches: int  # of each kind a step
+    fresh: int  # frames rendered at a time
+    reuse: int  # steps between two renderings
+    pool: int  # frames that are kept
+    samples: int  # rays a pixel
+    learning_rate: float  # at its highest; one cycle
+    lenses: float  # share of rendered batches with another lens than the camera's
+    calibration: int  # frames that confidences are calibrated on
+    seed: int
+
+    def __post_init__(self) -> None:
+        counts = {
+            name: getattr(self, name)
+            for name in (
+                "steps",
+                "batch",
+                "patches",
+                "fresh",
+                "reuse",
+                "pool",
+                "samples",
+                "calibration",
+            )
+        }
+        if min(counts.values()) < 1 or self.fresh > self.pool:
+            raise ValueError(
+                f"detector: {counts}; expected 1 or more of each, and no more fresh frames than the"
+                " pool holds"
+            )
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What is where in frames; `Truth` on the device, float32."""
+
+    rays: dict[str, Tensor]  # by kind, unit ray to the middle, shape (F, 3)
+    sizes: dict[str, Tensor]  # by kind [rad], shape (F,)
+    seen: dict[str, Tensor]  # by kind, whole in view, shape (F,), bool
+    corners: Tensor  # unit rays, shape (F, 4, 3)
+    north: Tensor  # the world's x in the camera frame, shape (F, 3)
+    distractor: Tensor  # unit ray to something else, shape (F, 3)
+
+
+def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Labels:
+    """Labels of frames.
+
+    Args:
+        truth: of their scenes. things_c: place of one other thing [m], shape (F, 3), camera frame.
+        radius: of the ball [m]. device: where they go.
+    """
+    unit = lambda v: F.normalize(v, dim=-1)  # noqa: E731
+    corners = unit(truth.corners_c)
+    middle = unit(corners.mean(1))
+    sizes = {
+        "ball": (radius / truth.ball_c.norm(dim=-1)).clamp(max=0.99).asin(),
+        "goal": (corners @ middle[:, :, None])[..., 0].clamp(max=1.0).acos().mean(1),
+    }
+    move = lambda v: v.to(device, torch.float32)  # noqa: E731
+    return Labels(
+        {"ball": move(truth.ball_ray), "goal": move(middle)},
+        {kind: move(size) for kind, size in sizes.items()},
+        {"ball": truth.ball_seen.to(device), "goal": truth.goal_seen.to(device)},
+        move(corners),
+        move(truth.rot_wc[:, 0]),
+        move(unit(things_c)),
+    )
+
+
+def other_lens(lens, generator: torch.Generator):
+    """A lens like this one with another scale and a bend, its picture of the same size."""
+    scale, bend = (
+        (1.0 + 0.35 * torch.rand(1, generator=generator)).item(),
+        (0.06 * torch.rand(1, generator=generator) - 0.04).item(),
+    )
+    reach = 0.98 * min(lens.width, lens.height) / 2.0 / (lens.fx * scale)
+    half = min(lens.half_fov, 1.75)
+    while half * (1.0 + bend * half * half) > reach:
+        half *= 0.98
+    return replace(
+        lens, fx=lens.fx * scale, fy=lens.fy * scale, k1=bend, fov_deg=math.degrees(2.0 * half)
+    )
+
+
+class Pool:
+    """Rendered frames and their labels, of one lens a block of frames."""
+
+    def __init__(self, params: FitParams, camera: CameraParams, renderer: Renderer) -> None:
+        """Start empty."""
+        self.params, self.camera, self.renderer = params, camera, renderer
+        self.blocks: list[tuple[Tensor, Labels, Fisheye]] = []
+
+    def refill(self, step: int) -> None:
+        """Render the frames of a step; the oldest go."""
+        p = self.params
+        seed = p.seed * 1_000_003 + step
+        generator = torch.Generator().manual_seed(seed)
+        lens = self.camera.fisheye
+        if torch.rand(1, generator=generator).item() < p.lenses:
+            lens = other_lens(lens, generator)
+        self.blocks.append(
+            rendered(replace(self.camera, fisheye=lens), self.renderer, p.fresh, seed)
+        )
+        del self.blocks[: -max(p.pool // p.fresh, 1)]
+
+    def take(self, generator: torch.Generator) -> tuple[Tensor, Labels, Fisheye]:
+        """Frames of one block, at random."""
+        return self.blocks[int(torch.randint(len(self.blocks), (1,), generator=generator))]
+
+
+def rendered(
+    camera: CameraParams, renderer: Renderer, count: int, seed: int
+) -> tuple[Tensor, Labels, Fisheye]:
+    """Frames of random scenes, their labels and their lens."""
+    lens = Fisheye(camera.fisheye)
+    scenes = random_scenes(camera, renderer.textures, count, seed)
+    scenes = replace(
+        scenes,
+        lens=torch.cat([lens_row(camera.fisheye)[:9].expand(count, -1), scenes.lens[:, 9:]], -1),
+    )
+    truth = truth_of(scenes, lens)
+    thing = scenes.things[:, 0, 1:4].double() - scenes.pose[:, :3].double()
+    things_c = torch.einsum("eji,ej->ei", truth.rot_wc, thing)
+    return (
+        renderer.render(scenes, seed),
+        labels_of(truth, things_c, camera.payload_radius, renderer.device),
+        lens,
+    )
+
+
+def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
+    """Loss of places, after Zhou et al., "Objects as Points", 2019: focal about a soft peak; place
+    and size at the peak's cell.
+    """
+    total, (height, width) = grids.new_zeros(()), grids.shape[-2:]
+    cells = torch.stack(
+        torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy"), -1
+    ).to(grids)
+    for k, kind in enumerate(KINDS):
+        pixels, inside = lens.project(labels.rays[kind])
+        at = (pixels + 0.5) / CELL
+        cell = at.floor().long()
+        inside = inside & (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+        cell = torch.where(inside[:, None], cell, 0)
+        seen = labels.seen[kind] & inside
+        away = (cells + 0.5 - at[:, None, None]).square().sum(-1)
+        here = (cells.long() == cell[:, None, None]).all(-1)
+        soft = torch.where(here, 1.0, torch.exp(-away / (2 * 0.7**2))) * seen[:, None, None]
+        logits = grids[:, k, 0]
+        probability = logits.sigmoid().clamp(1e-5, 1 - 1e-5)
+        cut = inside & ~seen  # half in view: neither a place nor none
+        counts = 1.0 - (cut[:, None, None] & (away < 9.0)).float()
+        negative = -((1 - soft) ** 4 * probability**2 * (1 - probability).log() * counts).sum(
+            (1, 2)
+        )
+        rows = torch.arange(len(grids), device=grids.device)
+        peak = grids[rows, k, :, cell[:, 1], cell[:, 0]]
+        p = peak[:, 0].sigmoid().clamp(1e-5, 1 - 1e-5)
+        positive = -((1 - p) ** 2 * p.log())
+        off = (peak[:, 1:3] - (at - cell - 0.5)).abs().sum(-1) + 0.5 * (
+            peak[:, 3] - log_size(labels.sizes[kind], lens)
+        ).abs()
+        total = total + (negative + seen * (positive + off)).mean()
+    return total
+
+
+def looks(
+    kind: str,
+    labels: Labels,
+    lens: Fisheye,
+    count: int,
+    peaks: tuple[Tensor, Tensor] | None,
+    generator,
+) -> tuple[Tensor, ...]:
+    """Places to look at: frame, ray, size; half of them about the thing, the others at other
+    things, anywhere, or where the search erred.
+
+    Args:
+        kind: of the thing. labels, lens: of the frames. count: of places.
+        peaks: of the search, rays (F, 3) and sizes (F,). generator: on the labels' device.
+    """
+    device = labels.corners.device
+    draw = lambda *shape: torch.randn(*shape, generator=generator, device=device)  # noqa: E731
+    index = torch.randint(len(labels.corners), (count,), generator=generator, device=device)
+    size = labels.sizes[kind][index] * (0.25 * draw(count)).exp()
+    ray = labels.rays[kind][index]
+    ray = F.normalize(ray + 0.45 * size[:, None] * draw(count, 3), dim=-1)
+    source = torch.randint(8, (count,), generator=generator, device=device)
+    other = "goal" if kind == "ball" else "ball"
+    anywhere = F.normalize(draw(count, 3), dim=-1)
+    anywhere[:, 2] = anywhere[:, 2].abs()
+    for number, rays in (
+        (4, labels.distractor[index]),
+        (5, anywhere),
+        (6, labels.rays[other][index]),
+    ):
+        ray = torch.where((source == number)[:, None], rays, ray)
+    if peaks is not None:
+        ray = torch.where((source == 7)[:, None], peaks[0][index], ray)
+        size = torch.where(source == 7, peaks[1][index].clamp(5e-3, 0.5), size)
+    return index, ray, size
+
+
+def look_loss(
+    networks: Networks,
+    kind: str,
+    frames: Tensor,
+    labels: Labels,
+    lens: Fisheye,
+    places,
+    augment,
+    generator,
+) -> Tensor:
+    """Loss of one kind's close looks: whether the thing is there, where and how large, and how far
+    off that is.
+    """
+    index, ray, size = places
+    north = labels.north[index] + 0.15 * torch.randn(
+        len(index), 3, generator=generator, device=ray.device
+    )
+    views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH[kind], 1.0), north)
+    patches = patches_of(frames, index, views, lens, PATCH[kind])
+    found = getattr(networks, kind)(augment(patches))
+    true = labels.rays[kind][index]
+    inside = views.points(true[:, None])[:, 0]
+    apart = inside.norm(dim=-1)
+    ahead = (views.axes[:, 2] * true).sum(-1) > 0.2
+    ratio = (labels.sizes[kind][index] / size).log().abs()
+    there = labels.seen[kind][index] & ahead & (apart < 0.75) & (ratio < 0.8)
+    gone = ~ahead | (apart > 1.2)
+    judged = there | gone
+    known = F.binary_cross_entropy_with_logits(found[:, 0], there.float(), reduction="none")
+    known = (known * judged).sum() / judged.sum().clamp(min=1)
+    off = offsets(kind, views, found, labels, index)
+    where = off.abs().mean(1)
+    error = (
+        off[:, :2].norm(dim=-1) if kind == "ball" else off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
+    )
+    spread = found[:, 1].clamp(-8.0, 3.0)
+    accuracy = (error.detach() / spread.exp()).clamp(max=50.0) + spread  # of a Laplace distribution
+    there = there.float()
+    return known + ((8.0 * where + 0.2 * accuracy) * there).sum() / there.sum().clamp(min=1)
+
+
+def offsets(kind: str, views: Views, found: Tensor, labels: Labels, index: Tensor) -> Tensor:
+    """How far off what was found is, in half sides; of a ball the last column is of its
+    log size.
+    """
+    if kind == "ball":
+        size = (labels.sizes["ball"][index] * REACH["ball"] / views.reach).log()
+        return torch.cat(
+            [
+                found[:, 2:4] - views.points(labels.rays["ball"][index, None])[:, 0],
+                0.5 * (found[:, 4] - size)[:, None],
+            ],
+            -1,
+        )
+    corners = views.points(labels.corners[index])
+    quadrants = torch.tensor(
+        [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], device=corners.device
+    )
+    off = corners - corners.mean(1, keepdim=True)
+    match = torch.stack([(off.roll(-k, 1) * quadrants).sum((1, 2)) for k in range(4)], 1).argmax(1)
+    order = (torch.arange(4, device=corners.device)[None] + match[:, None]) % 4
+    corners = torch.gather(corners, 1, order[..., None].expand(-1, -1, 2))
+    return found[:, 2:] - corners.clamp(-3.0, 3.0).flatten(1)
+
+
+class Fit:
+    """A training.
+
+    Attributes:
+        step: steps done. networks: as they are.
+    """
+
+    def __init__(
+        self,
+        params: FitParams,
+        camera: CameraParams,
+        device: str = "cpu",
+        files: list[Path] | None = None,
+    ) -> None:
+        """Start with untrained networks.
+
+        Args:
+            params: of the training. camera: that they will look through.
+            device: "cpu" or "cuda:0". files: photographs; left out, those of the training.
+        """
+        import kornia.augmentation as augmentations
+
+        torch.manual_seed(params.seed)
+        self.params, self.camera, self.device = params, camera, device
+        self.networks = Networks().to(device)
+        self.renderer = Renderer(camera.fisheye, device, files, params.samples)
+        self.pool = Pool(params, camera, self.renderer)
+        self.optimizer = torch.optim.AdamW(
+            self.networks.parameters(), params.learning_rate, weight_decay=1e-4
+        )
+        self.rates = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimizer, params.learning_rate, params.steps + 1, pct_start=0.1
+        )
+        self._vary = augmentations.AugmentationSequential(
+            augmentations.ColorJiggle(0.25, 0.3, 0.3, 0.03, p=0.7),
+            augmentations.RandomGaussianBlur((3, 3), (0.3, 1.0), p=0.2),
+            augmentations.RandomGaussianNoise(std=0.03, p=0.3),
+            data_keys=["input"],
+        )
+        self.step = 0
+
+    def augment(self, pictures: Tensor) -> Tensor:
+        """Pictures in -1 to 1 with other colours, blur and noise."""
+        return self._vary((pictures + 1.0) * 0.5) * 2.0 - 1.0
+
+    def advance(self) -> dict[str, float]:
+        """One step; returns its losses."""
+        p = self.params
+        seed = p.seed * 7_000_003 + self.step
+        generator = torch.Generator(self.device).manual_seed(seed)
+        host = torch.Generator().manual_seed(seed)
+        if self.step % p.reuse == 0 or not self.pool.blocks:
+            self.pool.refill(self.step)
+        frames, labels, lens = self.pool.take(host)
+        chosen = torch.randperm(len(frames), generator=host)[: p.batch].to(self.device)
+        frames, labels = frames[chosen], _chosen(labels, chosen)
+        grids = self.networks.search(self.augment(halved(frames)))
+        losses = {"search": search_loss(grids, labels, lens)}
+        for k, kind in enumerate(KINDS):
+            places = looks(
+                kind, labels, lens, p.patches, _peaks(grids[:, k].detach(), lens), generator
+            )
+            losses[kind] = look_loss(
+                self.networks, kind, frames, labels, lens, places, self.augment, generator
+            )
+        self.optimizer.zero_grad()
+        sum(losses.values()).backward()
+        torch.nn.utils.clip_grad_norm_(self.networks.parameters(), 1.0)
+        self.optimizer.step()
+        self.rates.step()
+        self.step += 1
+        return {name: float(value.detach()) for name, value in losses.items()}
+
+    def run(
+        self,
+        tell: Callable[[int, dict[str, float]], None],
+        until: float = math.inf,
+        saved: Path | None = None,
+    ) -> bool:
+        """Train to the end or to a time; whether it is done.
+
+        Args:
+            tell: called with step and losses now and then.
+            until: on `time.monotonic` [s].
+            saved: checkpoint, written now and then and at the end.
+        """
+        begin = time.monotonic()
+        while self.step < self.params.steps and time.monotonic() < until:
+            losses = self.advance()
+            if self.step % 50 == 0 or self.step == self.params.steps:
+                tell(self.step, losses)
+            if saved is not None and time.monotonic() - begin > 60.0:
+                self.save(saved)
+                begin = time.monotonic()
+        if saved is not None:
+            self.save(saved)
+        return self.step >= self.params.steps
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint, whole or not at all."""
+        parts = {"networks": self.networks, "optimizer": self.optimizer, "rates": self.rates}
+        torch.save(
+            {name: part.state_dict() for name, part in parts.items()} | {"step": self.step},
+            path.with_suffix(".part"),
+        )
+        path.with_suffix(".part").replace(path)
+
+    def load(self, path: Path) -> None:
+        """Take up a checkpoint; the pool is filled anew.
+
+        Raises ValueError: no checkpoint of such a training.
+        """
+        try:
+            saved = torch.load(path, map_location=self.device, weights_only=True)
+            for name in ("networks", "optimizer", "rates"):
+                getattr(self, name).load_state_dict(saved[name])
+            self.step = saved["step"]
+        except Exception as error:  # of a file that is none, torch raises what its bytes lead to
+            raise ValueError(f"{path}: no checkpoint of this training: {error}") from error
+
+    @torch.no_grad()
+    def calibrate(self) -> dict[str, dict[str, float]]:
+        """Fit the probabilities and the accuracies to what becomes of findings in frames that were
+        not trained on; returns figures.
+        """
+        self.networks.eval()
+        made = {kind: [] for kind in KINDS}
+        done = 0
+        while done < self.params.calibration:
+            count = min(16, self.params.calibration - done)
+            frames, labels, lens = rendered(self.camera, self.renderer, count, 900_000_001 + done)
+            for e in range(count):
+                for kind, rows in findings(
+                    self.networks, frames[e : e + 1], _chosen(labels, torch.tensor([e])), lens
+                ).items():
+                    made[kind].append(rows)
+            done += count
+        figures = {}
+        for kind in KINDS:
+            rows = torch.cat(made[kind]).cpu().double()
+            factor, offset = platt(rows[:, 0], rows[:, 1])
+            hits = rows[rows[:, 1] > 0.5]
+            scale = float((hits[:, 2] / hits[:, 3]).median() / math.log(2.0)) if len(hits) else 1.0
+            self.networks.calibration[kind] = (factor, offset, scale)
+            figures[kind] = {
+                "places": len(rows),
+                "hits": len(hits),
+                "factor": factor,
+                "offset": offset,
+                "accuracy": scale,
+            }
+        return figures
+
+
+def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -> dict[str, Tensor]:
+    """What becomes of the places of one frame: logit, whether it is of the thing, error [rad], told
+    accuracy [rad]; a row each.
+    """
+    places, found = places_of(networks.search(halved(frame)), lens), {}
+    for kind in KINDS:
+        rays, sizes = places[kind]
+        views, out, rays, sizes = looked(networks, kind, frame, rays, sizes, lens, labels.north)
+        error = _apart(rays, labels.rays[kind])
+        hit = (
+            labels.seen[kind]
+            & (error < NEAR * labels.sizes[kind])
+            & ((sizes / labels.sizes[kind]).log().abs() < 0.5)
+        )
+        if kind == "goal":
+            error = _apart(
+                views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1], labels.corners
+            ).amin(-1)
+        clear = labels.seen[kind] | (
+            _apart(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
+        )  # else half in view
+        rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
+        found[kind] = rows[clear.expand(len(rows))]
+    return found
+
+
+def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
+    """Factor and offset of logits that make them probabilities.
+
+    Source: Platt, "Probabilistic outputs for support vector machines", 1999; Newton's steps with a
+    weak prior at 1 and 0."""
+    weights, x = (
+        torch.tensor([1.0, 0.0], dtype=torch.float64),
+        torch.stack([logits, torch.ones_like(logits)], -1),
+    )
+    prior = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    for _ in range(50):
+        p = (x @ weights).sigmoid()
+        gradient = x.T @ (p - hits) + 0.5 * (weights - prior)
+        hessian = x.T @ (x * (p * (1 - p))[:, None]) + 0.5 * torch.eye(2, dtype=torch.float64)
+        weights = weights - torch.linalg.solve(hessian, gradient).clamp(-1.0, 1.0)
+    return float(weights[0]), float(weights[1])
+
+
+def _apart(rays: Tensor, others: Tensor) -> Tensor:
+    """Angles between unit rays [rad], exact for small ones."""
+    return torch.linalg.cross(*torch.broadcast_tensors(rays, others)).norm(dim=-1).clamp(
+        max=1.0
+    ).asin() + (((rays * others).sum(-1) < 0.0) * math.pi / 2)
+
+
+def _chosen(labels: Labels, rows: Tensor) -> Labels:
+    rows = rows.to(labels.corners.device)
+    tables = (
+        {kind: value[rows] for kind, value in table.items()}
+        for table in (labels.rays, labels.sizes, labels.seen)
+    )
+    return Labels(*tables, labels.corners[rows], labels.north[rows], labels.distractor[rows])
+
+
+def _peaks(grids: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:
+    """Ray and size of one of the three likeliest cells of each frame, of grids (F, 4, h, w) of one
+    kind.
+    """
+    logits = grids[:, 0].flatten(1)
+    best = logits.topk(3, dim=1).indices
+    best = best.gather(1, torch.randint(3, (len(best), 1), device=best.device))[:, 0]
+    width, rows = grids.shape[-1], torch.arange(len(grids), device=grids.device)
+    j, i = best // width, best % width
+    place = torch.stack([i, j], -1) + 0.5 + grids[rows, 1:3, j, i].clamp(-1, 1)
+    rays, _ = lens.unproject(place * CELL - 0.5)
+    return F.normalize(rays, dim=-1), grids[rows, 3, j, i].clamp(-6.0, 3.0).exp() * (
+        CELL / lens.params.fx
+    )

@@ -1,0 +1,102 @@
+"""Pictures of scenes, on Warp: CPU or CUDA, the same seed the same bits on one device."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+
+from camera.params import FisheyeParams
+from visthrow.detector_training.scenes.scene import Scenes
+from visthrow.detector_training.scenes.textures import photographs, pyramid
+
+
+class Renderer:
+    """Renders batches of scenes of one size of picture.
+
+    Attributes:
+        textures: number of photographs.
+    """
+
+    def __init__(
+        self,
+        lens: FisheyeParams,
+        device: str = "cpu",
+        files: list[Path] | None = None,
+        samples: int = 6,
+    ) -> None:
+        """Load the photographs. Raises ValueError: samples below 1, or no photographs.
+
+        Args:
+            lens: size of the pictures. device: "cpu" or "cuda:0".
+            files: photographs; left out, those of the training; without any, scenes are plain.
+            samples: rays a pixel.
+        """
+        import warp as wp
+
+        from camera.warp_start import start
+
+        if samples < 1:
+            raise ValueError(f"renderer: samples {samples}; expected 1 or more")
+        start()
+        self.lens, self.device, self.samples = lens, device, samples
+        pixels = pyramid(photographs() if files is None else files)
+        self.textures = len(pixels)
+        self._pixels = wp.array(pixels, dtype=wp.uint8, device=device)
+
+    def render(self, scenes: Scenes, seed: int = 0) -> torch.Tensor:
+        """Pictures, RGB, uint8, shape (E, H, W, 3), on the renderer's device.
+
+        Args:
+            scenes: rows of `Scenes`; texture -1 is plain grey.
+            seed: of the samples and the sensor's noise.
+        """
+        import warp as wp
+
+        from visthrow.detector_training.scenes.scene_kernel import render
+
+        p = self.lens
+        image = torch.empty(
+            scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device
+        )
+        s = scenes.to(self.device)
+        rows = [
+            s.lens,
+            s.pose,
+            s.shutter,
+            s.ball,
+            s.goal,
+            s.ground,
+            s.walls,
+            s.light,
+            s.rope,
+            s.sensor,
+            s.things,
+        ]
+        arrays = [row.float().contiguous() for row in rows]
+
+        def launch(part: slice) -> None:
+            inputs = [wp.from_torch(row[part]) for row in arrays]
+            out = wp.from_torch(image[part])
+            dim = (out.shape[0], p.height, p.width)
+            wp.launch(
+                render,
+                dim=dim,
+                device=self.device,
+                inputs=[seed, self.samples, *inputs, self._pixels],
+                outputs=[out],
+            )
+
+        if self.device.startswith("cuda"):
+            torch.cuda.synchronize(self.device)  # Warp's stream is not torch's
+            launch(slice(0, scenes.count))
+            wp.synchronize_device(self.device)
+            return image
+        wp.load_module(device=self.device, module="visthrow.detector_training.scenes.scene_kernel")
+        share = -(
+            -scenes.count // torch.get_num_threads()
+        )  # Warp runs a launch on the CPU in the thread that asks for it
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+            list(
+                threads.map(launch, (slice(at, at + share) for at in range(0, scenes.count, share)))
+            )
+        return image

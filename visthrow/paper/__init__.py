@@ -1,0 +1,9 @@
+"""The paper's results made again: baseline, sweeps of trainings, report, and the committed records.
+
+An optional room: nothing outside it imports it. Records of speed are in `records/bench`, of
+accuracy in `records`, each with its command and commit; `visthrow bench records` prints them."""
+
+from pathlib import Path
+
+RECORDS = Path(__file__).with_name("records")
+"""Committed records: ``throws`` (packed results), ``training`` (runs), ``findings`` (text)."""

@@ -1,0 +1,390 @@
+"""Flies planned throws: in the controller's own pendulum (idealised), and on the plants behind
+:mod:`visthrow.throws.plants`.
+
+The own model knows no delay, no noise, no lag of the release and no aerodynamics: what is flown
+there is an upper bound. On the plants the pendulum's state is put together from what the plant
+measures, payload velocity included, and smoothed by the model. To make up for delays the controller
+looks ahead by what it knows of them (measurement, command queue, motors) through its own model
+under the commands on their way, and trips the latch early by the release's lag;
+:data:`COMPENSATIONS` names which of the two it does."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.params import GRAVITY
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.rotations import matrix_of_quat
+from visthrow.paper.baseline import pendulum_model as pm
+from visthrow.paper.baseline.mpc import MPC, MPCParams, SolverError
+from visthrow.paper.baseline.pendulum_model import Pendulum
+from visthrow.paper.baseline.throw_plan import Plan, landing_point
+from visthrow.task import Experiment
+from visthrow.task.measurement import Throws, pilots_hover
+from visthrow.throws.flight import (
+    FALL_TIME,
+    Decision,
+    Flight,
+    Pilots,
+    Scores,
+    Smoothness,
+    hover,
+    throw,
+)
+from visthrow.throws.plants import HybridPlant, Plant, Snapshot
+from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
+
+# Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one
+FINE = 4
+
+
+SENT = 8  # commands on their way that the controller looks back at; more than any delay holds
+
+TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
+"""Share of a measurement in the estimate of payload position and velocity, cable direction and
+rate, and attitude.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown(Throws):
+    """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model."""
+
+    position_error: (
+        np.ndarray
+    )  # of the payload at separation against the planned release [m], shape (N,)
+    velocity_error: np.ndarray  # the same [m/s], shape (N,)
+    tracking: (
+        np.ndarray
+    )  # root mean square distance of the payload from the path until the release [m], shape (N,)
+    step_times: np.ndarray  # of all steps of the controller [s], shape (K,)
+
+
+def _off(
+    plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray
+) -> dict[str, np.ndarray]:
+    """How far payloads were from the planned release at separation; NaN where a throw failed."""
+    blank = np.where(good, 1.0, np.nan)
+    return {
+        "position_error": np.linalg.norm(pos_w - plan.release.pos_w, axis=1) * blank,
+        "velocity_error": np.linalg.norm(vel_w - plan.release.vel_w, axis=1) * blank,
+    }
+
+
+def _normalised(params: MPCParams, command: np.ndarray) -> np.ndarray:
+    """Commands (E, 4) as a policy puts them out."""
+    throttle = np.sqrt(np.clip(command[:, :1], 0.0, params.max_thrust) / params.max_thrust)
+    return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / np.array(params.max_rate)])
+
+
+def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
+    """Hover with the rest of a pilot's hover, by ``configs/start/hover.toml``: states, shape (N,
+    16).
+
+    What varies between throws: position and velocity of the payload, direction and rate of the
+    cable, attitude. The vehicle's mass, the cable's length and the battery, which vary in training
+    too, are the model's own here."""
+    start, rng = pilots_hover(), np.random.default_rng(seed)
+
+    def drawn(spread) -> np.ndarray:
+        return np.asarray(spread) * rng.uniform(-1.0, 1.0, (count, 3))
+
+    state, _ = pm.hover(plan.model, np.tile(plan.path.coefficients[0, 0], (count, 1)))
+    state[:, pm.POS] += drawn(start.position)
+    state[:, pm.VEL] += drawn(start.velocity)
+    state[:, pm.DIR] += np.tan(math.radians(start.cable_angle_deg)) * drawn([1.0, 1.0, 0.0])
+    state[:, pm.DIR] /= np.linalg.norm(state[:, pm.DIR], axis=1, keepdims=True)
+    rate = math.radians(start.cable_rate_deg) * drawn([1.0, 1.0, 1.0])
+    state[:, pm.RATE] = rate - (rate * state[:, pm.DIR]).sum(1, keepdims=True) * state[:, pm.DIR]
+    state[:, 12:15] = 0.5 * np.radians(drawn(start.attitude_deg))
+    state[:, pm.QUAT] /= np.linalg.norm(state[:, pm.QUAT], axis=1, keepdims=True)
+    return state
+
+
+def fly_pendulum(plan: Plan, count: int = 10, seed: int = 0, landing_height: float = 0.04) -> Flown:
+    """Fly a plan so many times in the pendulum that the controller believes in; the landing's
+    height [m] is the payload's centre's.
+
+    A throw fails when the controller's programme is not solved, the cable slackens or the payload
+    falls short. The release comes at the plan's time, within a control period if need be."""
+    params = MPCParams()
+    controller = MPC(plan.model, params)
+    steps, horizon = math.ceil(plan.path.duration / params.period - 1e-6), params.stages
+    last = plan.path.duration - (steps - 1) * params.period
+    reference = plan.reference(0.0, params.period, steps + horizon)
+    state = random_starts(plan, count, seed)
+    good, tracking, times = np.ones(count, bool), np.zeros(count), []
+    smoothness = np.full(count, np.nan)
+    for e in range(count):
+        controller.reset()
+        change = Smoothness(_normalised(params, pm.hover(plan.model, state[e : e + 1, pm.POS])[1]))
+        try:
+            for k in range(steps):
+                off = state[e, pm.POS] - reference[0][k, pm.POS]
+                tracking[e] += off @ off
+                command = controller.step(
+                    state[e], (reference[0][k : k + horizon + 1], reference[1][k : k + horizon])
+                )
+                times.append(controller.step_time)
+                change.add(_normalised(params, command[None]))
+                good[e] &= pm.tension(plan.model, state[e], command) > 0.0
+                state[e] = pm.step(
+                    plan.model, state[e], command, params.period if k < steps - 1 else last, FINE
+                )
+        except SolverError:
+            good[e] = False
+        smoothness[e] = change.value[0]
+    point, fall = landing_point(state[:, pm.POS], state[:, pm.VEL], landing_height)
+    good &= np.isfinite(fall)
+    blank = np.where(good, 1.0, np.nan)
+    landing = point * blank[:, None]
+    error = np.linalg.norm(landing - [plan.target, 0.0], axis=1)
+    return Flown(
+        plan.target,
+        good,
+        landing,
+        error,
+        (plan.path.duration + fall) * blank,
+        np.full(count, np.nan),
+        smoothness * blank,
+        **_off(plan, state[:, pm.POS], state[:, pm.VEL], good),
+        tracking=np.sqrt(tracking / steps) * blank,
+        step_times=np.array(times),
+    )
+
+
+def pendulum_state(snapshot: Snapshot, mount_b: np.ndarray) -> np.ndarray:
+    """State of the pendulum as a plant shows it, cable straight from mount to payload, shape (E,
+    16).
+    """
+    rot = matrix_of_quat(snapshot.quat_wb)
+    arm = rot @ mount_b
+    cable = snapshot.payload_pos_w - snapshot.pos_w - arm
+    length = np.linalg.norm(cable, axis=1, keepdims=True)
+    moving = (
+        snapshot.payload_vel_w
+        - snapshot.vel_w
+        - np.einsum("eij,ej->ei", rot, np.cross(snapshot.rate_b, mount_b))
+    )
+    direction = cable / length
+    rate = np.cross(direction, moving) / length
+    return np.concatenate(
+        [snapshot.payload_pos_w, snapshot.payload_vel_w, direction, rate, snapshot.quat_wb], axis=1
+    )
+
+
+@dataclass(frozen=True)
+class Delays:
+    """What the controller makes up for [s]."""
+
+    measurement: float = 0.0  # age of what it is told
+    command: float = 0.0  # from a command to its effect
+    release: float = 0.0  # from the latch to separation
+
+
+COMPENSATIONS = ("none", "release", "delay", "both")
+"""What is made up for: nothing, as in the paper; the release's lag; delays of measurement, command
+and motors; all.
+"""
+
+
+def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
+    """Known delays of a plant: mean age of measurements; command queue, set-point filter and
+    motors; release.
+
+    Raises ConfigError: no compensation of that name.
+    """
+    if compensation not in COMPENSATIONS:
+        raise ConfigError(
+            f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}"
+        )
+    vehicle, told = experiment.vehicle, experiment.task.observation.latency
+    motors = vehicle.motor.time_constant if vehicle.motor.kind == "first_order" else 0.0
+    setpoint = (
+        vehicle.controller.setpoint_time_constant
+        if vehicle.controller.kind == "betaflight"
+        else 0.0
+    )
+    effect = vehicle.queue.delay + setpoint + motors
+    across = (float(np.mean(told)), effect) if compensation in ("delay", "both") else (0.0, 0.0)
+    return Delays(*across, experiment.release.lag if compensation in ("release", "both") else 0.0)
+
+
+def look_ahead(
+    model: Pendulum,
+    state: np.ndarray,
+    sent: np.ndarray,
+    period: float,
+    begin: float,
+    end: float = 0.0,
+) -> np.ndarray:
+    """Predict states, shape (E, 16), under the commands that were given from ``begin`` to ``end``
+    [s] ago, each held for a period [s].
+
+    ``sent``: commands given one period ago, two periods ago and so on, shape (K, E, 4).
+    """
+    age = begin
+    while age > end + 1e-9:
+        k = max(math.ceil(age / period - 1e-9), 1)
+        part = age - max((k - 1) * period, end)
+        state = pm.step(model, state, sent[min(k, len(sent)) - 1], part)
+        age -= part
+    return state
+
+
+def _started(
+    name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
+) -> tuple[Plant, np.ndarray]:
+    """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m],
+    shape (3,).
+    """
+    task, start = experiment.task, pilots_hover()
+    if name == "hybrid":
+        plant = HybridPlant(
+            experiment, count, seed, device, task.noise, task.observation.latency, start
+        )
+        return plant, np.array([0.0, 0.0, start.spawn_height])
+    plant, rng = batch_plant(experiment, name, target, batch, count, seed)
+    return plant, place_in_hover(plant, experiment, rng)
+
+
+class Controllers(Pilots):
+    """MPC of E vehicles as the pilots of a flight: tracks a plan, and trips the latch at its time.
+
+    Attributes: ``latch``, the period of the throw in which the latch trips, ``most`` periods of a
+    throw, ``times`` of all steps [s]."""
+
+    def __init__(
+        self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int
+    ) -> None:
+        """Begin in hover, with the experiment's limits, mount and release; commands come each
+        period [s].
+        """
+        self.plan, self.delays, self.period, action = plan, delays, period, experiment.task.action
+        self.params = MPCParams(
+            period=period, max_thrust=action.max_thrust, max_rate=action.max_rate
+        )
+        self.latch = round((plan.path.duration - delays.release) / period)
+        self.most = self.latch + round((experiment.release.lag + FALL_TIME) / period) + 2
+        self.times: list[float] = []
+        self._mpc = [MPC(plan.model, self.params) for _ in range(count)]
+        self._reference = plan.reference(delays.command, period, self.most + self.params.stages)
+        self._hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
+        goal_w = np.tile([plan.target, 0.0, 0.0], (count, 1))
+        super().__init__(experiment, goal_w, _normalised(self.params, self._hover))
+        self._estimate: np.ndarray | None = None
+        self._period = 0
+
+    def decide(self, flight: Flight, seen: Snapshot, held: np.ndarray) -> Decision:
+        """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has
+        failed, and is held.
+        """
+        command, k, n = held.copy(), self._period, self.params.stages
+        sent = np.stack(
+            [*flight.commands[: -SENT - 1 : -1], *[self._hover] * (SENT - len(flight.commands))]
+        )
+        span = self.delays.measurement + self.delays.command
+        state = look_ahead(
+            self.plan.model, self._estimated(seen, sent, span), sent, self.period, span
+        )
+        reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
+        for e in np.flatnonzero(flight.flown):
+            try:
+                command[e] = self._mpc[e].step(state[e], reference)
+                self.times.append(self._mpc[e].step_time)
+            except SolverError as error:
+                flight.fail(e, str(error))
+        self._period += 1
+        return Decision(
+            command, np.full(len(command), k >= self.latch), _normalised(self.params, command)
+        )
+
+    def _estimated(self, seen: Snapshot, sent: np.ndarray, span: float) -> np.ndarray:
+        """State now: the model's prediction from the period before, corrected by what
+        is measured.
+        """
+        measured = pendulum_state(seen, np.array(self.experiment.rope.mount))
+        if self._estimate is None:
+            self._estimate = measured
+        then = look_ahead(
+            self.plan.model, self._estimate, sent, self.period, span + self.period, span
+        )
+        side = np.sign((then[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
+        measured[:, pm.QUAT] *= side
+        estimate = then + TRUST * (measured - then)
+        for part in (pm.DIR, pm.QUAT):
+            estimate[:, part] /= np.linalg.norm(estimate[:, part], axis=1, keepdims=True)
+        direction = estimate[:, pm.DIR]
+        estimate[:, pm.RATE] -= (estimate[:, pm.RATE] * direction).sum(1, keepdims=True) * direction
+        self._estimate = estimate
+        return estimate
+
+
+class _Tracking(Scores):
+    """Scores, and how well payloads keep to the plan."""
+
+    def __init__(self, pilots: Controllers) -> None:
+        super().__init__(pilots)
+        count = len(pilots.goal_w)
+        self.pilots, self.separated = pilots, np.full((2, count, 3), np.nan)
+        self._sum, self._due, self._period = np.zeros(count), np.zeros(count), 0
+
+    def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+        super().after(flight, seen, sent)
+        if sent.action is None:
+            return
+        now, path = flight.now, self.pilots.plan.path
+        self._period += 1
+        elapsed = self._period * flight.plant.period
+        due = now.attached & (elapsed <= path.duration)
+        self._sum += due * ((now.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2).sum(
+            1
+        )
+        self._due += due
+        for e in np.flatnonzero(seen.attached & ~now.attached):
+            back = flight.plant.time - flight.plant.landing.separation_time[e]
+            vel = now.payload_vel_w[e] + np.array([0.0, 0.0, GRAVITY * back])
+            self.separated[:, e] = (
+                now.payload_pos_w[e] - back * 0.5 * (vel + now.payload_vel_w[e]),
+                vel,
+            )
+
+    def flown(self, flight: Flight) -> Flown:
+        """Results of all throws."""
+        columns = self.columns(flight)
+        off = _off(self.pilots.plan, *self.separated, columns["success"])
+        tracking = np.sqrt(self._sum / np.maximum(self._due, 1)) * np.where(
+            columns["success"], 1.0, np.nan
+        )
+        return Flown(
+            self.pilots.plan.target,
+            **columns,
+            **off,
+            tracking=tracking,
+            step_times=np.array(self.pilots.times),
+        )
+
+
+def fly_plant(
+    plan: Plan,
+    plant_name: str,
+    experiment: Experiment,
+    delays: Delays,
+    count: int = 10,
+    seed: int = 0,
+    batch: int = 0,
+    device: str = "cpu",
+) -> Flown:
+    """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`, the delays made up for.
+
+    The throws are those that learnt policies meet with the same count and seed: in the training
+    simulator the same vehicles, ropes and starts as :func:`visthrow.training.protocol.throw`, on a
+    reference plant the same vehicles, winds and starts as batch ``batch`` of
+    :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller."""
+    plant, home = _started(plant_name, experiment, plan.target, batch, count, seed, device)
+    pilots = Controllers(plan, experiment, plant.period, delays, count)
+    flight = Flight(plant, pilots, tracking := _Tracking(pilots), home)
+    before = [] if plant_name == "hybrid" else [hover(HOVER_TIME)]
+    flight.run([*before, throw(pilots.most * plant.period)])
+    return tracking.flown(flight)

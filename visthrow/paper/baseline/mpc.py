@@ -1,0 +1,208 @@
+"""Nonlinear model-predictive controller of the pendulum: one real-time iteration of SQP a control
+period.
+
+Least squares over the horizon, on payload, cable, attitude and control effort (the paper, Sec.
+IV-A; weights are ours), under bounds on thrust and body rates. Each step linearises the model about
+the last solution moved on by one period, and solves one sparse quadratic programme with piqp's
+multistage factorisation.
+
+Source: Diehl, Bock, Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
+feedback control", SIAM J. Control Optim. 2005; Schwan, Jiang, Kuhn, Jones, "PIQP: A proximal
+interior-point quadratic programming solver", CDC 2023."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from visthrow.common.errors import VisthrowError
+from visthrow.paper.baseline import pendulum_model as pm
+from visthrow.paper.baseline.pendulum_model import DIR, INPUTS, QUAT, STATES, Pendulum
+
+WIDTH = STATES + INPUTS
+
+
+class SolverError(VisthrowError):
+    """The quadratic programme was not solved."""
+
+
+@dataclass(frozen=True)
+class MPCParams:
+    """Horizon, scales of the errors (a weight is one over the square), and bounds."""
+
+    period: float = 0.02  # [s]
+    stages: int = 62  # of one period: 1.24 s, the paper's 1.25 s in whole periods
+    position: float = 0.045  # of the payload [m]
+    velocity: float = 0.15  # of the payload [m/s]
+    direction: float = 0.15  # of the cable [-]
+    rate: float = 1.0  # of the cable [rad/s]
+    attitude: float = 0.3  # of the quaternion's parts [-]
+    thrust: float = 2.0  # off the feed-forward [N]
+    body_rate: float = 2.0  # off the feed-forward [rad/s]
+    min_thrust: float = 0.2  # [N]
+    max_thrust: float = 14.0  # [N]
+    max_rate: tuple[float, float, float] = (10.0, 10.0, 4.0)  # [rad/s]
+
+    @property
+    def state_weights(self) -> np.ndarray:
+        """Shape (16,)."""
+        scale = np.repeat(
+            [self.position, self.velocity, self.direction, self.rate, self.attitude],
+            [3, 3, 3, 3, 4],
+        )
+        return scale**-2.0
+
+    @property
+    def input_weights(self) -> np.ndarray:
+        """Shape (4,)."""
+        return np.array([self.thrust, *[self.body_rate] * 3]) ** -2.0
+
+
+class MPC:
+    """Controller of one vehicle."""
+
+    def __init__(self, model: Pendulum, params: MPCParams | None = None) -> None:
+        """Build the programme's pattern; it is factorised symbolically once.
+
+        ModuleNotFoundError where piqp is not installed.
+        """
+        import piqp
+
+        self.model, self.params = model, params or MPCParams()
+        n = self.params.stages
+        size = n * WIDTH + STATES
+        weights = np.concatenate([self.params.state_weights, self.params.input_weights])
+        self._weights = np.concatenate([np.tile(weights, n), self.params.state_weights])
+        self._rows_columns()
+        free, last, most = (
+            np.full(STATES, np.inf),
+            np.full(STATES, np.inf),
+            np.array(self.params.max_rate),
+        )
+        low = np.concatenate([*[np.r_[-free, self.params.min_thrust, -most]] * n, -last])
+        high = np.concatenate([*[np.r_[free, self.params.max_thrust, most]] * n, last])
+        self._bounds = low, high
+        self._solver = piqp.SparseSolver()
+        settings = self._solver.settings
+        settings.kkt_solver = piqp.KKTSolver.sparse_multistage
+        settings.eps_abs, settings.eps_rel = 1e-6, 1e-8
+        settings.check_duality_gap = False
+        self._solved = piqp.PIQP_SOLVED
+        self.reset()
+        self._set_up(np.zeros(size), np.zeros(self._matrix.shape[0]))
+
+    def reset(self) -> None:
+        """Forget the last solution."""
+        self._states = self._inputs = None
+        self.step_time = 0.0
+
+    def _rows_columns(self) -> None:
+        """Pattern of the constraints: stage k's rows hold -[A B] of stage k and 1 of stage k + 1;
+        the first rows x_0.
+        """
+        n, eye = self.params.stages, np.arange(STATES)
+        row, column = [eye], [eye]
+        for k in range(n):
+            block = np.meshgrid(eye + (k + 1) * STATES, np.arange(WIDTH) + k * WIDTH, indexing="ij")
+            row += [block[0].ravel(), eye + (k + 1) * STATES]
+            column += [block[1].ravel(), eye + (k + 1) * WIDTH]
+        row, column = np.concatenate(row), np.concatenate(column)
+        self._order = np.lexsort((row, column))
+        shape = ((n + 1) * STATES, n * WIDTH + STATES)
+        count = np.bincount(column, minlength=shape[1])
+        pointer = np.concatenate([[0], np.cumsum(count)])
+        self._matrix = sparse.csc_matrix(
+            (np.ones(len(row)), row[self._order], pointer), shape=shape
+        )
+
+    def _fill(self, by_state: np.ndarray, by_input: np.ndarray) -> None:
+        n = self.params.stages
+        blocks = np.concatenate([-by_state, -by_input], axis=2).reshape(n, -1)
+        values = np.concatenate([blocks, np.ones((n, STATES))], axis=1).ravel()
+        self._matrix.data[:] = np.concatenate([np.ones(STATES), values])[self._order]
+
+    def step(self, state: np.ndarray, reference: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming
+        period, shape (4,).
+
+        Raises SolverError: the programme was not solved; the message carries the solver's status;
+        ValueError: a reference of another length.
+
+        Args:
+            state: now.
+            reference: states (N + 1, 16) and inputs (N, 4) at the ends of the stages, from now on.
+        """
+        began = time.perf_counter()
+        n = self.params.stages
+        target, effort = reference
+        if target.shape != (n + 1, STATES) or effort.shape != (n, INPUTS):
+            raise ValueError(
+                f"reference of shapes {target.shape}, {effort.shape}; expected ({n + 1}, 16),"
+                f" ({n}, 4)"
+            )
+        if self._states is None:
+            self._states, self._inputs = target.copy(), effort.copy()
+        state, *target = _same_side(
+            np.vstack([state, target]), np.vstack([self._states[:1], self._states])
+        )
+        target = np.array(target)
+        moved, by_state, by_input = pm.linearise(
+            self.model, self._states[:n], self._inputs, self.params.period
+        )
+        self._fill(by_state, by_input)
+        free = (
+            moved
+            - np.einsum("kij,kj->ki", by_state, self._states[:n])
+            - np.einsum("kij,kj->ki", by_input, self._inputs)
+        )
+        wanted = np.concatenate([np.concatenate([target[:n], effort], axis=1).ravel(), target[n]])
+        solution = self._solve(-self._weights * wanted, np.concatenate([state, free.ravel()]))
+        stages = solution[: n * WIDTH].reshape(n, WIDTH)
+        states, inputs = (
+            np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]]),
+            stages[:, STATES:],
+        )
+        command = inputs[0].copy()
+        self._move_on(states, inputs)
+        self.step_time = time.perf_counter() - began
+        return command
+
+    def _solve(self, linear: np.ndarray, right: np.ndarray) -> np.ndarray:
+        if self._ready:
+            self._solver.update(c=linear, A=self._matrix, b=right)
+        else:
+            self._set_up(linear, right)
+        status = self._solver.solve()
+        if status != self._solved:
+            self._ready = False
+            raise SolverError(
+                f"the controller's quadratic programme ended with {status}; expected {self._solved}"
+            )
+        return np.asarray(self._solver.result.x)
+
+    def _set_up(self, linear: np.ndarray, right: np.ndarray) -> None:
+        """Hand the whole programme over, with its pattern; after that only its numbers change."""
+        low, high = self._bounds
+        cost = sparse.diags(self._weights, format="csc")
+        self._solver.setup(cost, linear, self._matrix, right, x_l=low, x_u=high)
+        self._ready = True
+
+    def _move_on(self, states: np.ndarray, inputs: np.ndarray) -> None:
+        """Keep the solution as of one period later, its last input held; directions and quaternions
+        back at unit length.
+        """
+        self._inputs = np.concatenate([inputs[1:], inputs[-1:]])
+        self._states = np.concatenate(
+            [states[1:], pm.step(self.model, states[-1], inputs[-1], self.params.period)[None]]
+        )
+        for part in (DIR, QUAT):
+            self._states[:, part] /= np.linalg.norm(self._states[:, part], axis=1, keepdims=True)
+
+
+def _same_side(target: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Quaternions with the signs of others': q and -q are one attitude."""
+    target = target.copy()
+    sign = np.sign((target[:, QUAT] * near[:, QUAT]).sum(1))
+    target[:, QUAT] *= np.where(sign == 0.0, 1.0, sign)[:, None]
+    return target

@@ -1,0 +1,42 @@
+"""The baseline's throws for ``visthrow compare``, on the same targets as the policies'."""
+
+import argparse
+import tempfile
+
+import piqp  # noqa: F401  needed by every worker: a missing package is an error at once
+
+from visthrow.common.workers import status
+from visthrow.paper.baseline import thrower
+from visthrow.task.measurement import Throws
+from visthrow.throws.reference_protocol import FIELDS
+from visthrow.throws.results import Entry
+
+
+def throw_baseline(args: argparse.Namespace) -> list[Entry]:
+    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each
+    compensation.
+    """
+    rows, how = (
+        thrower.rows([args.plant]),
+        {
+            "config_name": args.config or "state",
+            "overrides": args.overrides,
+        },
+    )
+    sets = [
+        thrower.units(*row, target, args.throws, args.seed, **how)
+        for row in rows
+        for target in args.targets
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        found = thrower.flown(sets, folder, status)
+    status("")
+    throws = [
+        Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in found
+    ]
+    each = len(args.targets)
+    layouts = ("TO+MPC" if plant == thrower.OWN else "" for plant, _ in rows)
+    return [
+        Entry(thrower.title_of(*row), layout, throws[i * each : (i + 1) * each])
+        for i, (row, layout) in enumerate(zip(rows, layouts))
+    ]

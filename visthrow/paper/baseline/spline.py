@@ -1,0 +1,391 @@
+"""Payload's path from hover to release: a septic spline, jointly optimised waypoints and segment
+times, and its flatness.
+
+Segments of degree 7 meet with derivatives up to the fifth, so that the body rates of the flat
+vehicle are continuous. The path starts at rest with the vehicle level (all derivatives 0) and ends
+with the release's velocity and no acceleration or higher derivative, so that it goes on as flight
+at constant velocity: the reference of a controller whose horizon looks past the release. With four
+segments and given waypoints the conditions fix every coefficient.
+
+The optimisation is over the waypoints and times: ``rho int |snap|^2 dt + w_t T`` plus penalties on
+speed, acceleration and workspace (the paper, Sec. IV-A; bounds and penalties' weights are ours).
+Two more penalties are ours, on the thrust vector and its turning: without them short plans flip the
+vehicle in ways that no quadrotor follows."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import perm
+
+from sim.params import GRAVITY
+from visthrow.common.errors import VisthrowError
+from visthrow.paper.baseline.pendulum_model import Pendulum
+
+SEGMENTS, ORDER = 4, 8
+SMOOTH = 6  # derivatives 0 to 5 agree where two segments meet, and are given at the start
+
+END = 5  # derivatives 0 to 4 are given at the release
+
+SAMPLES, DENSE = 30, 300
+"""Samples of a segment, for penalties and energy: while improving a path, and to judge it, as
+thrust has narrow peaks.
+"""
+
+
+class PlanError(VisthrowError):
+    """A trajectory that cannot be planned."""
+
+
+LONGEST, SHORTEST, COARSE = (2.4, 1.8, 1.4, 1.1, 0.9), 0.4, 0.1
+"""Durations that are tried first: several starts, the shortest, the step [s].
+
+The best result is taken.
+"""
+
+EVEN = 0.02
+"""Weight of the squared logarithm of a segment's share over the first one's, relative to the
+duration's [s]: without it the segments grow so uneven that the path rings.
+"""
+
+MOST_UNEVEN = float(np.log(2.0))
+"""That logarithm past which the penalty acts: a segment of a few milliseconds would slip between
+the samples.
+"""
+
+# factor on what the thrust's vertical part lacks [1/N]: past zero the vehicle turns over and the
+# path is lost
+STIFF = 6.0
+
+DIFFERENCE = 1e-6  # step of the objective's slopes, in m and in logarithms of time
+
+# evaluations of the objective at each duration, which starts from the path of the one before
+EVALUATIONS = 100
+
+HOPELESS = 2.0  # ratio of objectives at which shortening ends
+
+
+@dataclass(frozen=True)
+class PlanParams:
+    """Weights and soft bounds.
+
+    Weights ``duration`` and ``energy`` as in the paper's table; the rest is ours.
+    """
+
+    duration: float = 30e3  # w_t [1/s]
+    energy: float = 0.005  # rho [s^7/m^2]
+    max_speed: float = 4.5  # of the payload [m/s]
+    max_acceleration: float = 12.0  # of the payload [m/s^2]
+    floor: float = 0.5  # lowest height of the payload [m]
+    ceiling: float = 2.2  # highest height of the payload [m]
+    backward: float = 0.4  # how far behind the start the payload may swing out [m]
+    max_thrust: float = 12.0  # of the vehicle [N]
+    least_lift: float = 0.8  # vertical part of the thrust [N]
+    least_pull: float = 0.4  # vertical part of the cable's pull, in the payload's weights [-]
+    max_turn: float = 9.0  # of the thrust's direction [rad/s]
+    # of squared excess, integrated over time; relative to the bound, or in m and weights [1/s]
+    penalty: float = 1e5
+
+
+def payload_bounds_only(params: PlanParams) -> PlanParams:
+    """Return the parameters without our bounds on the thrust: the paper's plan, which a vehicle
+    need not be able to follow.
+    """
+    return replace(params, max_thrust=np.inf, least_lift=-np.inf, max_turn=np.inf)
+
+
+@dataclass(frozen=True)
+class Spline:
+    """Piecewise polynomial of the payload; constant velocity after its end, rest before
+    its start.
+    """
+
+    times: np.ndarray  # of the segments [s], shape (S,)
+    coefficients: np.ndarray  # of t^0 to t^7 in each segment's own time, shape (S, 8, 3)
+
+    @property
+    def duration(self) -> float:
+        """Time from start to release [s]."""
+        return float(self.times.sum())
+
+    def sample(self, time: np.ndarray, derivatives: int = 6) -> np.ndarray:
+        """Payload's position and derivatives [m/s^n] at times since the start [s], shape (T,):
+        shape (T, 2 or more derivatives, 3).
+        """
+        time = np.atleast_1d(np.asarray(time, dtype=float))
+        inside = np.clip(time, 0.0, self.duration)
+        starts = np.concatenate([[0.0], np.cumsum(self.times)])
+        segment = np.clip(np.searchsorted(starts, inside, side="right") - 1, 0, len(self.times) - 1)
+        local = inside - starts[segment]
+        out = np.einsum("tdk,tkc->tdc", _rows(local, derivatives), self.coefficients[segment])
+        past = (time - inside)[:, None]
+        out[:, 0] += past * out[:, 1]
+        out[:, 2:][past[:, 0] > 0.0] = 0.0
+        return out
+
+
+def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
+    """Derivatives of the monomials t^0 to t^7 at times, shape (T, derivatives, 8)."""
+    n, k = np.arange(derivatives)[:, None], np.arange(ORDER)
+    return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
+
+
+BEGINS, ENDS = _rows(
+    np.array([0.0, 1.0])
+)  # the same where a segment begins and where it ends, in units of its time
+
+
+@lru_cache(maxsize=4)
+def _sample_rows(samples: int) -> np.ndarray:
+    return _rows((np.arange(samples) + 0.5) / samples)
+
+
+def _coefficients(
+    start: np.ndarray,
+    waypoints: np.ndarray,
+    end: np.ndarray,
+    velocity: np.ndarray,
+    times: np.ndarray,
+) -> np.ndarray:
+    """Coefficients in units of each segment's time, which keeps the matrix well conditioned; B
+    paths at once.
+
+    Waypoints (B, 3, D), times (B, 4); returns (B, 4, 8, D).
+    """
+    size, count = SEGMENTS * ORDER, len(times)
+    matrix, right = np.zeros((count, size, size)), np.zeros((count, size, len(start)))
+    matrix[:, :SMOOTH, :ORDER], right[:, 0] = BEGINS, start
+    row = SMOOTH
+    for i in range(SEGMENTS - 1):
+        here, there = slice(i * ORDER, (i + 1) * ORDER), slice((i + 1) * ORDER, (i + 2) * ORDER)
+        matrix[:, row, here], right[:, row] = ENDS[0], waypoints[:, i]
+        matrix[:, row + 1 : row + 1 + SMOOTH, here] = ENDS
+        ratio = (times[:, i] / times[:, i + 1])[:, None] ** np.arange(SMOOTH)
+        matrix[:, row + 1 : row + 1 + SMOOTH, there] = -ratio[:, :, None] * BEGINS
+        row += 1 + SMOOTH
+    matrix[:, row:, -ORDER:] = ENDS[:END]
+    right[:, row], right[:, row + 1] = end, velocity * times[:, -1:]
+    return np.linalg.solve(matrix, right).reshape(count, SEGMENTS, ORDER, -1)
+
+
+def residuals(
+    unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES
+) -> dict[str, np.ndarray]:
+    """Objective of B planar paths (along the throw, up) as sums of squares.
+
+    Args:
+        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2), of times [s], shape
+            (B, 4).
+        times, params, model, samples: of each segment.
+
+    Returns:
+        ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose squares add up to each part of
+        the objective.
+    """
+    count = len(times)
+    path = np.einsum("tdk,bskc->dbstc", _sample_rows(samples), unit)
+    path /= (times[None] ** np.arange(SMOOTH)[:, None, None])[:, :, :, None, None]
+    path = path.reshape(SMOOTH, -1, 2)
+    weight = np.sqrt(np.repeat(times / samples, samples, axis=1)).reshape(-1)
+    force, change = _thrust(model, path, np.array([0.0, GRAVITY]))[:2]
+    size = np.linalg.norm(force, axis=1)
+    turn = (
+        np.abs(force[:, 0] * change[:, 1] - force[:, 1] * change[:, 0])
+        / np.maximum(size, 0.05) ** 2
+    )
+    begin = np.repeat(unit[:, 0, 0, 0], SEGMENTS * samples)
+    excess = np.array(
+        [
+            np.linalg.norm(path[1], axis=1) / params.max_speed - 1.0,
+            np.linalg.norm(path[2], axis=1) / params.max_acceleration - 1.0,
+            path[0, :, 1] - params.ceiling,
+            params.floor - path[0, :, 1],
+            begin - path[0, :, 0] - params.backward,
+            size / params.max_thrust - 1.0,
+            STIFF * (params.least_lift - force[:, 1]),
+            (params.least_pull - 1.0 - path[2, :, 1] / GRAVITY),
+            np.minimum(turn / params.max_turn - 1.0, 20.0),
+        ]
+    )
+    penalty = np.sqrt(params.penalty) * weight * np.maximum(excess, 0.0)
+    return {
+        "duration": np.sqrt(params.duration * times.sum(1, keepdims=True)),
+        "energy": (np.sqrt(params.energy) * weight[:, None] * path[4]).reshape(count, -1),
+        "penalty": penalty.reshape(len(excess), count, -1).transpose(1, 0, 2).reshape(count, -1),
+    }
+
+
+def optimise(
+    model: Pendulum,
+    start_w: np.ndarray,
+    end_w: np.ndarray,
+    velocity_w: np.ndarray,
+    params: PlanParams,
+    tick: tuple[float, float] = (0.02, 0.0),
+) -> Spline:
+    """Plan the payload's path from hover to the release.
+
+    Raises PlanError: no horizontal velocity, a release beside the plane, or the optimisation does
+    not find a path.
+
+    Args:
+        model, params: whose thrust the bounds are on.
+        start_w, end_w: [m], shape (3,), in a vertical plane with ``velocity_w`` [m/s], which is not
+            vertical.
+        tick: period and offset [s]: the duration is the offset and a whole number of periods, so
+            that a controller of that period can release at its end.
+    """
+    along = np.array([*velocity_w[:2], 0.0])
+    speed = float(np.linalg.norm(along))
+    if not speed > 1e-6:
+        raise PlanError(f"release velocity {velocity_w}; expected a horizontal part")
+    basis = np.stack([along / speed, [0.0, 0.0, 1.0]])  # (2, 3)
+    aside = np.linalg.norm((end_w - start_w) - basis.T @ (basis @ (end_w - start_w)))
+    if not aside < 1e-6:
+        raise PlanError(
+            f"the release lies {aside:g} m beside the plane of start and velocity; expected it"
+            " within"
+        )
+    begin, velocity = np.array([0.0, start_w[2]]), basis @ velocity_w
+    end = basis @ (end_w - start_w) + begin
+
+    def build(x: np.ndarray, total: float) -> tuple[np.ndarray, np.ndarray]:
+        ratio = np.exp(np.concatenate([np.zeros((len(x), 1)), x[:, -(SEGMENTS - 1) :]], axis=1))
+        middle = _base(begin, end, velocity, total) + x[:, : -(SEGMENTS - 1)].reshape(len(x), -1, 2)
+        times = total * ratio / ratio.sum(1, keepdims=True)
+        return _coefficients(begin, middle, end, velocity, times), times
+
+    def objective(x: np.ndarray, total: float, samples: int = SAMPLES) -> np.ndarray:
+        parts = residuals(*build(x, total), params, model, samples).values()
+        uneven = x[:, -(SEGMENTS - 1) :]
+        limited = np.sqrt(params.penalty) * np.maximum(np.abs(uneven) - MOST_UNEVEN, 0.0)
+        even = np.sqrt(EVEN * params.duration) * uneven
+        return np.concatenate([*parts, even, limited], axis=1) / np.sqrt(params.duration)
+
+    value, total, x = _search(objective, tick)
+    if not np.isfinite(value):
+        raise PlanError(f"no path from {start_w} to {end_w} at {velocity_w} m/s")
+    unit, times = (item[0] for item in build(x[None], total))
+    lifted = (unit / (times[:, None] ** np.arange(ORDER))[:, :, None]) @ basis
+    lifted[:, 0] += [*start_w[:2], 0.0]
+    return Spline(times, lifted)
+
+
+def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, np.ndarray]:
+    """Objective, duration and variables of the best: at several starts on a coarse grid of
+    durations, then on the fine one about it.
+    """
+
+    def improve(x: np.ndarray, total: float) -> tuple[np.ndarray, float]:
+        def slope(x: np.ndarray) -> np.ndarray:
+            near = objective(x + DIFFERENCE * np.vstack([0.0 * x, np.eye(len(x))]), total)
+            return (near[1:] - near[0]).T / DIFFERENCE
+
+        found = least_squares(
+            lambda x: objective(x[None], total)[0], x, slope, method="lm", max_nfev=EVALUATIONS
+        )
+        return found.x, float((objective(found.x[None], total, DENSE) ** 2).sum())
+
+    blank = np.zeros(3 * (SEGMENTS - 1))
+    tried = (_descend(improve, blank, np.arange(top, SHORTEST, -COARSE)) for top in LONGEST)
+    best = min(tried, key=lambda found: found[0])
+    return _descend(
+        improve, best[2], _ticks(best[1] + COARSE, max(best[1] - COARSE, SHORTEST), *tick)
+    )
+
+
+def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """The best of a path that is shortened step by step, each from the one before, till the
+    objective is :data:`HOPELESS` times the best.
+
+    From a long path down, the vehicle never turns over: short plans have local optima in which it
+    does."""
+    best = (np.inf, float(totals[0]), x)
+    for total in totals:
+        x, value = improve(x, float(total))
+        if value < best[0]:
+            best = (value, float(total), x)
+        elif value > HOPELESS * best[0]:
+            break
+    return best
+
+
+def _ticks(high: float, low: float, period: float, offset: float) -> np.ndarray:
+    """Offset plus whole periods between two durations, falling."""
+    first, last = np.floor((high - offset) / period + 1e-6), np.ceil((low - offset) / period - 1e-6)
+    return offset + period * np.arange(first, last - 1, -1)
+
+
+def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float) -> np.ndarray:
+    """Waypoints on the single septic with the same ends, up to the third derivative, that takes a
+    total time [s].
+    """
+    right = np.zeros((ORDER, len(begin)))
+    right[0], right[4], right[5] = begin, end, velocity * total
+    unit = np.linalg.solve(np.concatenate([BEGINS[:4], ENDS[:4]]), right)
+    return _rows(np.arange(1, SEGMENTS) / SEGMENTS, 1)[:, 0] @ unit
+
+
+def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path, position and five
+    derivatives, shape (T, 6, 3).
+
+    The attitude is the shortest turn from level to the thrust's direction. Raises PlanError: the
+    payload falls freely, where the cable has no direction.
+
+    Source: Sreenath, Lee, Kumar, CDC 2013, Lemma 1: payload position and heading are flat outputs.
+    """
+    chain = np.moveaxis(path, 1, 0)
+    up = np.array([0.0, 0.0, GRAVITY])
+    if np.any(np.linalg.norm(chain[2] + up, axis=1) < 1e-3 * GRAVITY):
+        raise PlanError(
+            "the planned payload falls freely; expected a taut cable all along the path"
+        )
+    force, change, direction, first = _thrust(model, chain, up)
+    axis, turn = _unit(force, change)
+    half = np.column_stack([-axis[:, 1], axis[:, 0], 0.0 * axis[:, 0], 1.0 + axis[:, 2]])
+    quat, spin = _unit(
+        half, np.column_stack([-turn[:, 1], turn[:, 0], 0.0 * turn[:, 0], turn[:, 2]])
+    )
+    v, w, dv, dw = quat[:, :3], quat[:, 3:], spin[:, :3], spin[:, 3:]
+    rates = 2.0 * (w * dv - dw * v - np.cross(v, dv))
+    state = np.concatenate(
+        [chain[0], chain[1], direction, np.cross(direction, first), quat], axis=1
+    )
+    return state, np.column_stack([np.linalg.norm(force, axis=1), rates])
+
+
+def _thrust(
+    model: Pendulum, chain: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path
+    (6, T, D).
+    """
+    _, _, acc, jerk, snap, crackle = chain
+    unit = _unit(acc + up, jerk, snap, crackle)
+    direction, first, second, third = (-x for x in unit)
+    both = model.vehicle_mass + model.payload_mass
+    force = both * (acc + up) - model.vehicle_mass * model.length * second
+    return force, both * jerk - model.vehicle_mass * model.length * third, direction, first
+
+
+def _unit(*chain: np.ndarray) -> list[np.ndarray]:
+    """Unit vector of the first and its derivatives, from a vector and its derivatives, shape (T, D)
+    each.
+    """
+
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return (a * b).sum(1, keepdims=True)
+
+    norm = [np.sqrt(dot(chain[0], chain[0]))]  # and its derivatives
+    out = [chain[0] / norm[0]]
+    for k in range(1, len(chain)):
+        norm.append(sum(math.comb(k - 1, i) * dot(out[k - 1 - i], chain[i + 1]) for i in range(k)))
+        rest = chain[k]
+        for j in (*range(k - 1, 0, -1), k):
+            rest = rest - math.comb(k, j) * norm[j] * out[k - j]
+        out.append(rest / norm[0])
+    return out

@@ -1,0 +1,147 @@
+"""A planned throw: where the payload is let go and how fast, its path, and the reference of the
+controller on its grid of periods.
+
+Source: the paper, Sec. IV-A: release height and speed are mirrored from a learnt policy, the
+release state follows from the drag-free flight to the target. The release is horizontal."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.params import GRAVITY
+from visthrow.common.errors import ConfigError
+from visthrow.logs.flightlog import FlightLog
+from visthrow.paper.baseline.pendulum_model import Pendulum
+from visthrow.paper.baseline.spline import PlanParams, Spline, flat_reference, optimise
+
+START_HEIGHT = 0.95  # height of the payload in hover (the paper, Sec. IV-A) [m]
+
+POLICY_RELEASES = {1.5: (1.107, 2.270), 2.0: (1.127, 2.935), 2.5: (1.146, 3.602)}
+"""Target [m] -> height [m] and speed [m/s] at separation of the shipped state policy in the
+training simulator; mean of five flights. :func:`measure` reads them off any policy.
+"""
+
+
+@dataclass(frozen=True)
+class Release:
+    """State at which the payload is let go, and what follows."""
+
+    pos_w: np.ndarray  # [m], shape (3,)
+    vel_w: np.ndarray  # [m/s], shape (3,)
+    fall_time: float  # from release to landing [s]
+
+
+def fall_time(pos_z: np.ndarray, vel_z: np.ndarray, landing_height: float) -> np.ndarray:
+    """Time to landing [s] from a height [m] and an upward velocity [m/s]; NaN where the height is
+    never passed.
+    """
+    inside = np.asarray(vel_z) ** 2 + 2.0 * GRAVITY * (np.asarray(pos_z) - landing_height)
+    return (vel_z + np.sqrt(np.where(inside < 0.0, np.nan, inside))) / GRAVITY
+
+
+def landing_point(
+    pos_w: np.ndarray, vel_w: np.ndarray, landing_height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Landing points (..., 2) [m] and times (...) [s] of payloads let go at states, shape (..., 3)
+    each.
+    """
+    time = fall_time(pos_w[..., 2], vel_w[..., 2], landing_height)
+    return pos_w[..., :2] + time[..., None] * vel_w[..., :2], time
+
+
+def release_for(target: float, height: float, speed: float, landing_height: float) -> Release:
+    """Release state of a throw along x to a target [m], at a height [m] with a horizontal speed
+    [m/s]; landing is the payload's centre's.
+
+    Raises ConfigError: no throw: a height below the landing's, or no speed.
+    """
+    if not (height > landing_height and speed > 0.0):
+        raise ConfigError(
+            f"release at {height:g} m height with {speed:g} m/s; expected above the landing's"
+            f" {landing_height:g} m and above 0"
+        )
+    fall = float(fall_time(np.float64(height), np.float64(0.0), landing_height))
+    return Release(
+        np.array([target - speed * fall, 0.0, height]), np.array([speed, 0.0, 0.0]), fall
+    )
+
+
+def default_release(target: float) -> tuple[float, float]:
+    """Height [m] and speed [m/s] of the shipped policy's release at a target [m], between the
+    measured ones linear.
+    """
+    known = sorted(POLICY_RELEASES)
+    return tuple(
+        float(np.interp(target, known, [POLICY_RELEASES[x][i] for x in known])) for i in range(2)
+    )
+
+
+def read_release(log: FlightLog) -> tuple[float, float]:
+    """Height [m] and speed [m/s] of the payload at the separation that a flight log records;
+    ConfigError where it has none.
+    """
+    when = log.meta.get("times", {}).get("separation")
+    if when is None:
+        raise ConfigError(
+            f"this flight let nothing go: {log.meta.get('result', {}).get('failure')}; expected a"
+            " throw"
+        )
+    return float(log["payload_pos_w"].at(when)[2]), float(
+        np.linalg.norm(log["payload_vel_w"].at(when))
+    )
+
+
+def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[float, float]:
+    """Mean height [m] and speed [m/s] of a loaded policy's releases in the training simulator, at a
+    target [m]; of so many seeds.
+    """
+    from visthrow.throws.recorded import fly
+
+    goal = np.array([target, 0.0, 0.0])
+    seen = [read_release(fly(loaded, goal, "hybrid", seed + i)) for i in range(throws)]
+    return tuple(float(x) for x in np.mean(seen, axis=0))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One planned throw."""
+
+    model: Pendulum
+    target: float  # [m] along x
+    release: Release
+    path: Spline
+    params: PlanParams
+
+    @property
+    def duration(self) -> float:
+        """From start to landing, if all goes as planned [s]."""
+        return self.path.duration + self.release.fall_time
+
+    def reference(self, begin: float, period: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """States (count + 1, 16) at ``begin`` [s] and each period on; inputs (count, 4) in the
+        middle of the periods.
+        """
+        ends = begin + period * np.arange(count + 1)
+        states = flat_reference(self.model, self.path.sample(ends))[0]
+        inputs = flat_reference(self.model, self.path.sample(ends[:-1] + 0.5 * period))[1]
+        return states, inputs
+
+
+def plan_throw(
+    model: Pendulum,
+    target: float,
+    height: float,
+    speed: float,
+    params: PlanParams,
+    landing_height: float,
+    period: float = 0.02,
+    lag: float = 0.0,
+) -> Plan:
+    """Plan a throw along x from hover at the origin; the first arguments as of :func:`release_for`.
+
+    The release falls on a whole number of the controller's periods [s] and the lag [s] from the
+    latch to separation."""
+    release = release_for(target, height, speed, landing_height)
+    start = np.array([0.0, 0.0, START_HEIGHT])
+    path = optimise(model, start, release.pos_w, release.vel_w, params, (period, lag % period))
+    return Plan(model, target, release, path, params)

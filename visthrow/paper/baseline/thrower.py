@@ -1,0 +1,189 @@
+"""The baseline as one more thrower: sets of throws as units of work, for ``visthrow compare`` and
+``visthrow report``.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from visthrow import config
+from visthrow.paper.baseline import NAME
+from visthrow.paper.baseline.fly_plan import delays_of, fly_pendulum, fly_plant
+from visthrow.paper.baseline.pendulum_model import pendulum_of
+from visthrow.paper.baseline.spline import PlanParams, payload_bounds_only
+from visthrow.paper.baseline.throw_plan import Plan, default_release, plan_throw
+from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.throws.reference_protocol import batches
+from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
+from visthrow.training import device
+
+OWN = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
+    "pendulum"
+)
+
+MADE_UP = {
+    "none": "nothing made up for",
+    "delay": "all delays but the release's lag made up for",
+    "both": "all delays made up for",
+}
+"""Compensations that are compared, of :data:`visthrow.paper.baseline.fly_plan.COMPENSATIONS`."""
+
+
+BOUNDS = (
+    "payload and thrust",
+    "payload",
+)  # what plans bound: ours, and the payload alone as the paper's do
+
+
+def title_of(plant: str, compensation: str) -> str:
+    """What a row is called: plant and condition never go unsaid."""
+    return "TO+MPC, own model (ideal)" if plant == OWN else f"TO+MPC, {MADE_UP[compensation]}"
+
+
+def unit(
+    plant: str,
+    compensation: str,
+    target: float,
+    throws: int,
+    seed: int = 0,
+    *,
+    height: float | None = None,
+    speed: float | None = None,
+    w_t: float | None = None,
+    rho: float | None = None,
+    bounds: str = BOUNDS[0],
+    config_name: str = "state",
+    overrides: Sequence[str] = (),
+    batch: int = 0,
+) -> dict[str, Any]:
+    """Unit of so many throws with the baseline at a target [m] along x.
+
+    Args:
+        plant: :data:`OWN`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the
+            number of the batch.
+        compensation: of :data:`~visthrow.paper.baseline.fly_plan.COMPENSATIONS`; "none" in the
+            own model.
+        target, throws, seed: of starts and noise.
+        height, speed: of the payload at release [m], [m/s]; default the learnt policy's.
+        w_t, rho: weights of duration and energy; default those of
+            :class:`visthrow.paper.baseline.spline.PlanParams`.
+        bounds: of :data:`BOUNDS`. config_name: train config whose plant is flown. overrides: its
+            changes.
+        batch: see above.
+    """
+    default_height, default_speed = default_release(target)
+    params = PlanParams()
+    return {
+        "kind": NAME,
+        "protocol": PROTOCOL,
+        "plant": plant,
+        "compensation": compensation,
+        "target": float(target),
+        "height": round(height or default_height, 6),
+        "speed": round(speed or default_speed, 6),
+        "w_t": float(w_t or params.duration),
+        "rho": float(rho or params.energy),
+        "bounds": bounds,
+        "throws": int(throws),
+        "seed": int(seed),
+        "config": config_name,
+        "overrides": list(overrides),
+        "batch": int(batch),
+        "conditions": key_of(contract_of(_experiment(config_name, tuple(overrides)))),
+    }
+
+
+def units(
+    plant: str, compensation: str, target: float, throws: int, seed: int = 0, **how: Any
+) -> list[dict[str, Any]]:
+    """:func:`unit`, cut into the batches in which reference plants are flown."""
+    if plant in (OWN, "hybrid"):
+        return [unit(plant, compensation, target, throws, seed, **how)]
+    return [
+        unit(plant, compensation, target, size, seed, batch=i, **how) for i, size in batches(throws)
+    ]
+
+
+@lru_cache(maxsize=8)
+def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
+    return config.load(Experiment, config.find("train", name), overrides)
+
+
+@lru_cache(maxsize=64)
+def plan_of(
+    experiment: Experiment,
+    target: float,
+    height: float,
+    speed: float,
+    w_t: float,
+    rho: float,
+    bounds: str,
+) -> Plan:
+    """The plan of a unit, whose entries the arguments are."""
+    params = replace(PlanParams(), duration=w_t, energy=rho)
+    params = params if bounds == BOUNDS[0] else payload_bounds_only(params)
+    return plan_throw(
+        pendulum_of(plant_of(experiment)),
+        target,
+        height,
+        speed,
+        params,
+        experiment.release.landing_height,
+        experiment.sim.control_period,
+        experiment.release.lag,
+    )
+
+
+def fly_unit(wanted: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Plan and fly a unit; returns columns of the throws, and the planned duration [s] and times of
+    the controller's steps [ms].
+    """
+    experiment = _experiment(wanted["config"], tuple(wanted["overrides"]))
+    plan = plan_of(
+        experiment, *(wanted[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds"))
+    )
+    count, seed = wanted["throws"], wanted["seed"]
+    if wanted["plant"] == OWN:
+        flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
+    else:
+        delays = delays_of(experiment, wanted["compensation"])
+        where = device.resolve("auto") if wanted["plant"] == "hybrid" else "cpu"
+        flown = fly_plant(
+            plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"], where
+        )
+    columns = columns_of(flown)
+    columns.pop("step_times", None)  # as many as throws by chance
+    extra = {"planned": round(plan.duration, 6)}
+    if len(flown.step_times):
+        extra["step_ms"] = [
+            round(1e3 * float(t), 3) for t in np.percentile(flown.step_times, (50, 99))
+        ]
+    return columns, extra
+
+
+def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
+    """Plant and compensation of a table's rows: the own model, and each plant under each
+    compensation.
+    """
+    return [(OWN, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
+
+
+def flown(
+    sets: Sequence[list[dict[str, Any]]], folder: str | Path, say: Callable[[str], None]
+) -> list[Result]:
+    """Results of sets of units, the batches of each joined; those that the folder holds are not
+    flown again.
+    """
+    found = work(
+        [u for part in sets for u in part],
+        folder,
+        fly_unit,
+        None,
+        device.cores(),
+        lambda text: say(f"TO+MPC: {text}"),
+    )
+    return [join(found[key_of(u)] for u in part)[0] for part in sets]

@@ -1,0 +1,195 @@
+"""``visthrow baseline``: plan with splines, track with MPC, throw: by target, and its front with
+learnt policies on it.
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.arguments import WHOLE, add_common, add_out
+from visthrow.common.workers import status
+
+TARGETS = (1.5, 2.0, 2.5)
+POLICY_THROWS = 100  # throws of each learnt policy for its point on the front
+
+TITLE = "Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}"
+NOTE = (
+    "All our figures are simulated; the plant stands in each row. The paper's TO+MPC figures come"
+    " from its own pendulum model, its policies' from a real vehicle. Own-model throws vary in"
+    " start only (position, velocity, attitude, cable; configs/start/hover.toml); on the plants"
+    " noise, latency and extras vary too."
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n  visthrow baseline                              tables at three targets and"
+        " the sweep at 2.0 m (minutes)\n  visthrow baseline --quick                      two"
+        " throws, a small sweep, own model alone\n  visthrow baseline --plants hybrid"
+        " reference-realistic --no-sweep\n\nThe baseline plans the payload's path to a release"
+        " state by projectile motion, with height and speed of a\nlearnt policy's release, and"
+        " tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model,"
+        " an\nidealised upper bound, and on the plants, with and without making up for delays and"
+        " the release's lag.\nWhat is flown is kept in the output folder; interrupted and started"
+        " again, the command goes on.\n"
+    )
+    parser.add_argument(
+        "--targets", type=float, nargs="+", default=list(TARGETS), metavar="M", help="along x [m]"
+    )
+    parser.add_argument(
+        "--throws", type=int, default=10, metavar="N", help="a row (default: 10, as in the paper)"
+    )
+    parser.add_argument(
+        "--plants",
+        nargs="*",
+        default=["hybrid"],
+        metavar="NAME",
+        help="beside the own model: hybrid, reference, reference-realistic (default: hybrid)",
+    )
+    parser.add_argument(
+        "--release-from",
+        metavar="POLICY",
+        help=(
+            "measure release height and speed on its throws (default: as measured on the shipped"
+            " state policy)"
+        ),
+    )
+    parser.add_argument(
+        "--policies",
+        nargs="*",
+        default=["state", "vision"],
+        metavar="POLICY",
+        help="points on the front",
+    )
+    parser.add_argument(
+        "--payload-bounds",
+        action="store_true",
+        help=(
+            "bound the payload's path alone, as the paper does, not the vehicle's thrust: plans"
+            " that tracking may fail on"
+        ),
+    )
+    parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="two throws, one speed and two weights, own model alone",
+    )
+    parser.add_argument("--seed", type=WHOLE, default=0, help="of starts and noise (default: 0)")
+    parser.add_argument(
+        "--config",
+        default="state",
+        metavar="NAME",
+        help="train config whose plant is flown (default: state)",
+    )
+    add_out(parser, "out/baseline", "for page, tables, pictures and the single results")
+    add_common(parser, device=False)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plan, throw, print, write."""
+    from visthrow.cli import compare
+    from visthrow.common.storage import writable
+    from visthrow.paper.baseline import thrower
+    from visthrow.paper.report import result_set, trade
+    from visthrow.paper.report.throws import SHORT
+    from visthrow.throws import results
+    from visthrow.throws.plants import known_plant
+    from visthrow.view import page
+    from visthrow.view.parts import Section
+
+    compare.check(args.targets, args.throws)
+    for plant in args.plants:
+        known_plant(plant)
+    out, bounds = Path(args.out), thrower.BOUNDS[args.payload_bounds]
+    writable(out)
+    if args.quick:
+        args.throws, args.plants = min(args.throws, 2), []
+    by_target, swept = (
+        list(_by_target(args, bounds)),
+        ([] if args.no_sweep else list(_swept(args, bounds))),
+    )
+    found = thrower.flown(by_target + swept, out / "throws", status)
+    rows, front = found[: len(by_target)], found[len(by_target) :]
+    made = [Section("baseline", "By target", (trade.by_target(rows),))]
+    if swept:
+        policies = [_thrown(name, args) for name in args.policies]
+        kinds = [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]
+        shown = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
+        names = [result.unit["policy"] for result in policies]
+        made.append(trade.front_section(result_set.ResultSet((*front, *policies)), shown, names))
+        found += policies
+    status("")
+    title = TITLE.format(throws=args.throws, bounds=bounds)
+    print(page.markdown_of(title, NOTE, made))
+    for path in page.write(out, title, NOTE, made):
+        print(path)
+    if args.json:
+        results.pack(found, args.json)
+    return 0
+
+
+def _how(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
+    return {
+        "bounds": bounds,
+        "config_name": args.config,
+        "overrides": args.overrides,
+        "seed": args.seed,
+    }
+
+
+def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
+    """Units of each row: the own model first, then each plant under each compensation."""
+    from visthrow.paper.baseline import thrower
+
+    releases = _releases(args)
+    for target in args.targets:
+        height, speed = releases.get(target, (None, None))
+        for row in thrower.rows(args.plants):
+            yield thrower.units(
+                *row, target, args.throws, height=height, speed=speed, **_how(args, bounds)
+            )
+
+
+def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
+    """Units of each setting of the sweep: in the own model and, all delays made up for, on the
+    plants.
+    """
+    from visthrow.paper.baseline import front, thrower
+
+    speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
+    for speed in speeds:
+        for w_t, rho in weights:
+            for plant, made_up in [
+                (thrower.OWN, "none"),
+                *((plant, "both") for plant in args.plants),
+            ]:
+                how = {"speed": speed, "w_t": w_t, "rho": rho, **_how(args, bounds)}
+                yield thrower.units(plant, made_up, front.FRONT_TARGET, args.throws, **how)
+
+
+def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
+    if not args.release_from:
+        return {}
+    from visthrow.paper.baseline.throw_plan import measure
+    from visthrow.throws.loading import load_policy
+
+    loaded = load_policy(args.release_from)
+    status(f"measuring the releases of {loaded.name}")
+    return {target: measure(loaded, target, seed=args.seed) for target in args.targets}
+
+
+def _thrown(name: str, args: argparse.Namespace) -> Any:
+    """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
+    from visthrow.cli.compare import throw_hybrid
+    from visthrow.paper.baseline.front import FRONT_TARGET
+    from visthrow.throws import results
+    from visthrow.throws.loading import load_policy
+
+    loaded, count = load_policy(name), 10 if args.quick else POLICY_THROWS
+    ((flown,),) = throw_hybrid([loaded], [FRONT_TARGET], count, "cpu", args.seed)
+    layout = loaded.policy.contract["observation"]["layout"]
+    unit = results.policy_unit(loaded.name, "", layout, "hybrid", FRONT_TARGET, count, args.seed)
+    return results.Result(unit, results.columns_of(flown))

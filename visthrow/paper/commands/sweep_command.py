@@ -1,0 +1,166 @@
+"""``visthrow sweep``: work lists of training runs and throws in resumable pieces, on several GPUs
+or a cluster.
+"""
+
+import argparse
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.arguments import NUMBER
+
+DEFAULT_OUT = "runs/sweep"
+ACTIONS = ("run", "status", "collect", "work")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = (
+        "examples:\n  visthrow sweep run paper --devices cuda:0,cuda:1 --jobs 30    all runs of"
+        " configs/sweep/paper.toml\n  visthrow sweep run paper --minutes 9                         "
+        " stop after 9 minutes; the same command goes on\n  visthrow sweep run paper --slurm"
+        " partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n  visthrow sweep status"
+        " paper                                   a line a run\n  visthrow sweep collect paper"
+        " --records out/records            what is committed of it\n\nWhat is done is not done"
+        " again: a training run is known by its resolved config and seed, throws by the"
+        " policy's\ncontent and everything else they depend on. Ctrl-C, a kill or a power cut lose"
+        " what was not yet in a checkpoint.\n"
+    )
+    add = parser.add_argument
+    add("action", choices=ACTIONS, help="work is what run starts processes with")
+    add("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
+    add(
+        "--out",
+        metavar="FOLDER",
+        default=DEFAULT_OUT,
+        help=f"of all results (default: {DEFAULT_OUT})",
+    )
+    devices = "one training at once on each: cuda:0,cuda:1; with a cluster how many (default: auto)"
+    add("--devices", metavar="NAMES", default="auto", help=devices)
+    add(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="throws on the reference plant at once (default: one a core)",
+    )
+    add(
+        "--minutes",
+        type=NUMBER,
+        help="end after so long with checkpoints; on a cluster the length of a job",
+    )
+    add(
+        "--slurm",
+        metavar="KEY=VALUE",
+        action="append",
+        help="submit jobs, with this option of sbatch; may be repeated",
+    )
+    add(
+        "--records",
+        metavar="FOLDER",
+        help="collect: where to (default: records beside the results)",
+    )
+    add("--units", metavar="NAMES", help="work: which, with commas between")
+    add("--device", default="auto", help="work: where")
+    add("--parent", type=int, metavar="ID", help="work: process with which this one is to end")
+    add(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help=(
+            "change one value of the list, for instance --set runs.full.seeds=[1]; may be repeated"
+        ),
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run, tell, collect."""
+    from visthrow.common.errors import ConfigError
+    from visthrow.paper.sweep import sweep_record as record
+    from visthrow.paper.sweep.work_units import load_list
+
+    if args.action == "run" and args.minutes is not None and args.minutes <= 0:
+        raise ConfigError(f"--minutes {args.minutes:g}; expected more than 0")
+    work, out = load_list(args.list, tuple(args.overrides)), Path(args.out)
+    if args.action == "status":
+        lines, done = record.status(work, out)
+        print("\n".join(lines))
+        return 0 if done else 1
+    if args.action == "collect":
+        for path in record.collect(work, out, Path(args.records or out / "records")):
+            print(path)
+        return 0
+    return _run(args, work, out) if args.action == "run" else _work(args, work, out)
+
+
+def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
+    from visthrow.common.arguments import EXIT_INTERRUPTED
+    from visthrow.paper.sweep.pool import Local, Pool
+    from visthrow.training import device
+
+    changes, jobs, begin = tuple(args.overrides), args.jobs or device.cores(), time.monotonic()
+
+    def say(text: str) -> None:
+        print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)
+
+    before = signal.signal(
+        signal.SIGTERM, signal.default_int_handler
+    )  # so that a batch system's signal also ends in checkpoints
+    try:
+        if args.slurm is not None:
+            outcome = Pool(work, out, _cluster(args, out, jobs, changes), say).run()
+        else:
+            starter = Local(
+                args.list,
+                out,
+                [device.resolve(name) for name in args.devices.split(",")],
+                jobs,
+                changes,
+            )
+            outcome = Pool(work, out, starter, say).run(args.minutes)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    for name, reason in outcome.failed.items():
+        print(f"{name} failed: {reason}; all it printed is in {out / 'logs'}", file=sys.stderr)
+    if outcome.stopped:
+        print("stopped before the end; the same command goes on", file=sys.stderr)
+    if outcome.interrupted:
+        return EXIT_INTERRUPTED
+    return 1 if outcome.failed else 0
+
+
+def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str, ...]) -> Any:
+    from visthrow.common.errors import ConfigError
+    from visthrow.paper.sweep.cluster import Cluster
+
+    wrong = [item for item in args.slurm if "=" not in item]
+    if wrong or not args.devices.isdigit() or args.minutes is None:
+        raise ConfigError(
+            f"--slurm {' '.join(args.slurm)} --devices {args.devices} --minutes {args.minutes};"
+            " expected KEY=VALUE, the number of GPUs to use at once, and the length of a job"
+        )
+    options = {f"slurm_{key}": value for key, value in (item.split("=", 1) for item in args.slurm)}
+    return Cluster(args.list, out, "slurm", int(args.devices), jobs, args.minutes, changes, options)
+
+
+def _work(args: argparse.Namespace, work: Any, out: Path) -> int:
+    from visthrow.common.errors import ConfigError
+    from visthrow.paper.sweep.work import work as do
+
+    if not args.units:
+        raise ConfigError("sweep work: no --units; expected ids as `visthrow sweep run` gives them")
+    if args.parent:
+        threading.Thread(target=_follow, args=(args.parent,), daemon=True).start()
+    return do(work, out, args.units.split(","), args.device, args.minutes)
+
+
+def _follow(parent: int) -> None:
+    """Stop this process as Ctrl-C does once its parent is gone."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGINT)

@@ -1,0 +1,216 @@
+"""Sections on the learnt policies: their throws on each plant, and vision against state."""
+
+import math
+
+from visthrow.common import statistics as st
+from visthrow.paper.baseline.front import FRONT_TARGET
+from visthrow.paper.report.result_set import SHIPPED, ResultSet, landed
+from visthrow.task.measurement import TARGETS
+from visthrow.throws.plants import PLANTS
+from visthrow.throws.results import Result
+from visthrow.view import figures
+from visthrow.view.parts import Grid, Picture, Section, Text, section
+from visthrow.view.tables import PAPER, PAPER_NOTE, of_paper
+
+SHORT = {
+    "pendulum": "own model",
+    "hybrid": "training simulator",
+    "reference": "reference plant",
+    "reference-realistic": "realistic reference plant",
+}
+"""Plant -> its name in tables."""
+
+
+def throws_section(thrown: ResultSet) -> Section:
+    """Landing error and duration of the shipped policies on every plant, the paper's
+    beside them.
+    """
+    rows, missing = [], []
+    for name in SHIPPED:
+        for target in TARGETS:
+            for plant in PLANTS:
+                found = thrown.shipped(name, plant, target)
+                if found is None:
+                    if wanted_there(plant, target):
+                        missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
+                    continue
+                rows.append(_row(name, target, plant, found))
+    lead = Text(
+        "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and"
+        " 2.5 m (`vision`): for the first 2.5 m is out of distribution. The training simulator has"
+        " all noise of the training; the reference plants were never seen in it."
+    )
+    head = (
+        "policy",
+        "target [m]",
+        "plant",
+        "throws",
+        "landed",
+        "landing error [m], mean and 95 % interval",
+        "deviation [m]",
+        "duration [s]",
+        "bias along / left [m]",
+        "the paper's vehicle: error [m], duration [s]",
+    )
+    table = (
+        Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3) if rows else None
+    )
+    return section(
+        "throws",
+        "What the policies do",
+        lead,
+        table,
+        _scatter(thrown),
+        missing=missing,
+        head="Not thrown",
+    )
+
+
+def wanted_there(plant: str, target: float) -> bool:
+    """Whether the report wants policies thrown there: on the plain reference plant at one target
+    alone.
+    """
+    return plant != "reference" or target == FRONT_TARGET
+
+
+def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]:
+    head = (name, f"{target:.1f}", SHORT[plant], str(len(found.good)), landed(found))
+    paper = of_paper(name, target)
+    if not found.good.any():
+        return (*head, "-", "-", "-", "-", paper)
+    bias = st.bias(found.miss)
+    return (
+        *head,
+        st.mean(found.of("error")).text(),
+        f"{found.of('error').std():.3f}",
+        f"{found.of('duration').mean():.3f}",
+        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}",
+        paper,
+    )
+
+
+def _scatter(thrown: ResultSet) -> Picture | None:
+    for plant in ("reference-realistic", "hybrid"):
+        panels = []
+        for target in TARGETS:
+            found = [(name, thrown.shipped(name, plant, target)) for name in SHIPPED]
+            series = [
+                (f"{name} policy", result.miss)
+                for name, result in found
+                if result is not None and result.good.any()
+            ]
+            if series:
+                panels.append((f"target {target:.1f} m", series))
+        if panels:
+            text = (
+                f"Landing points from above on the {SHORT[plant]}; large marks: means. The paper's"
+                " figure shows 1.5 m and 2.0 m."
+            )
+            return Picture("landings", figures.scatter(panels), text)
+    return None
+
+
+def vision_section(thrown: ResultSet) -> Section:
+    """What vision costs: difference of mean landing errors at each target, on each plant."""
+    rows, marks, missing = [], [], []
+    for i, plant in enumerate(PLANTS):
+        for target in TARGETS:
+            pair = _groups(thrown, plant, target)
+            if pair is None:
+                if wanted_there(plant, target):
+                    missing.append(f"{target:g} m on the {SHORT[plant]}")
+                continue
+            (vision, state), runs = pair
+            gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
+            paper = _paper(target)
+            beside = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
+            rows.append(
+                (
+                    SHORT[plant],
+                    f"{target:.1f}",
+                    runs,
+                    gap.text(sign=True),
+                    _said(gap),
+                    faster.text(sign=True),
+                    beside,
+                )
+            )
+            marks.append(
+                figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0])
+            )
+    parts = [
+        Text(
+            "Vision minus state: positive means that vision lands further off. Where several"
+            " trainings of both are recorded, the interval covers trainings and throws; else it"
+            " speaks of the two shipped policies alone, throw by throw: both met the same vehicles,"
+            " starts and winds."
+        )
+    ]
+    if rows:
+        head = (
+            "plant",
+            "target [m]",
+            "policies",
+            "error: vision - state [m]",
+            "in words",
+            "duration: vision - state [s]",
+            "the paper's: error [m], duration [s]",
+        )
+        picture = figures.marks(
+            marks,
+            "landing error, vision minus state [m]",
+            [SHORT[plant] for plant in PLANTS],
+            zero=0.0,
+        )
+        text = (
+            "Difference of mean landing errors with 95 % intervals; left of the line vision lands"
+            " nearer."
+        )
+        parts += [Grid("Vision against state", head, tuple(rows)), Picture("vision", picture, text)]
+    return section(
+        "vision", "Vision against state", *parts, missing=missing, head="Not thrown by both"
+    )
+
+
+def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
+    """Difference of means: throw by throw where one policy of each met the same vehicles and
+    starts.
+    """
+    alike = all(
+        vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target")
+    )
+    if len(vision) == len(state) == 1 and alike:
+        return st.paired(vision[0].columns[name], state[0].columns[name])
+    return st.difference([r.of(name) for r in vision], [r.of(name) for r in state])
+
+
+def _groups(
+    thrown: ResultSet, plant: str, target: float
+) -> tuple[tuple[list[Result], list[Result]], str] | None:
+    """Runs of both layouts: those trained for the comparison where two or more of each are there,
+    else the shipped ones.
+    """
+    trained = [thrown.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
+    if min(map(len, trained)) >= 2:
+        return (trained[0], trained[1]), f"{len(trained[0])} and {len(trained[1])} trainings"
+    shipped = [thrown.shipped(layout, plant, target) for layout in ("vision", "state")]
+    if any(result is None or not result.good.any() for result in shipped):
+        return None
+    return ([shipped[0]], [shipped[1]]), "shipped"
+
+
+def _paper(target: float) -> tuple[st.Interval, float] | None:
+    """The paper's differences: errors [m] with a normal interval from its deviations, ten throws
+    each, and durations [s].
+    """
+    vision, state = PAPER.get(("vision", target)), PAPER.get(("state", target))
+    if vision is None or state is None:
+        return None
+    gap, half = vision[0] - state[0], 1.96 * math.hypot(vision[1], state[1]) / math.sqrt(10.0)
+    return st.Interval(gap, gap - half, gap + half, "throws"), vision[2] - state[2]
+
+
+def _said(gap: st.Interval) -> str:
+    if 0.0 in gap:
+        return "no difference shows"
+    return "vision further off" if gap.value > 0.0 else "vision nearer"

@@ -1,0 +1,107 @@
+"""Tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as
+processes, for a test.
+"""
+
+import os
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.errors import ConfigError
+from visthrow.paper.sweep.pool import Task
+from visthrow.paper.sweep.work import EXIT_STOPPED
+
+SLACK = 5  # minutes that a job is granted beyond its piece: start of the process, last checkpoint
+
+# times that a task's job may vanish (preempted, out of time, its node down) before the task counts
+# as failed
+LOST_AT_MOST = 3
+
+
+class Job:
+    """One submitted task."""
+
+    def __init__(self, job: Any, task: str, lost: Counter[str]) -> None:
+        self._job, self._task, self._lost = job, task, lost
+
+    def poll(self) -> int | None:
+        from submitit.core.utils import FailedJobError, UncompletedJobError
+
+        if not self._job.done():
+            return None
+        try:
+            return int(self._job.result())
+        except FailedJobError:  # the work raised; what it printed tells why
+            return 1
+        except UncompletedJobError:
+            self._lost[self._task] += 1
+            return EXIT_STOPPED if self._lost[self._task] <= LOST_AT_MOST else 1
+
+    def stop(self) -> None:
+        """Cancel it: Slurm's signal lets a training write its checkpoint."""
+        self._job.cancel()
+
+    def kill(self) -> None:
+        self._job.cancel()
+
+
+@dataclass
+class Cluster:
+    """Submits tasks."""
+
+    list_name: str
+    out: Path
+    executor: str  # "slurm", or "local" for processes of this machine
+    gpus: int
+    jobs: int
+    minutes: float  # length of a piece; what is not done then is submitted again
+    changes: tuple[str, ...] = ()
+    options: dict[str, Any] = field(
+        default_factory=dict
+    )  # of submitit's executor, for instance ``slurm_partition``
+
+    def __post_init__(self) -> None:
+        import submitit
+
+        self.devices = [f"job {i}" for i in range(self.gpus)]
+        self._lost: Counter[str] = Counter()
+        try:
+            self._executor = submitit.AutoExecutor(self.out / "logs", cluster=self.executor)
+        except RuntimeError as error:
+            raise ConfigError(
+                f"no jobs can be submitted from here: {error}; expected the commands of"
+                f" {self.executor}"
+            ) from error
+        try:
+            self._executor.update_parameters(
+                timeout_min=int(self.minutes) + 1 + SLACK, **self.options
+            )
+        except (NameError, ValueError, TypeError) as error:
+            raise ConfigError(f"options of the cluster {self.options}: {error}") from error
+
+    def start(self, task: Task, device: str, minutes: float | None) -> Job:
+        self._executor.update_parameters(
+            name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0
+        )
+        piece = self.minutes if minutes is None else min(minutes, self.minutes)
+        where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())
+        job = self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece)
+        return Job(job, task.name, self._lost)
+
+
+def do(
+    list_name: str,
+    out: str,
+    changes: tuple[str, ...],
+    folder: str,
+    ids: tuple[str, ...],
+    device: str,
+    minutes: float,
+) -> int:
+    """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
+    from visthrow.paper.sweep.work import work
+    from visthrow.paper.sweep.work_units import load_list
+
+    os.chdir(folder)
+    return work(load_list(list_name, changes), Path(out), ids, device, minutes)

@@ -1,0 +1,236 @@
+"""Hands units out: trainings and throws in the training simulator to devices, throws on the
+reference plant to CPU cores.
+
+What is handed out is a task: a training with its own policy's throws in the training simulator
+behind it, or one batch on a reference plant. Tasks run in processes of their own (:class:`Local`)
+or as jobs of a cluster (:class:`visthrow.paper.sweep.cluster.Cluster`); a process that was
+killed costs what it had not yet written, and no more."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from visthrow.paper.sweep.work import EXIT_BUSY, EXIT_STOPPED
+from visthrow.paper.sweep.work_units import Source, ThrowUnit, Work
+
+VISIBLE = "CUDA_VISIBLE_DEVICES"
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+POLL = 0.3  # between two looks at what runs [s]
+GRACE = 90.0  # for a stopped process to write its checkpoint [s]
+BUSY_PAUSE = 5.0  # before a unit that another process has is looked at again [s]
+
+
+@dataclass(frozen=True)
+class Task:
+    """Units that one process does in turn."""
+
+    name: str
+    ids: tuple[str, ...]
+    gpu: bool  # goes to one of the devices; else to a CPU core
+
+    def log(self, out: Path) -> Path:
+        """What its process prints."""
+        return out / "logs" / f"{self.name.replace('/', '_')}.txt"
+
+
+class Process(subprocess.Popen):
+    """A task in a process of this machine; it stops by itself when this one dies (see ``visthrow
+    sweep work``).
+    """
+
+    def __init__(self, words: Sequence[str], log: Path, environment: dict[str, str]) -> None:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **environment}
+        with log.open("ab") as file:
+            super().__init__(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
+
+    def stop(self) -> None:
+        self.send_signal(signal.SIGINT)
+
+
+@dataclass
+class Local:
+    """Starts tasks on this machine."""
+
+    list_name: str
+    out: Path
+    devices: list[str]
+    jobs: int
+    changes: tuple[str, ...] = ()
+
+    def start(self, task: Task, device: str, minutes: float | None) -> Process:
+        words = [
+            sys.executable,
+            "-m",
+            "visthrow.cli",
+            "sweep",
+            "work",
+            self.list_name,
+            "--out",
+            str(self.out),
+        ]
+        words += ["--units", ",".join(task.ids), "--parent", str(os.getpid())]
+        if device.startswith(
+            "cuda"
+        ):  # the process sees its own GPU alone, and puts no context on the others
+            seen = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
+            index = int(device.removeprefix("cuda:"))
+            words, environment = (
+                [*words, "--device", "cuda:0"],
+                {VISIBLE: seen[index] if seen else str(index)},
+            )
+        else:
+            words, environment = (
+                [*words, "--device", device],
+                (dict.fromkeys(THREADS, "1") if not task.gpu else {}),
+            )
+        words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
+        for change in self.changes:
+            words += ["--set", change]
+        return Process(words, task.log(self.out), environment)
+
+
+@dataclass
+class Outcome:
+    """What a call did: units by name."""
+
+    failed: dict[str, str] = field(default_factory=dict)  # task -> last line of its log
+    stopped: bool = False  # before everything was done
+    interrupted: bool = False  # by Ctrl-C or SIGTERM, not by the clock
+
+
+def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
+    """What is left to do and can be done now, the most important first; ids that are found to be
+    done are added to ``done``.
+    """
+
+    def left(unit: Source | ThrowUnit) -> bool:
+        if unit.id not in done and unit.done(out):
+            done.add(unit.id)
+        return unit.id not in done
+
+    for source in work.sources:
+        units = work.throws.get(source.id, ())
+        untrained = bool(source.config) and left(source)
+        mine = [
+            unit.id for unit in units if unit.params.plant == "hybrid" and (untrained or left(unit))
+        ]
+        if untrained or mine:
+            yield Task(source.id, (*([source.id] if untrained else []), *mine), gpu=True)
+        for unit in () if untrained else units:
+            if unit.params.plant != "hybrid" and left(unit):
+                yield Task(unit.id, (unit.id,), gpu=False)
+
+
+class Pool:
+    """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop.
+
+    Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU
+    cores, and ``start(task, device, minutes)``. What that returns has ``poll()`` for the exit
+    status, None while it runs, ``stop()`` to write what it has and end, and ``kill()``."""
+
+    def __init__(self, work: Work, out: Path, starter: Any, say: Callable[[str], None]) -> None:
+        self.work, self.out, self.starter, self.say = work, out, starter, say
+        self.outcome, self._done, self._todo = Outcome(), set(), []
+        self._running: dict[str, tuple[Task, str, Any]] = {}
+        self._wait: dict[str, float] = {}  # task -> time before which it is not tried again
+
+    def run(self, minutes: float | None = None) -> Outcome:
+        """Work; returns when nothing is left, or ``minutes`` have passed, or after Ctrl-C."""
+        deadline = None if minutes is None else time.monotonic() + 60.0 * minutes
+        self._todo = list(tasks(self.work, self.out, self._done))
+        try:
+            while self._todo or self._running:
+                left = None if deadline is None else (deadline - time.monotonic()) / 60.0
+                if left is not None and left <= 0.0:
+                    self.outcome.stopped = True
+                    break
+                self._fill(left)
+                time.sleep(POLL)
+                if self._reap():
+                    self._todo = list(tasks(self.work, self.out, self._done))
+                self._todo = [task for task in self._todo if task.name not in self.outcome.failed]
+        except KeyboardInterrupt:
+            self.outcome.stopped = self.outcome.interrupted = True
+        finally:
+            self._stop()
+        return self.outcome
+
+    def _fill(self, left: float | None) -> None:
+        """Start what there is room for."""
+        now = time.monotonic()
+        used = [device for _, device, _ in self._running.values()]
+        free = [device for device in self.starter.devices if device not in used]
+        cores = self.starter.jobs - used.count("cpu core")
+        for task in self._todo:
+            if task.name in self._running or self._wait.get(task.name, 0.0) > now:
+                continue
+            if task.gpu and free:
+                self._start(task, free.pop(0), left)
+            elif not task.gpu and cores > 0:
+                self._start(task, "cpu core", left)
+                cores -= 1
+            if not free and cores <= 0:
+                break
+
+    def _start(self, task: Task, slot: str, left: float | None) -> None:
+        device = "cpu" if slot == "cpu core" else slot
+        self._running[task.name] = (task, slot, self.starter.start(task, device, left))
+        if task.gpu:
+            self.say(f"{task.name} begins on {device}")
+
+    def _reap(self) -> bool:
+        """Take note of what ended; whether anything did."""
+        ended = [
+            (task, status)
+            for task, _, handle in self._running.values()
+            if (status := handle.poll()) is not None
+        ]
+        for task, status in ended:
+            del self._running[task.name]
+            if status in (EXIT_BUSY, EXIT_STOPPED):
+                self._wait[task.name] = time.monotonic() + BUSY_PAUSE
+            elif status != 0:
+                self.outcome.failed[task.name] = (
+                    last_line(task.log(self.out)) or f"exit status {status}"
+                )
+                self.say(f"{task.name} FAILED: {self.outcome.failed[task.name]}")
+            elif task.gpu:
+                self.say(f"{task.name} done")
+        return bool(ended)
+
+    def _stop(self) -> None:
+        """Have everything write its checkpoint and end."""
+        for _, _, handle in self._running.values():
+            if handle.poll() is None:
+                handle.stop()
+        end = time.monotonic() + GRACE
+        while (
+            any(handle.poll() is None for _, _, handle in self._running.values())
+            and time.monotonic() < end
+        ):
+            time.sleep(POLL)
+        for _, _, handle in self._running.values():
+            if handle.poll() is None:
+                handle.kill()
+        self._running.clear()
+
+
+def last_line(log: Path) -> str:
+    """Return the last line of what a task printed."""
+    return (
+        log.read_text(errors="replace").strip().rpartition("\n")[2].strip() if log.exists() else ""
+    )

@@ -1,0 +1,170 @@
+"""What is told and kept of a list: a line a run, and two records, of the trainings and of the
+throws.
+"""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.errors import StorageError
+from visthrow.paper.report.result_set import runs_of
+from visthrow.paper.sweep.work import PIECES, held, lock_of
+from visthrow.paper.sweep.work_units import (
+    PROGRESS,
+    SUMMARY,
+    Source,
+    Work,
+    throws_folder,
+    variant_of,
+)
+from visthrow.throws import results
+
+CURVE_POINTS = 60  # points of a run's learning curve in the record
+
+
+def status(work: Work, out: Path) -> tuple[list[str], bool]:
+    """A line a run, a last one with the sum, and whether all is done."""
+    lines, seconds, left = [], 0.0, 0
+    width = max(len(source.name) for source in work.sources)
+    for source in work.sources:
+        units = work.throws.get(source.id, ())
+        thrown = sum(unit.done(out) for unit in units)
+        state, spent = _state(source, out)
+        seconds += spent
+        left += (not source.done(out)) + len(units) - thrown
+        lines.append(f"{source.name:{width}}  {state:44}  throws {thrown}/{len(units)}")
+    lines.append(
+        f"{len(work.sources)} runs, {seconds / 60:.1f} minutes of training, {left} units left"
+    )
+    return lines, left == 0
+
+
+def _state(source: Source, out: Path) -> tuple[str, float]:
+    """What is to be said of one training, and its seconds so far."""
+    if not source.config:
+        return "there already", 0.0
+    rows = _progress(source, out)
+    seconds = _seconds(rows)
+    if source.done(out):
+        error = _final(source, out)["error_mean"]
+        return (
+            f"done in {seconds:.0f} s" + ("" if error is None else f", {error:.3f} m at 2.0 m"),
+            seconds,
+        )
+    if held(lock_of(out, source.id)):
+        return f"running, {len(rows)} of {source.iterations} iterations", seconds
+    return (
+        f"stopped after {len(rows)} of {source.iterations} iterations" if rows else "not begun"
+    ), seconds
+
+
+def collect(work: Work, out: Path, records: Path) -> list[Path]:
+    """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already;
+    returns their paths.
+
+    Of two results for the same question, older and newer weights or config, the one that is here
+    counts. Raises StorageError: nothing is done, and nothing stands there."""
+    training, throws = (
+        records / "training" / f"{work.name}.json",
+        records / "throws" / f"{work.name}.json",
+    )
+    runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {
+        source.name: _run(source, out)
+        for source in work.sources
+        if source.config and source.done(out)
+    }
+    if (
+        not runs
+        and not any(unit.done(out) for units in work.throws.values() for unit in units)
+        and not throws.exists()
+    ):
+        raise StorageError(
+            f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep"
+            f" run {work.name}' made"
+        )
+    order = {source.name: i for i, source in enumerate(work.sources)}
+    listed = sorted(
+        (run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]]
+    )
+    results.write_line(training, {"runs": listed})
+    kept = {_question(result): result for result in results.load_all([throws]).values()}
+    for units in work.throws.values():
+        for unit in units:
+            if unit.done(out):
+                path = throws_folder(out) / f"{results.key_of(unit.unit(out))}.json"
+                kept |= {_question(result): result for result in results.load(path)}
+    results.pack(kept.values(), throws)
+    return [training, throws]
+
+
+def _question(result: results.Result) -> str:
+    return results.key_of({key: value for key, value in result.unit.items() if key != "weights"})
+
+
+def _progress(source: Source, out: Path) -> list[dict[str, str]]:
+    path = source.folder(out) / PROGRESS
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if row.get("wall_s")]
+
+
+def _seconds(rows: list[dict[str, str]]) -> float:
+    return sum(float(row["rollout_s"]) + float(row["learning_s"]) for row in rows)
+
+
+def _summary(source: Source, out: Path) -> dict[str, Any]:
+    return json.loads((source.folder(out) / SUMMARY).read_text(encoding="utf-8"))
+
+
+def _final(source: Source, out: Path) -> dict[str, float | None]:
+    """Mean error and duration of the throws that end a training, at 2.0 m."""
+    rows = [row for row in _summary(source, out)["figures"]["throws"] if row["target"] == 2.0]
+    return {
+        name: rows[0].get(name) if rows else None
+        for name in ("error_mean", "duration_mean", "success")
+    }
+
+
+def _run(source: Source, out: Path) -> dict[str, Any]:
+    """A finished training for the record."""
+    rows, summary = _progress(source, out), _summary(source, out)
+    experiment = source.experiment()
+    per_iteration = experiment.samples
+    step = max(len(rows) // CURVE_POINTS, 1)
+    curve, seconds = [], 0.0
+    for i, row in enumerate(rows, 1):
+        seconds += float(row["rollout_s"]) + float(row["learning_s"])
+        if i % step == 0:
+            curve.append(
+                [
+                    int(row["iteration"]) * per_iteration,
+                    round(seconds, 2),
+                    round(float(row["landing_error"]), 5),
+                ]
+            )
+    pieces = [
+        json.loads(path.read_text())
+        for path in sorted((source.folder(out) / PIECES).glob("*.json"))
+    ]
+    return {
+        "name": source.name,
+        "run": Path(source.config).stem,
+        "variant": variant_of(source.config),
+        "layout": experiment.task.observation.layout,
+        "train_seed": source.seed,
+        "key": source.key,
+        "iterations": len(rows),
+        "environments": experiment.ppo.environments,
+        "steps": len(rows) * per_iteration,
+        "seconds": round(seconds, 2),
+        "wall_s": round(sum(piece["seconds"] for piece in pieces), 2),
+        "pieces": len(pieces),
+        "device": (summary["processors"].get("gpu") or [summary["processors"]["cpu"]])[0],
+        "commit": summary["commit"],
+        "command": summary["command"],
+        "versions": summary["versions"],
+        "final": _final(source, out),
+        "curve": curve,
+    }

@@ -1,0 +1,186 @@
+"""Doing of units in this process: a piece of a training run, throws.
+
+What is done, or is being done elsewhere, is left alone.
+"""
+
+import fcntl
+import json
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from visthrow.common import provenance
+from visthrow.common.errors import BusyError
+from visthrow.common.storage import write_json
+from visthrow.paper.sweep.work_units import Source, ThrowUnit, Work, throws_folder
+from visthrow.throws import results
+from visthrow.throws.loading import Loaded, load_policy
+
+PIECES = "pieces"  # folder of a run with one file a piece
+
+EXIT_STOPPED, EXIT_BUSY = 130, 75
+
+
+def lock_of(out: Path, name: str) -> Path:
+    """Lock file of a unit."""
+    return out / "locks" / f"{name.replace('/', '_')}.lock"
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock on a file, which says who has it; BusyError where another process does.
+
+    The kernel lets go of it with the process. The file stays: removing it would let two processes
+    lock two files of one name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise BusyError(
+                f"{path}: another process works on it: {file.read() or 'it does not say which'}"
+            ) from None
+        file.truncate(0)
+        json.dump({"process": os.getpid(), "machine": platform.node(), "since": time.time()}, file)
+        file.flush()
+        yield
+
+
+def held(path: Path) -> bool:
+    """Whether a living process has the lock on a file."""
+    try:
+        with path.open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
+    """Do trainings and throws of these ids one after the other; after so many minutes a training
+    stops with a checkpoint.
+
+    Returns 0; 130 where a training was stopped before its end; 75 where another process had the
+    unit."""
+    begin, status = time.monotonic(), 0
+    throws = {unit.id: unit for units in work.throws.values() for unit in units}
+    for name in ids:
+        left = None if minutes is None else max(minutes - (time.monotonic() - begin) / 60, 0.01)
+        unit = throws.get(name) or work.source(name)
+        try:
+            with locked(lock_of(out, name)):
+                if unit.done(out):
+                    continue
+                if isinstance(unit, Source):
+                    status = train(unit, out, device, left, work.checkpoint_every)
+                elif unit.source.done(out):
+                    fly(unit, out, device)
+        except BusyError as error:
+            print(error, file=sys.stderr)
+            status = EXIT_BUSY
+        if status:
+            break
+    return status
+
+
+def train(
+    source: Source, out: Path, device: str, minutes: float | None, checkpoint_every: int
+) -> int:
+    """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow
+    train``.
+    """
+    from visthrow.training import session
+    from visthrow.training.trainer import CHECKPOINT
+
+    folder = source.folder(out)
+    resume = (folder / CHECKPOINT).is_file()
+    if folder.exists() and not resume:  # killed before its first checkpoint
+        shutil.rmtree(folder)
+    asked = session.Options(
+        source.config,
+        source.seed,
+        str(folder),
+        minutes=minutes,
+        checkpoint_every=checkpoint_every,
+        resume=resume,
+        device=device,
+        overrides=source.changes,
+    )
+    start, began = time.perf_counter(), datetime.now(UTC).isoformat(timespec="seconds")
+    status = 1
+    try:
+        status = session.run(asked)
+        status = status if status or source.done(out) else EXIT_STOPPED  # by the clock
+    finally:
+        piece = {
+            "start": began,
+            "seconds": round(time.perf_counter() - start, 2),
+            "status": status,
+            "commit": provenance.commit(),
+        }
+        write_json(
+            folder / PIECES / f"{time.time_ns()}.json",
+            {**piece, "processors": provenance.processors()},
+        )
+    return status
+
+
+def fly(unit: ThrowUnit, out: Path, device: str) -> None:
+    """Throw and write the result."""
+    command = f"visthrow sweep run (throws {unit.set} of {unit.source.name})"
+    results.finish(
+        throws_folder(out),
+        lambda _: (_columns(unit, out, device), {}),
+        provenance.commit(),
+        command,
+        unit.unit(out),
+    )
+
+
+def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
+    from visthrow.throws.reference_protocol import Job, fly_batch
+    from visthrow.training.device import resolve
+    from visthrow.training.protocol import throw
+
+    loaded = load(unit, out)
+    if unit.params.plant == "hybrid":
+        device = resolve(device)
+        policy = loaded.policy.to(device)
+        return results.columns_of(
+            throw(
+                loaded.experiment,
+                policy.actor(unit.count),
+                unit.target,
+                unit.count,
+                device,
+                unit.params.seed,
+            )
+        )
+    torch.set_num_threads(1)
+    return fly_batch(
+        [loaded],
+        unit.params.plant,
+        Job((0,), unit.target, unit.batch, unit.count, unit.params.seed),
+    )
+
+
+def load(unit: ThrowUnit, out: Path) -> Loaded:
+    """The policy with the experiment that it is to fly in; MismatchError where the list does not
+    allow what differs.
+    """
+    layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
+    name, changes = unit.flown_in(
+        layout
+    )  # a training's from the list: that of its file may have fields of another version
+    return load_policy(unit.source.policy(out), name or None, changes, unit.params.allow)

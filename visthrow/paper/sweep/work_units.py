@@ -1,0 +1,277 @@
+"""Units of work of a list: training runs and sets of throws, where their results lie, and which are
+done.
+
+A training run is known by a hash of its resolved config, its seed and, where the list asks for it,
+the commit: a changed config is another run, and its folder another folder. Throws are known as
+:mod:`visthrow.throws.results` knows them, by all that they depend on, the policy file's content
+included."""
+
+import json
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from visthrow import config
+from visthrow.common import provenance
+from visthrow.common.errors import ConfigError, suggest
+from visthrow.onboard.policy import find_policy
+from visthrow.paper.sweep import SweepList, ThrowParams
+from visthrow.task import Experiment
+from visthrow.throws import results
+from visthrow.throws.reference_protocol import batches
+
+FULL = {
+    "state": "state",
+    "vision": "vision_ideal",
+}  # layout -> the training config whose variants are compared with it
+
+POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A policy: to be trained, or there already."""
+
+    # <config>-<seed> where it is trained, <config>-<group>-<seed> with changes of its group
+    name: str
+    config: str = ""  # of configs/train; empty for a policy that is there already
+    changes: tuple[str, ...] = ()
+    seed: int = 0
+    key: str = ""  # of the training; empty likewise
+
+    @property
+    def id(self) -> str:
+        """Name of the training on the command line and of its folder."""
+        return f"{self.name}-{self.key[:8]}" if self.key else self.name
+
+    @property
+    def iterations(self) -> int:
+        """That the training is to have."""
+        return self.experiment().iterations
+
+    def folder(self, out: Path) -> Path:
+        """Folder of the training run."""
+        return out / "train" / self.id
+
+    def policy(self, out: Path) -> Path:
+        """Where the policy lies, or will."""
+        return self.folder(out) / POLICY if self.config else find_policy(self.name)
+
+    def done(self, out: Path) -> bool:
+        """Whether the policy is there, with what the training says of it."""
+        return not self.config or (self.folder(out) / SUMMARY).is_file()
+
+    def experiment(self) -> Experiment:
+        """What it is trained in."""
+        return _experiment(self.config, self.changes)
+
+    @property
+    def flown(self) -> tuple[str, ...]:
+        """Changes of the config that its policy is flown with."""
+        return self.changes + self.experiment().flown if self.config else ()
+
+
+@dataclass(frozen=True)
+class ThrowUnit:
+    """Throws of one policy at one target: all of them in the training simulator, one batch on a
+    reference plant.
+    """
+
+    source: Source
+    set: str  # name of the table of throws
+    params: ThrowParams
+    target: float  # [m]
+    count: int
+    batch: int | None = None
+
+    @property
+    def id(self) -> str:
+        """Name on the command line."""
+        return ":".join(
+            [
+                self.source.id,
+                self.set,
+                f"{self.target:g}",
+                *([] if self.batch is None else [str(self.batch)]),
+            ]
+        )
+
+    def unit(self, out: Path) -> dict[str, Any]:
+        """What :mod:`visthrow.throws.results` knows it by; the policy must be there."""
+        source, params = self.source, self.params
+        path = source.policy(out)
+        own, flown = self.experiments(out)
+        layout = own["task"]["observation"]["layout"]
+        run, seed = (source.config, source.seed) if source.config else (layout, None)
+        unit = results.policy_unit(
+            source.name,
+            _hash(path, path.stat().st_mtime_ns),
+            layout,
+            params.plant,
+            self.target,
+            self.count,
+            params.seed,
+            run=Path(run).stem,
+            variant=variant_of(run),
+            train_seed=seed,
+            departures=differences(own, flown),
+        )
+        return unit if self.batch is None else {**unit, "batch": self.batch}
+
+    def experiments(self, out: Path) -> tuple[dict, dict]:
+        """The policy's own config and the one it is flown in, without the learning parameters."""
+        source = self.source
+
+        def stated(name: str, changes: tuple[str, ...]) -> dict[str, Any]:
+            found = (
+                config.to_dict(_experiment(name, changes))
+                if name
+                else _shipped_config(source.policy(out), changes)
+            )
+            return {key: value for key, value in found.items() if key != "ppo"}
+
+        own = stated(source.config, source.flown)
+        return own, stated(*self.flown_in(own["task"]["observation"]["layout"]))
+
+    def flown_in(self, layout: str) -> tuple[str, tuple[str, ...]]:
+        """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its
+        changes.
+        """
+        if self.params.fly_in == "full":
+            return FULL[layout], self.params.changes
+        return self.source.config, self.source.flown + self.params.changes
+
+    def done(self, out: Path) -> bool:
+        """Whether the result is there."""
+        return (
+            self.source.done(out)
+            and (throws_folder(out) / f"{results.key_of(self.unit(out))}.json").is_file()
+        )
+
+
+@dataclass(frozen=True)
+class Work:
+    """All units of a list, the most important first."""
+
+    name: str
+    sources: tuple[Source, ...]
+    throws: dict[str, tuple[ThrowUnit, ...]]  # by the policy's id
+    checkpoint_every: int  # iterations
+
+    def source(self, name: str) -> Source:
+        """The training of that id; ConfigError where the list has changed."""
+        known = {source.id: source for source in self.sources}
+        if name not in known:
+            raise ConfigError(f"no run '{name}' in the list; {suggest(name, known)}")
+        return known[name]
+
+
+def throws_folder(out: Path) -> Path:
+    """Where results of throws lie."""
+    return out / "throws"
+
+
+def variant_of(run: str) -> str:
+    """What a training config lacks or has more of than its layout's full one:
+
+    ``state_no_delay`` -> ``no_delay``.
+    """
+    stem = Path(run).stem
+    layout, _, rest = stem.partition("_")
+    return "full" if stem in FULL.values() else rest if layout in FULL and rest else stem
+
+
+def load_list(name: str, overrides: tuple[str, ...] = ()) -> Work:
+    """Load a list by a name of ``configs/sweep`` or a file, and cut it into units; ConfigError
+    where something is wrong in it.
+    """
+    path = config.find("sweep", name)
+    return expand(path.stem, config.load(SweepList, path, overrides))
+
+
+def expand(name: str, params: SweepList) -> Work:
+    """Cut a list into units; ConfigError for a config, change or policy that does not exist."""
+    sources: dict[str, Source] = {}
+    throws: dict[str, list[ThrowUnit]] = {}
+    commit = provenance.commit() if params.commit == "same" else ""
+    for called, group in params.runs.items():
+        changes, mark = params.changes + group.changes, f"{called}-" if group.changes else ""
+        trained = [
+            _trained(item, mark, changes, seed, commit)
+            for seed in group.seeds
+            for item in group.configs
+        ]
+        for source in [*(Source(str(policy)) for policy in group.policies), *trained]:
+            sources.setdefault(source.id, source)
+            listed = throws.setdefault(source.id, [])
+            for wanted in group.throws:
+                throw = params.throws[wanted]
+                count = (
+                    throw.count
+                    if params.most_throws is None
+                    else min(throw.count, params.most_throws)
+                )
+                fresh = _throws(source, wanted, replace(throw, count=count))
+                listed.extend(unit for unit in fresh if unit not in listed)
+    return Work(
+        name,
+        tuple(sources.values()),
+        {key: tuple(units) for key, units in throws.items()},
+        params.checkpoint_every,
+    )
+
+
+def differences(own: dict, flown: dict, path: str = "") -> dict[str, Any]:
+    """Dotted key -> value flown with, wherever two configs differ."""
+    found: dict[str, Any] = {}
+    for key in sorted(own.keys() | flown.keys()):
+        before, now = own.get(key), flown.get(key)
+        if isinstance(before, dict) and isinstance(now, dict):
+            found |= differences(before, now, f"{path}{key}.")
+        elif before != now:
+            found[f"{path}{key}"] = now
+    return found
+
+
+def _trained(name: str, mark: str, changes: tuple[str, ...], seed: int, commit: str) -> Source:
+    stated = config.to_dict(
+        _experiment(name, changes), defaults=False
+    )  # a field that is added later changes no key
+    key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
+    return Source(f"{Path(name).stem}-{mark}{seed}", name, changes, seed, key)
+
+
+def _throws(source: Source, name: str, params: ThrowParams) -> list[ThrowUnit]:
+    if params.plant == "hybrid":
+        return [ThrowUnit(source, name, params, target, params.count) for target in params.targets]
+    cut = batches(params.count)
+    return [
+        ThrowUnit(source, name, params, target, size, batch)
+        for target in params.targets
+        for batch, size in cut
+    ]
+
+
+@cache
+def _hash(path: Path, changed: int) -> str:
+    return results.hash_of(path)
+
+
+@cache
+def _experiment(name: str, changes: tuple[str, ...]) -> Experiment:
+    return config.load(Experiment, config.find("train", name), changes)
+
+
+@cache
+def _shipped_config(path: Path, changes: tuple[str, ...] = ()) -> dict[str, Any]:
+    from visthrow.throws.loading import load_policy
+
+    return json.loads(
+        json.dumps(config.to_dict(load_policy(path, None, changes, allow=_ANYTHING).experiment))
+    )
+
+
+_ANYTHING = ("observation", "action", "control_period", "release", "vehicle", "rope", "camera")
+"""Every section of a contract: here the config is only read; whoever flies states what may differ.
+"""
