@@ -1,232 +1,537 @@
-"""Calibration files of the field: OpenCV YAML, Kalibr camchain, ROS camera_info and basalt JSON.
+"""Calibration files of the field, as our lens: which tool wrote a file is told from its keys.
 
-Convention: all four count pixels from the centre of the top left one and x right, y down, z
-forward, as `FisheyeParams` does. None of them holds a field of view; it is read from an extra key
-``fov_deg``, which their own readers ignore. A file without it gets the ``fov_deg`` of the call
-[deg] or, that left out, the angle that the farthest corner of the image sees. A file that is
-missing, cut short, lacks a key, or holds another model is a ValueError; ``camera`` is the number of
-one in a file that holds several."""
+Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, vikit,
+ORB-SLAM, basalt, ROS camera_info (as a file or as ``topic echo`` prints it), OpenCV's FileStorage,
+OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one or several cameras. A box says where the
+numbers of a camera stand; `camera.calibrate.foreign` knows the models.
+
+Convention: pixel (0, 0) is the centre of the top left pixel, x right, y down, z forward, as in
+`FisheyeParams`. None of the files holds a field of view; it is read from an extra key ``fov_deg``,
+which their own readers ignore. A file without it gets the ``fov_deg`` of the call [deg] or, that
+left out, the angle that the farthest corner of the image sees."""
 
 import json
 import math
-from dataclasses import dataclass
+import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from camera.calibrate.foreign import FOREIGN_MODELS, FitReport, fit_fisheye
-from camera.fisheye import Fisheye
+from camera.calibrate.foreign import (
+    ANGULAR,
+    DENOMINATORS,
+    DISTORTIONS,
+    LARGEST_DECENTRING,
+    FitReport,
+    fit_fisheye,
+    image_fov_deg,
+)
 from camera.params import FisheyeParams, monotonic_limit
 
-EXACT = FitReport("kb4", 0.0, 0.0, 0)
-"""Report of a file that holds our own model: nothing was fitted."""
+Node = dict[str, Any]
+Values = dict[str, float]
+Camera = tuple[str, Values]
+"""Model, as `camera.calibrate.foreign.project` calls it, and its numbers."""
 
-_KB4 = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
-
-
-def read_opencv(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
-    """Read an OpenCV YAML (or XML, JSON) file of a fisheye calibration, ``fisheye_model: 1``, as
-    OpenCV's calibration sample writes it.
-    """
-    import cv2
-
-    text_of(path)
-    tree: dict[str, Any] = {}
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        for key in sorted(storage.root().keys()):
-            node = storage.getNode(key)
-            tree[key] = node.real() if node.isInt() or node.isReal() else None
-            if key in ("camera_matrix", "distortion_coefficients") and node.isMap():
-                tree[key] = node.mat().ravel().tolist()
-    except (cv2.error, SystemError, AttributeError) as error:
-        raise ValueError(
-            f"{path} cannot be read as an OpenCV file (cut short?): {str(error).strip()}"
-        ) from error
-    file = _Entry(path, tree)
-    file["fisheye_model"].among(1)  # the Kannala-Brandt model
-    size = [file[key].value for key in ("image_width", "image_height")]
-    return _params(
-        file,
-        size,
-        (*file["camera_matrix"].focal_and_centre(), *file["distortion_coefficients"].floats(4)),
-        fov_deg,
-    )
+KB4 = "fx fy cx cy k1 k2 k3 k4"
+LABELS = {
+    "kb4": "kb4 equidistant equi fisheye kannalabrandt kannalabrandt4 kannalabrandt8 opencvfisheye",
+    "radtan": (
+        "radtan radialtangential plumbbob rationalpolynomial brownconrady modifiedbrownconrady"
+        " inversebrownconrady opencv pinholeradtan8"
+    ),
+    "fov": "fov atan",
+    "none": "none",
+}
+"""Distortion -> what tools call it, in small letters without signs."""
 
 
-def read_kalibr(path: str | Path, camera: int = 0, fov_deg: float | None = None) -> FisheyeParams:
-    """Read one camera of a Kalibr camchain (``pinhole`` + ``equidistant``, which is
-    Kannala-Brandt).
-    """
-    file = _yaml(path)[f"cam{camera}"]
-    file["camera_model"].among("pinhole")
-    file["distortion_model"].among("equidistant")
-    values = (*file["intrinsics"].floats(4), *file["distortion_coeffs"].floats(4))
-    return _params(file, file["resolution"].value, values, fov_deg)
+class _Missing(ValueError):
+    """A key that a file should hold."""
 
 
-def read_ros(path: str | Path, fov_deg: float | None = None) -> FisheyeParams:
-    """Read a ROS camera_info YAML with the ``equidistant`` (ROS 2, REP 118) or ``fisheye``
-    distortion model.
-    """
-    file = _yaml(path)
-    file["distortion_model"].among("equidistant", "fisheye")
-    values = (
-        *file["camera_matrix"]["data"].focal_and_centre(),
-        *file["distortion_coefficients"]["data"].floats(4),
-    )
-    for key, count in (
-        ("rectification_matrix", 9),
-        ("projection_matrix", 12),
-    ):  # unused, but a file cut short lacks them
-        file[key]["data"].floats(count)
-    return _params(
-        file, [file[key].value for key in ("image_width", "image_height")], values, fov_deg
-    )
+def read(
+    path: str | Path, camera: int | str = 0, fov_deg: float | None = None, model: str | None = None
+) -> tuple[str, FisheyeParams, FitReport]:
+    """Read a calibration file.
 
+    Raises ValueError: the file is missing, no text, of no known tool or model, or its numbers
+    describe no lens; the message names the file.
 
-def read_basalt(
-    path: str | Path, camera: int = 0, fov_deg: float | None = None
-) -> tuple[FisheyeParams, FitReport]:
-    """Read one camera of a basalt calibration:
+    Args:
+        path: The file.
+        camera: Number from 0, or name, of the camera in a file that holds several.
+        fov_deg: Full field of view where the file has none [deg].
+        model: Distortion model, a key of `LABELS`, where the file names none or a wrong one.
 
-    ``kb4`` as it is, ``ds`` and ``eucm`` through a fit inside the field of view.
-
-    Returns the fisheye and what the fit left over (all zero for ``kb4``).
+    Returns:
+        The tool that writes such files, the fisheye, and what a fit of another lens model left over
+        (zero where the file holds ours).
     """
     try:
-        tree = json.loads(text_of(path, whole_lines=False))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no complete JSON (cut short?): {error}") from error
-    file = _Entry(path, tree)["value0"]
-    node = file["intrinsics"][camera]
-    model = node["camera_type"].among("kb4", *sorted(FOREIGN_MODELS))
-    names = _KB4 if model == "kb4" else FOREIGN_MODELS[model][0]
-    values = _Entry(path, [node["intrinsics"][name].value for name in names], "intrinsics").floats(
-        len(names)
-    )
-    size = file["resolution"][camera]
-    if model == "kb4":
-        return _params(node, size.value, tuple(values), fov_deg), EXACT
-    width, height = map(int, size.floats(2))
-    try:
-        return fit_fisheye(model, dict(zip(names, values, strict=True)), width, height, fov_deg)
+        found = _cameras(_tree(path))
+        if not found:
+            raise ValueError(
+                f"holds no camera of a known tool; expected a calibration of {', '.join(BOXES)}"
+            )
+        box, node, name = _chosen(found, camera)
+        node = {**node, "asked_model": model} if model else node
+        lens, report = _lens(*BOXES[box][1](node), node, fov_deg)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    if len(found) > 1:
+        others = ", ".join(of[2] or str(i) for i, of in enumerate(found))
+        report = replace(
+            report,
+            remarks=(f"camera {name} of {len(found)} in the file ({others})", *report.remarks),
+        )
+    return box, lens, report
 
 
-def image_fov_deg(fisheye: FisheyeParams) -> float:
-    """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d
-    stops growing and to 360.
-    """
-    limit = min(2.0 * math.degrees(monotonic_limit(fisheye.coefficients)), 360.0)
-    widest = Fisheye(FisheyeParams(**{**vars(fisheye), "fov_deg": limit * (1.0 - 1e-9)}))
-    right, low = fisheye.width - 0.5, fisheye.height - 0.5
-    corners = torch.tensor(
-        [[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]], dtype=torch.float64
+def _chosen(found: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
+    names = [name for *_, name in found]
+    number = int(camera) if str(camera).isdigit() else -1
+    if camera in names:
+        return found[names.index(str(camera))]
+    if 0 <= number < len(found):
+        return found[number]
+    raise ValueError(
+        f"camera {camera} asked for; expected a number below {len(found)}, the cameras in the file,"
+        f" or one of their names: {', '.join(name or '(no name)' for name in names)}"
     )
-    rays, _ = widest.unproject(corners)
-    return 2.0 * math.degrees(float(widest.angle(rays)[0].max()))
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """What stands in a file under a name; where it is not what is asked for, the ValueError names
-    both.
-    """
-
-    path: str | Path
-    value: Any
-    name: str = ""
-
-    def _refused(self, expected: str) -> ValueError:
-        text = repr(self.value)
-        shown = text if len(text) <= 80 else text[:77] + "..."
-        return ValueError(f"{self.path}: {self.name or 'the file'} is {shown}; expected {expected}")
-
-    def __getitem__(self, key: str | int) -> "_Entry":
-        """Entry of a mapping by its key, of a list by the number of the camera."""
-        if isinstance(key, int):
-            count = len(self.value) if isinstance(self.value, list) else 0
-            if not 0 <= key < count:
-                raise ValueError(
-                    f"{self.path}: camera {key} asked for; expected below {count}, the number of"
-                    f" {self.name} in the file"
-                )
-        elif not isinstance(self.value, dict):
-            raise self._refused("a mapping of keys to values")
-        elif key not in self.value:
-            raise ValueError(
-                f"{self.path} lacks the key {key!r} (cut short?); it has"
-                f" {sorted(map(str, self.value))}"
-            )
-        return _Entry(self.path, self.value[key], f"{self.name}.{key}".lstrip("."))
-
-    def among(self, *choices: Any) -> Any:
-        """The value, which must be one of these."""
-        if self.value not in choices:
-            raise self._refused(f"one of {list(choices)}")
-        return self.value
-
-    def floats(self, count: int) -> list[float]:
-        """So many numbers."""
-        values = self.value
-        good = isinstance(values, list | tuple) and len(values) == count
-        if not good or not all(
-            isinstance(v, int | float) and not isinstance(v, bool) for v in values
-        ):
-            raise self._refused(f"{count} numbers")
-        return [float(v) for v in values]
-
-    def focal_and_centre(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy of a camera matrix without skew."""
-        fx, skew, cx, _, fy, cy, *_ = self.floats(9)
-        if abs(skew) > 1e-9 * abs(fx):
-            raise self._refused("a matrix without skew, which our model has not")
-        return fx, fy, cx, cy
+# What a file holds: a tree of mappings and lists
 
 
-def _params(
-    entry: _Entry, size: Any, values: tuple[float, ...], asked_fov: float | None
-) -> FisheyeParams:
-    """Intrinsics in the order of `_KB4`; the field of view is the entry's own, the asked one, or
-    what the farthest corner sees.
-    """
-    width, height = map(int, _Entry(entry.path, size, "image size").floats(2))
-    lens = dict(zip(_KB4, values, strict=True))
-    fov = asked_fov if entry.value.get("fov_deg") is None else entry.value["fov_deg"]
-    try:
-        if fov is None:
-            fov = image_fov_deg(FisheyeParams(width, height, **lens, fov_deg=1.0))
-        return FisheyeParams(
-            width, height, **lens, fov_deg=_Entry(entry.path, [fov], "fov_deg").floats(1)[0]
-        )
-    except ValueError as error:
-        raise ValueError(f"{entry.path}: {error}") from error
-
-
-def text_of(path: str | Path, whole_lines: bool = True) -> str:
-    """Text of a file that exists and, where the format has no closing bracket, does not end within
-    a line.
-    """
+def _tree(path: str | Path) -> Any:
+    """Mappings and lists of a YAML, JSON or XML file, or of OCamCalib's text."""
     if not Path(path).is_file():
-        raise ValueError(f"{path} is not a file; expected a calibration file")
-    text = Path(path).read_text()
-    if whole_lines and not text.endswith("\n"):
-        # "resolution: [640, 48" and "- 48" of 480 read as numbers too: only the missing line end
-        # tells.
-        raise ValueError(
-            f"{path} ends within a line (cut short?); expected a line end, which a complete file"
-            " needs"
-        )
-    return text
+        raise ValueError("not a file; expected a calibration file")
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig").replace("\r\n", "\n").strip()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"no text ({error}); expected a calibration file") from error
+    if text.startswith("<"):
+        return _tree_of_xml(text)
+    if text.startswith("{"):
+        try:
+            return json.loads(text)
+        except json.JSONDecodeError:
+            pass  # YAML's mappings may begin with a brace too
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if lines and all(re.fullmatch(r"[-+.\deE\s]+", line) for line in lines):
+        return {"ocam_lines": [line.split() for line in lines]}
+    return _tree_of_yaml(text)
 
 
-def _yaml(path: str | Path) -> _Entry:
+def _tree_of_yaml(text: str) -> Any:
+    """First document that is a mapping or a list; OpenCV's head and tags are passed over."""
     import yaml
 
+    text = re.sub(r"\A%YAML[^\n]*\n|!!opencv-matrix", "", text).replace("\t", "    ")
     try:
-        return _Entry(path, yaml.safe_load(text_of(path)))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no complete YAML (cut short?): {error}") from error
+        documents = list(yaml.safe_load_all(text))
+    except (yaml.YAMLError, ValueError) as error:
+        raise ValueError(f"is no complete YAML (cut short?): {error}") from error
+    return next((tree for tree in documents if isinstance(tree, dict | list)), None)
+
+
+def _tree_of_xml(text: str) -> Any:
+    from xml.etree import ElementTree
+
+    def tree_of(element: ElementTree.Element) -> Any:
+        if len(element):
+            return {child.tag: tree_of(child) for child in element}
+        words = (element.text or "").split()
+        return words if element.tag == "data" else " ".join(words)
+
+    try:
+        return tree_of(ElementTree.fromstring(text))
+    except ElementTree.ParseError as error:
+        raise ValueError(f"is no complete XML (cut short?): {error}") from error
+
+
+def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
+    """Each camera in a tree: its box, its node and what it is called there."""
+    if isinstance(tree, list):
+        named = [(str(i), of) for i, of in enumerate(tree)]
+    elif isinstance(tree, dict):
+        if isinstance(tree.get("intrinsics"), list) and "resolution" in tree:
+            tree = _unzipped(tree)
+        known = {str(key) for key in tree}
+        box = next((box for box, (keys, _) in BOXES.items() if keys(known)), "")
+        if box:
+            return [(box, tree, str(tree.get("label", name) or name))]
+        named = [(str(key), of) for key, of in tree.items()]
+    else:
+        return []
+    return [
+        found
+        for key, of in named
+        for found in _cameras(of, name if key in ("camera", "value0", "cameras") else key)
+    ]
+
+
+def _unzipped(tree: Node) -> Node:
+    """Basalt's cameras, whose intrinsics and resolutions stand in two lists."""
+    if not all(isinstance(of, dict) for of in tree["intrinsics"]):
+        return tree
+    sizes = tree["resolution"]
+    return {
+        f"cam{i}": {**of, "resolution": sizes[i] if i < len(sizes) else None}
+        for i, of in enumerate(tree["intrinsics"])
+    }
+
+
+# Numbers in it
+
+
+def _any(node: Node, *names: str) -> Any:
+    """What stands under the first of these keys that is there; a dot leads into a mapping."""
+    for name in names:
+        value: Any = node
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if value is not None:
+            return value
+    raise _Missing(
+        f"lacks the key {' or '.join(map(repr, names))} (cut short?); it has"
+        f" {sorted(map(str, node))}"
+    )
+
+
+def _floats(value: Any, name: str, counts: tuple[int, ...] | None = None) -> list[float]:
+    """So many numbers, in a list, a list of lists, or the ``data`` of a matrix."""
+    flat = value.get("data", value) if isinstance(value, dict) else value
+    if isinstance(flat, list) and flat and all(isinstance(row, list) for row in flat):
+        flat = [cell for row in flat for cell in row]
+    try:
+        numbers = [float(cell) for cell in flat if not isinstance(cell, bool)]
+        if isinstance(flat, str) or (counts and len(numbers) not in counts):
+            raise ValueError
+    except (TypeError, ValueError):
+        text = repr(value)
+        wanted = " or ".join(map(str, counts)) if counts else "some"
+        raise ValueError(
+            f"{name} is {text if len(text) <= 80 else text[:77] + '...'}; expected {wanted} numbers"
+        ) from None
+    return numbers
+
+
+def _named(node: Node, names: str, section: str = "") -> Values:
+    """Numbers that stand under their own names."""
+    at = _any(node, section) if section else node
+    words = names.split()
+    return dict(zip(words, _floats([_any(at, word) for word in words], names)))
+
+
+def _label(node: Node, *names: str) -> str:
+    """Distortion model by whatever name a tool gives it."""
+    asked = node.get("asked_model")
+    word = str(asked if asked else _any(node, *names))
+    plain = re.sub(r"[^a-z0-9]", "", word.lower())
+    for model, words in LABELS.items():
+        if plain in words.split():
+            return model
+    raise ValueError(f"distortion model {word!r}; expected one of {list(LABELS)}, or their names")
+
+
+def _model(core: str, distortion: str, values: Values, coefficients: list[float]) -> Camera:
+    """Model of a core and its distortion; coefficients beyond those of the model must be zero."""
+    if core == "pinhole" and distortion == "kb4":
+        core, distortion, names = "kb4", "none", KB4.split()[4:]
+    elif distortion == "kb4":
+        raise ValueError(f"model '{core}' with equidistant distortion; no tool writes that")
+    else:
+        names = DISTORTIONS[distortion][0].split()
+    if len(coefficients) < (4 if core == "kb4" else len(names[:4])):
+        raise ValueError(
+            f"{len(coefficients)} distortion coefficients {coefficients}; expected"
+            f" {' '.join(names[:4])}"
+        )
+    if any(coefficients[len(names) :]):
+        raise ValueError(
+            f"distortion coefficients {coefficients}; the {distortion} model has {' '.join(names)},"
+            " and those beyond are not zero: another model, such as a thin prism"
+        )
+    values = values | dict(zip(names, coefficients))
+    return (core if distortion == "none" else f"{core}-{distortion}"), values
+
+
+# Boxes: where the numbers of one camera stand
+
+
+def _kalibr(node: Node) -> Camera:
+    core = str(_any(node, "camera_model", "model")).lower()
+    names = {"pinhole": "", "omni": "xi", "ds": "xi alpha", "eucm": "alpha beta"}
+    if core not in names:
+        raise ValueError(f"camera_model is {core!r}; expected one of {list(names)}")
+    words = f"{names[core]} fx fy cx cy".split()
+    values = dict(zip(words, _floats(_any(node, "intrinsics"), "intrinsics", (len(words),))))
+    if core in ("ds", "eucm"):
+        return core, values
+    given = _any(node, "distortion_coeffs", "distortion_coefficients")
+    coefficients = _floats(given, "distortion_coeffs")
+    return _model(core, _label(node, "distortion_model"), values, coefficients)
+
+
+CAMODOCAL = {
+    "kannala_brandt": ("kb4", "k1=k2 k2=k3 k3=k4 k4=k5 fx=mu fy=mv cx=u0 cy=v0"),
+    "mei": ("omni-radtan", "xi k1 k2 p1 p2 fx=gamma1 fy=gamma2 cx=u0 cy=v0"),
+    "pinhole": ("pinhole-radtan", "k1 k2 p1 p2 fx fy cx cy"),
+    "pinhole_full": ("pinhole-radtan", "k1 k2 p1 p2 k3 k4 k5 k6 fx fy cx cy"),
+    "polyfisheye": ("polyfisheye", "k2 k3 k4 k5 k6 k7 fx=A11 skew=A12 fy=A22 cx=u0 cy=v0"),
+    "fishpoly": ("polyfisheye", "k2 k3 k4 k5 k6 k7 fx=A11 skew=A12 fy=A22 cx=u0 cy=v0"),
+    "scaramuzza": ("ocam", "fx=ac skew=ad shear=ae cx cy a0=p0 a1=p1 a2=p2 a3=p3 a4=p4"),
+}
+"""``model_type`` -> our model, and its numbers, with the file's names where they differ."""
+
+
+def _camodocal(node: Node) -> Camera:
+    kind = str(_any(node, "model_type", "cam_model")).lower()
+    if kind not in CAMODOCAL:
+        raise ValueError(f"model_type is {kind.upper()!r}; expected one of {[*CAMODOCAL]}")
+    model, names = CAMODOCAL[kind]
+    inner = [of for key, of in node.items() if isinstance(of, dict) and "inv" not in key]
+    flat = {key: of for section in (node, *inner) for key, of in section.items()}
+    pairs = [word.partition("=") for word in names.split()]
+    values = {ours: _floats([_any(flat, his or ours)], his or ours)[0] for ours, _, his in pairs}
+    return model, values | ({"fy": 1.0} if model == "ocam" else {})
+
+
+def _svo(node: Node) -> Camera:
+    core = str(node["type"]).lower()
+    numbers = _floats(_any(node, "intrinsics"), "intrinsics")
+    if core == "omni" and len(numbers) == 24:
+        values = {f"a{i}": a for i, a in enumerate(numbers[:5])}
+        cx, cy, c, d, e = numbers[5:10]
+        return "ocam", values | {"cx": cx, "cy": cy, "fx": 1.0, "skew": e, "shear": d, "fy": c}
+    if core != "pinhole" or len(numbers) != 4:
+        raise ValueError(
+            f"type is {core!r} with {len(numbers)} intrinsics; expected 'pinhole' with 4 or 'omni'"
+            " with 24"
+        )
+    given = _any(node, "distortion.parameters", "distortion_coefficients", "distortion.data")
+    label = "fov" if _any(node, "distortion.type") == "fisheye" else _label(node, "distortion.type")
+    values = dict(zip(KB4.split(), numbers))
+    return _model(core, label, values, _floats(given, "distortion.parameters"))
+
+
+def _vikit(node: Node) -> Camera:
+    kind = str(node["cam_model"]).lower()
+    cores = {"pinhole": "radtan", "pinholeequidistant": "kb4", "atan": "fov", "pinholeatan": "fov"}
+    if kind not in cores:
+        raise ValueError(f"cam_model is {node['cam_model']!r}; expected one of {list(cores)}")
+    fx, fy, cx, cy = _floats([_any(node, f"cam_{k}") for k in KB4.split()[:4]], "cam_fx ...")
+    if fx < 10.0:  # shares of the image, which count from its corner
+        width, height = _size(node) or (0, 0)
+        fx, fy, cx, cy = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5
+    given = [_floats([node.get(f"cam_d{i}", 0.0)], f"cam_d{i}")[0] for i in range(5)]
+    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    return _model("pinhole", cores[kind], values, given[: 1 if cores[kind] == "fov" else None])
+
+
+def _matrix(node: Node) -> Camera:
+    """ROS camera_info and OpenCV's FileStorage: a camera matrix and coefficients."""
+    given = _any(node, "camera_matrix", "cameraMatrix", "K", "k")
+    fx, skew, cx, _, fy, cy, *_ = _floats(given, "camera_matrix", (9,))
+    given = _any(node, "distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "d")
+    coefficients = _floats(given, "distortion_coefficients")
+    flag = node.get("fisheye_model")
+    if flag is not None:
+        node = {**node, "distortion_model": "fisheye" if int(flag) else "radtan"}
+    elif not node.get("distortion_model") and len(coefficients) in (5, 8, 12, 14):
+        node = {**node, "distortion_model": "radtan"}
+    if not node.get("distortion_model") and not node.get("asked_model"):
+        raise ValueError(
+            f"{len(coefficients)} distortion coefficients and no name of their model; say it with"
+            " --model kb4 or --model radtan"
+        )
+    label = _label(node, "distortion_model")
+    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
+    return _model("pinhole", label, values, coefficients + [0.0] * (4 - len(coefficients)))
+
+
+def _orbslam(node: Node) -> Camera:
+    head = "Camera1" if "Camera1.fx" in node else "Camera"
+    fisheye = "kannala" in str(node.get("Camera.type", "")).lower()
+    plain = {key.partition(".")[2]: of for key, of in node.items() if key.startswith(head + ".")}
+    names = KB4.split()[4:] if fisheye else DISTORTIONS["radtan"][0].split()[:5]
+    given = [_floats([plain.get(name, 0.0)], name)[0] for name in names]
+    values = _named(plain, "fx fy cx cy")
+    return _model("pinhole", "kb4" if fisheye else "radtan", values, given)
+
+
+def _basalt(node: Node) -> Camera:
+    kind = str(node["camera_type"])
+    core, distortion = ("pinhole", "radtan") if kind == "pinhole-radtan8" else (kind, "none")
+    names = {"kb4": KB4, "pinhole": "fx fy cx cy"}.get(kind, "")
+    if distortion == "radtan":
+        names = "fx fy cx cy " + DISTORTIONS["radtan"][0]
+    elif core in DENOMINATORS and not names:
+        names = f"fx fy cx cy {DENOMINATORS[core][0]}"
+    if not names:
+        known = ["kb4", "pinhole-radtan8", *DENOMINATORS]
+        raise ValueError(f"camera_type is {kind!r}; expected one of {known}")
+    return kind.replace("radtan8", "radtan"), _named(node, names, "intrinsics")
+
+
+def _ocam(node: Node) -> Camera:
+    """OCamCalib's "export data" (rows before columns, depth below zero); py-OCamCalib's JSON."""
+    if "taylor_coefficient" in node:
+        depth = [-a for a in _floats(node["taylor_coefficient"], "taylor_coefficient")]
+        cx, cy = _floats(_any(node, "distortion_center"), "distortion_center", (2,))
+        fx, skew, shear, fy = _floats(_any(node, "stretch_matrix"), "stretch_matrix", (4,))
+    else:
+        lines = node["ocam_lines"]
+        if len(lines) < 5:
+            raise ValueError(
+                f"{len(lines)} lines of numbers; expected five: direct polynomial, inverse"
+                " polynomial, centre, affine part c d e, height and width (cut short?)"
+            )
+        count, *depth = _floats(lines[0], "direct polynomial")
+        cy, cx = _floats(lines[2], "centre", (2,))
+        fy, shear, skew = _floats(lines[3], "affine part c d e", (3,))
+        fx = 1.0
+        if len(depth) != int(count):
+            raise ValueError(f"direct polynomial of {len(depth)} coefficients; announced {count:g}")
+    stretch = {"fx": fx, "skew": skew, "shear": shear, "fy": fy, "cx": cx, "cy": cy}
+    return "ocam", {f"a{i}": a for i, a in enumerate(depth)} | stretch
+
+
+def _has(*names: str) -> Callable[[set[str]], bool]:
+    return lambda keys: all(keys & set(name.split()) for name in names)
+
+
+BOXES: dict[str, tuple[Callable[[set[str]], bool], Callable[[Node], Camera]]] = {
+    "basalt": (_has("camera_type"), _basalt),
+    "kalibr": (_has("camera_model", "intrinsics"), _kalibr),
+    "camodocal": (_has("model_type cam_model", "image_width"), _camodocal),
+    "svo": (_has("type", "intrinsics"), _svo),
+    "vikit": (_has("cam_model"), _vikit),
+    "ros or opencv": (
+        _has(
+            "camera_matrix cameraMatrix K k distortion_coefficients",
+            "D d distortion_coefficients dist_coeffs distCoeffs camera_matrix",
+        ),
+        _matrix,
+    ),
+    "orb-slam": (_has("Camera.fx Camera1.fx"), _orbslam),
+    "ocam": (_has("taylor_coefficient ocam_lines"), _ocam),
+}
+"""Tool -> whether a mapping with these keys is a camera of its, and what reads it."""
+
+
+# From the numbers of a file to our lens
+
+
+def _size(node: Node) -> tuple[int, int] | None:
+    """Width and height [px]; None where the file does not say."""
+    if "ocam_lines" in node:
+        height, width = _floats(node["ocam_lines"][4], "height and width", (2,))
+        return int(width), int(height)
+    pair = ("resolution", "cameraResolution", "image_size", "imageSize", "img_size")
+    given = next((node[name] for name in pair if node.get(name) is not None), None)
+    if given is not None:
+        width, height = _floats(given, "image size", (2,))
+        return int(width), int(height)
+    sides = [("image_width", "width", "cam_width", "Camera.width")]
+    sides.append(("image_height", "height", "cam_height", "Camera.height"))
+    found = [next((node[n] for n in names if n in node), None) for names in sides]
+    if None in found:
+        return None
+    width, height = _floats(found, "image size")
+    return int(width), int(height)
+
+
+def _lens(
+    model: str, values: Values, node: Node, asked_fov: float | None
+) -> tuple[FisheyeParams, FitReport]:
+    """Our lens, read or fitted, and what its numbers say against themselves."""
+    remarks = []
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise ValueError(f"{name} is {value}; expected a finite number")
+    size = _size(node)
+    if size is None:
+        size = (round(2.0 * values["cx"] + 1.0), round(2.0 * values["cy"] + 1.0))
+        remarks.append(
+            f"the file holds no image size: {size[0]} x {size[1]} px, twice its principal point, is"
+            " taken; add image_width and image_height to it"
+        )
+    if model == "kb4" and values.pop("skew", 0.0):
+        raise ValueError("a camera matrix with skew, which our model has not")
+    model, said = _contradictions(model, values, size, bool(node.get("asked_model")))
+    remarks += said
+    fov = asked_fov
+    if node.get("fov_deg") is not None:
+        fov = _floats([node["fov_deg"]], "fov_deg")[0]
+    if model != "kb4":
+        lens, report = _fitted(model, values, size, fov)
+        return lens, replace(report, remarks=(*remarks, *report.remarks))
+    fx, fy, cx, cy, k1, k2, k3, k4 = (values[name] for name in KB4.split())
+    limit = math.degrees(monotonic_limit((k1, k2, k3, k4)))
+    narrow = min(1.0, 1.9 * limit)  # until it is known how much the image sees
+    lens = FisheyeParams(*size, fx, fy, cx, cy, k1, k2, k3, k4, narrow if fov is None else fov)
+    if fov is None:
+        lens = replace(lens, fov_deg=image_fov_deg(lens))
+        if lens.fov_deg > 1.99999 * limit:
+            remarks.append(
+                f"its numbers fold back {limit:.1f} deg off the axis, inside the image: the field"
+                " of view ends there"
+            )
+    return lens, FitReport("kb4", remarks=tuple(remarks))
+
+
+def _fitted(
+    model: str, values: Values, size: tuple[int, int], fov: float | None
+) -> tuple[FisheyeParams, FitReport]:
+    """Fit our lens; ocam's polynomial is told how far the image reaches."""
+    core = model.partition("-")[0]
+    if core not in (*DENOMINATORS, *ANGULAR):
+        raise ValueError(f"camera model {model!r} is not known")
+    if core == "ocam":
+        corner = (
+            max(values["cx"], size[0] - values["cx"]),
+            max(values["cy"], size[1] - values["cy"]),
+        )
+        values = values | {"farthest": 1.1 * math.hypot(*corner)}
+        if (
+            not values["a0"] < 0.0
+            or values["fx"] * values["fy"] == values["skew"] * values["shear"]
+        ):
+            raise ValueError(f"direct polynomial begins with {values['a0']:g}; expected below 0")
+    return fit_fisheye(model, values, *size, fov)
+
+
+def _contradictions(
+    model: str, values: Values, size: tuple[int, int], asked: bool
+) -> tuple[str, list[str]]:
+    """The model that a file's numbers are of, and what they say against their label."""
+    names = values.keys() & set(["k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "w"])
+    remarks = []
+    if names and not any(values[k] for k in names):
+        focal = (
+            "; its focal length is the image's width over pi"
+            if math.isclose(values["fx"], size[0] / math.pi, rel_tol=1e-4)
+            else ""
+        )
+        remarks.append(
+            f"all distortion coefficients are zero{focal}: was this lens calibrated, or are its"
+            " pictures rectified?"
+        )
+    if model == "pinhole-radtan" and not asked:
+        k1, k2, k3, k4 = (values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2"))
+        rest = any(values.get(k, 0.0) for k in ("k3", "k4", "k5", "k6"))
+        tangential = max(abs(k3), abs(k4))
+        if tangential > LARGEST_DECENTRING and not rest:
+            values |= {"k1": k1, "k2": k2, "k3": k3, "k4": k4}
+            remarks.append(
+                f"its label says radial and tangential distortion, but no lens has p = {k3:g},"
+                f" {k4:g}: the numbers are taken as Kannala-Brandt's k1 to k4, as a RealSense T265"
+                " writes them; --model radtan takes the label"
+            )
+            return "kb4", remarks
+    return model, remarks

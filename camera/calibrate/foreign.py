@@ -1,172 +1,301 @@
-"""Other lens models of the field (double sphere, extended unified, ocam) and their conversion into
-ours by a fit.
+"""Lens models of other tools, and their conversion into ours by a fit.
 
-NumPy, float64: this runs once, when a calibration file is read.
+A model is a core (how a ray meets the image plane) and a distortion of that plane, such as
+``omni-radtan``. NumPy, float64: this runs once, when a calibration file is read.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from camera.params import FisheyeParams, monotonic_limit
 
-GRID = 64  # pixels along each side of the grid on which a foreign model is sampled
+Array = NDArray[np.float64]
+Values = Mapping[str, float]
+
+HOLDS_PX = 0.05
+"""Difference of pixels up to which a fitted lens counts as the lens of the file [px]."""
+ANGLES, TURNS = 721, 48
+"""Rays on which a lens is sampled: angles off the axis from 0 to 180 deg, directions about it."""
+LARGEST_DECENTRING = 0.01
+"""Tangential coefficients p1, p2 that no lens reaches; calibrations of others stay below 0.003."""
 
 
 @dataclass(frozen=True)
 class FitReport:
     """How well our model took over a foreign one, as a difference of pixels for the same ray."""
 
-    model: str  # name of the foreign model
-    rms_px: float  # over the grid [px]
-    max_px: float  # over the grid [px]
-    points: int  # rays compared
+    model: str  # of the file
+    rms_px: float = 0.0  # over all that the image sees [px]
+    max_px: float = 0.0  # there [px]
+    points: int = 0  # rays compared; 0: the file holds our model, nothing was fitted
+    # full angle out to which the difference stays below `HOLDS_PX` [deg]
+    holds_deg: float = 360.0
+    remarks: tuple[str, ...] = ()  # what the file's numbers say against themselves
 
 
-Unprojection = Callable[[dict[str, float], np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Of intrinsics (fx, fy, cx, cy [px], the model's own [-]) and pixels [px], shape (N, 2): unit
-rays, shape (N, 3), and validity, (N,).
+def _omni(values: Values, side2: Array, z: Array) -> Array:
+    """Mei and Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA
+    2007, sec. III.
+    """
+    return z + values["xi"] * np.sqrt(side2 + z * z)
+
+
+def _ucm(values: Values, side2: Array, z: Array) -> Array:
+    """Geyer and Daniilidis' unified model with alpha = xi / (1 + xi)."""
+    return values["alpha"] * np.sqrt(side2 + z * z) + (1.0 - values["alpha"]) * z
+
+
+def _eucm(values: Values, side2: Array, z: Array) -> Array:
+    """Khomutenko, Garcia, Martinet, "An Enhanced Unified Camera Model", RA-L 1(1), 2016, eq. 3."""
+    alpha, beta = values["alpha"], values["beta"]
+    return alpha * np.sqrt(beta * side2 + z * z) + (1.0 - alpha) * z
+
+
+def _ds(values: Values, side2: Array, z: Array) -> Array:
+    """Usenko, Demmel, Cremers, "The Double Sphere Camera Model", 3DV 2018, eqs. 40 to 42."""
+    xi, alpha = values["xi"], values["alpha"]
+    shifted = xi * np.sqrt(side2 + z * z) + z
+    return alpha * np.sqrt(side2 + shifted**2) + (1.0 - alpha) * shifted
+
+
+DENOMINATORS: dict[str, tuple[str, Callable[[Values, Array, Array], Array]]] = {
+    "pinhole": ("", lambda values, side2, z: z),
+    "omni": ("xi", _omni),
+    "ucm": ("alpha", _ucm),
+    "eucm": ("alpha beta", _eucm),
+    "ds": ("xi alpha", _ds),
+}
+"""Core -> its parameters, and what x and y of a ray are divided by on the image plane, of
+``x^2 + y^2`` and ``z``; a ray is imaged where that is above 0.
 """
 
 
-def unproject_ds(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of the double-sphere model, as `Unprojection` says.
-
-    Source: Usenko, Demmel, Cremers, "The Double Sphere Camera Model", 3DV 2018, eqs. 46 to 52.
-    """
-    xi, alpha = values["xi"], values["alpha"]
-    m, radius2 = _plane(values, pixels)
-    discriminant = 1.0 - (2.0 * alpha - 1.0) * radius2
-    valid = discriminant >= 0.0
-    mz = (1.0 - alpha**2 * radius2) / (alpha * np.sqrt(np.maximum(discriminant, 0.0)) + 1.0 - alpha)
-    under = mz**2 + (1.0 - xi**2) * radius2
-    valid &= under >= 0.0
-    scale = (mz * xi + np.sqrt(np.maximum(under, 0.0))) / (mz**2 + radius2)
-    return np.column_stack([scale[:, None] * m, scale * mz - xi]), valid
+def _radtan(values: Values, plane: Array) -> Array:
+    """Brown's radial and tangential distortion, with OpenCV's rational part."""
+    k = [0.0] + [values.get(f"k{i}", 0.0) for i in range(1, 7)]
+    p1, p2 = values.get("p1", 0.0), values.get("p2", 0.0)
+    x, y = plane.T
+    r2 = x * x + y * y
+    below = 1.0 + r2 * (k[4] + r2 * (k[5] + r2 * k[6]))
+    radial = (1.0 + r2 * (k[1] + r2 * (k[2] + r2 * k[3]))) / np.where(below > 0.0, below, np.nan)
+    u = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    v = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
+    return np.column_stack([u, v])
 
 
-def unproject_eucm(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of the extended unified camera model, as `Unprojection` says.
-
-    Source: Khomutenko, Garcia, Martinet, "An Enhanced Unified Camera Model", RA-L 1(1), 2016, eqs.
-    5 and 8."""
-    alpha, beta = values["alpha"], values["beta"]
-    m, radius2 = _plane(values, pixels)
-    discriminant = 1.0 - (2.0 * alpha - 1.0) * beta * radius2
-    mz = (1.0 - beta * alpha**2 * radius2) / (
-        alpha * np.sqrt(np.maximum(discriminant, 0.0)) + 1.0 - alpha
-    )
-    rays = np.column_stack([m, mz])
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True), discriminant >= 0.0
+def _fov(values: Values, plane: Array) -> Array:
+    """Devernay and Faugeras, "Straight lines have to be straight", MVA 13, 2001, eq. 13."""
+    radius = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
+    bent = np.arctan(2.0 * radius * math.tan(values["w"] / 2.0)) / values["w"]
+    return plane * (bent / radius)[:, None]
 
 
-FOREIGN_MODELS: dict[str, tuple[tuple[str, ...], Unprojection]] = {
-    "ds": (("fx", "fy", "cx", "cy", "xi", "alpha"), unproject_ds),
-    "eucm": (("fx", "fy", "cx", "cy", "alpha", "beta"), unproject_eucm),
+DISTORTIONS: dict[str, tuple[str, Callable[[Values, Array], Array]]] = {
+    "none": ("", lambda values, plane: plane),
+    "radtan": ("k1 k2 p1 p2 k3 k4 k5 k6", _radtan),
+    "fov": ("w", _fov),
 }
-"""Foreign model: its intrinsics and its unprojection."""
+"""Distortion -> its parameters in the usual order, and what it makes of the image plane."""
+
+ANGULAR = ("kb4", "polyfisheye", "ocam")
+"""Models whose radius follows from the angle off the axis; the first is ours."""
+
+
+def project(model: str, values: Values, rays: Array) -> Array:
+    """Project unit rays, shape (N, 3), by a foreign model.
+
+    Returns pixels [px], shape (N, 2); NaN where the model images nothing.
+    """
+    core, _, distortion = model.partition("-")
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if core in ANGULAR:
+            side = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-300)
+            radius = _RADII[core](values, np.arctan2(side, rays[:, 2]))
+            plane = rays[:, :2] * (radius / side)[:, None]
+        else:
+            divisor = DENOMINATORS[core][1](values, np.sum(rays[:, :2] ** 2, axis=1), rays[:, 2])
+            plane = rays[:, :2] / np.where(divisor > 1e-9, divisor, np.nan)[:, None]
+            plane = DISTORTIONS[distortion or "none"][1](values, plane)
+    stretch = np.array(
+        [
+            [values["fx"], values.get("skew", 0.0)],
+            [values.get("shear", 0.0), values["fy"]],
+        ]
+    )
+    return plane @ stretch.T + [values["cx"], values["cy"]]
+
+
+def _kb4_radius(values: Values, theta: Array) -> Array:
+    """Kannala and Brandt's, as :class:`camera.params.FisheyeParams` says."""
+    t2 = theta * theta
+    return theta * (
+        1.0 + t2 * (values["k1"] + t2 * (values["k2"] + t2 * (values["k3"] + t2 * values["k4"])))
+    )
+
+
+def _polyfisheye_radius(values: Values, theta: Array) -> Array:
+    """Polynomial of camodocal's PolyFisheyeCamera: all powers of the angle from 1 to 7."""
+    powers = np.array([0.0, 1.0] + [values.get(f"k{i}", 0.0) for i in range(2, 8)])
+    return np.polynomial.polynomial.polyval(theta, powers)
+
+
+def _ocam_radius(values: Values, theta: Array) -> Array:
+    """Scaramuzza, Martinelli, Siegwart, "A Toolbox for Easily Calibrating Omnidirectional Cameras",
+    IROS 2006, eq. 3: the direct polynomial a0 + a1 rho + ... is the ray's depth, inverted here.
+    """
+    powers = np.array([values[f"a{i}"] for i in range(sum(name[0] == "a" for name in values))])
+    rho = np.linspace(0.0, values["farthest"], 4096)
+    seen = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, powers))
+    grows = int(np.argmin(np.append(np.diff(seen) > 0.0, False)))
+    found = np.interp(theta, seen[: grows + 1], rho[: grows + 1], right=np.nan)
+    slope = np.polynomial.polynomial.polyder(powers)
+    for _ in range(4):
+        depth = np.polynomial.polynomial.polyval(found, powers)
+        off = found * np.cos(theta) + depth * np.sin(theta)
+        steepness = np.cos(theta) + np.sin(theta) * np.polynomial.polynomial.polyval(found, slope)
+        found = found - off / steepness
+    return np.asarray(found)
+
+
+_RADII = {"kb4": _kb4_radius, "polyfisheye": _polyfisheye_radius, "ocam": _ocam_radius}
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Rays that a lens images one to one, from the axis outwards."""
+
+    theta: Array  # [rad], shape (N,)
+    direction: Array  # unit vectors across the axis, shape (N, 2)
+    pixels: Array  # shape (N, 2)
+    fold: float  # angle at which the image turns back before it leaves the sensor; pi if nowhere
+
+
+def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
+    theta = np.linspace(0.0, math.pi, ANGLES)
+    turn = 2.0 * math.pi * np.arange(TURNS) / TURNS
+    direction = np.column_stack([np.cos(turn), np.sin(turn)])
+    across = np.sin(theta)[:, None, None] * direction
+    ahead = np.broadcast_to(np.cos(theta)[:, None, None], (ANGLES, TURNS, 1))
+    rays = np.concatenate([across, ahead], axis=2)
+    pixels = project(model, values, rays.reshape(-1, 3)).reshape(ANGLES, TURNS, 2)
+    radius = np.linalg.norm(pixels - pixels[:1], axis=2)
+    with np.errstate(invalid="ignore"):
+        grows = np.vstack([np.isfinite(radius[:1]), np.diff(radius, axis=0) > 0.0])
+        inside = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=2)
+    one_to_one = np.logical_and.accumulate(grows, axis=0)
+    seen = np.logical_and.accumulate(one_to_one & inside, axis=0)
+    last = np.sum(seen, axis=0)  # the first angle of each direction that is not seen
+    last_angle = np.minimum(last, ANGLES - 1)
+    folds = ~one_to_one[last_angle, np.arange(TURNS)] & (last < ANGLES)
+    fold = float(theta[last_angle[folds]].min()) if np.any(folds) else math.pi
+    at = np.nonzero(seen)
+    return _Samples(theta[at[0]], direction[at[1]], pixels[at], fold)
 
 
 def fit_fisheye(
-    model: str, values: dict[str, float], width: int, height: int, fov_deg: float | None = None
+    model: str, values: Values, width: int, height: int, fov_deg: float | None = None
 ) -> tuple[FisheyeParams, FitReport]:
-    """Fit our model to a foreign one on a grid of pixels, by least squares of the pixel difference.
+    """Fit our model to a foreign one, by least squares of the pixel difference over all rays that
+    the image sees.
 
-    The principal point is taken over (all three models are symmetric about it); fx, fy and k1 to k4
-    are fitted. Raises ValueError: the model is unknown, or no grid point lies in the field of view,
-    or the fit describes no camera.
+    fx, fy and k1 to k4 are fitted, and the principal point where the foreign lens is not symmetric
+    about its own. Raises ValueError: the model is unknown, its image shows too little, or the fit
+    describes no camera.
 
     Args:
-        model: A key of `FOREIGN_MODELS`.
-        values: Its intrinsics.
+        model: A core of `DENOMINATORS`, a hyphen and one of `DISTORTIONS`; or one of `ANGULAR`.
+        values: fx, fy, cx, cy [px], the model's parameters; ``skew``, ``shear`` of its pixels.
         width: Image width [px].
         height: Image height [px].
         fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
 
     Returns:
         The fisheye and what the fit left over. Its field of view is the asked one, cut to what the
-        image sees and to
-        where theta_d stops growing: nothing is extrapolated.
+        image sees and to where either model folds back: nothing is extrapolated.
     """
-    if model not in FOREIGN_MODELS:
+    samples = _sample(model, values, width, height)
+    limit = samples.fold if fov_deg is None else min(math.radians(fov_deg) / 2.0, samples.fold)
+    used = samples.theta <= limit
+    theta, direction, pixels = samples.theta[used], samples.direction[used], samples.pixels[used]
+    if len(theta) < 50 * TURNS / 8:
         raise ValueError(
-            f"camera model {model!r} cannot be fitted; expected one of {sorted(FOREIGN_MODELS)}"
+            f"the image of this {model} lens shows {len(theta)} of {ANGLES * TURNS} rays that were"
+            " tried; expected a principal point and focal lengths that lie in the image"
         )
-    centre, focal = (values["cx"], values["cy"]), (values["fx"], values["fy"])
-    return fit_rays(
+    found = _fitted(theta, direction, pixels, np.array([values["cx"], values["cy"]]), values)
+    error = np.linalg.norm(_project_ours(found, theta, direction) - pixels, axis=1)
+    coefficients = tuple(float(k) for k in found[4:])
+    folds = min(limit, monotonic_limit(coefficients) * (1.0 - 1e-9))
+    lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), map(float, found)))
+    narrow = FisheyeParams(width, height, **lens, fov_deg=2.0 * math.degrees(min(folds, 0.1)))
+    fov = min(image_fov_deg(narrow), 2.0 * math.degrees(folds))
+    off = theta[error > HOLDS_PX]
+    holds = 2.0 * math.degrees(float(off.min())) if len(off) else fov
+    remarks = []
+    if samples.fold < math.pi and limit == samples.fold:
+        remarks.append(
+            f"its {model} numbers fold back {math.degrees(folds):.1f} deg off the axis, inside the"
+            " image: the field of view ends there"
+        )
+    report = FitReport(
         model,
-        lambda pixels: FOREIGN_MODELS[model][1](values, pixels),
-        centre,
-        focal,
-        width,
-        height,
-        fov_deg,
+        float(np.sqrt(np.mean(error**2))),
+        float(error.max()),
+        len(theta),
+        holds,
+        tuple(remarks),
     )
+    return FisheyeParams(width, height, **lens, fov_deg=fov), report
 
 
-def fit_rays(
-    model: str,
-    unproject: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    centre_px: tuple[float, float],
-    focal_px: tuple[float, float],
-    width: int,
-    height: int,
-    fov_deg: float | None = None,
-) -> tuple[FisheyeParams, FitReport]:
-    """Fit our model to any lens that turns pixels into rays; see :func:`fit_fisheye`.
+def _project_ours(unknown: Array, theta: Array, direction: Array) -> Array:
+    """Pixels of our model, of fx, fy, cx, cy, k1 to k4."""
+    powers = theta[:, None] ** (2 * np.arange(1, 5) + 1)
+    radius = theta + powers @ unknown[4:]
+    return direction * radius[:, None] * unknown[:2] + unknown[2:4]
 
-    Raises ValueError: no grid point lies in the field of view, or the fit describes no camera.
 
-    Args:
-        model: What the report calls the lens.
-        unproject: Rays, shape (N, 3), camera frame, and validity, shape (N,), of pixels [px], shape
-            (N, 2).
-        centre_px: Principal point, taken over.
-        focal_px: fx and fy to start from.
-        width: Image width [px].
-        height: Image height [px].
-        fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
-    """
+def _fitted(theta: Array, direction: Array, pixels: Array, centre: Array, values: Values) -> Array:
+    """fx, fy, cx, cy, k1 to k4; every angle off the axis counts alike."""
     from scipy.optimize import least_squares
 
-    u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, GRID), np.linspace(-0.5, height - 0.5, GRID))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays, valid = unproject(pixels)
-    theta = np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2])
-    seen_deg = 2.0 * math.degrees(theta[valid].max(initial=0.0))
-    if fov_deg is not None:
-        valid &= theta <= math.radians(fov_deg) / 2.0
-    if np.count_nonzero(valid) < 50:
-        raise ValueError(
-            f"{model} model sees {np.count_nonzero(valid)} of {len(pixels)} pixels of the grid;"
-            " expected 50"
-        )
-    theta, pixels = theta[valid], pixels[valid]
-    centre = np.array(centre_px)
-    direction = rays[valid, :2] / np.maximum(np.sin(theta), 1e-12)[:, None]
-    powers = theta[:, None] ** (2 * np.arange(1, 5) + 1)
+    crooked = any(values.get(name, 0.0) for name in ("p1", "p2", "skew", "shear"))
+    slope = np.linalg.norm(pixels - centre, axis=1)[theta > 0.0] / theta[theta > 0.0]
+    focal = float(np.median(slope[theta[theta > 0.0] < 0.3 * theta.max()]))
+    free = np.array([True, True, crooked, crooked, True, True, True, True])
+    start = np.array([focal, focal, *centre, 0.0, 0.0, 0.0, 0.0])
 
-    def residual(unknown: np.ndarray) -> np.ndarray:
-        radius = theta + powers @ unknown[2:]
-        return (direction * radius[:, None] * unknown[:2] - (pixels - centre)).ravel()
+    def residual(unknown: Array) -> Array:
+        whole = start.copy()
+        whole[free] = unknown
+        return np.asarray((_project_ours(whole, theta, direction) - pixels).ravel())
 
-    start = np.array([*focal_px, 0.0, 0.0, 0.0, 0.0])
-    fit = least_squares(residual, start, x_scale="jac", method="lm", xtol=1e-14, ftol=1e-14)
-    error = np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)
-    coefficients = tuple(float(k) for k in fit.x[2:])
-    limit = 2.0 * math.degrees(monotonic_limit(coefficients))
-    fov = min(seen_deg if fov_deg is None else fov_deg, seen_deg, limit * (1.0 - 1e-9))
-    params = FisheyeParams(
-        width, height, float(fit.x[0]), float(fit.x[1]), *map(float, centre), *coefficients, fov
+    fit = least_squares(
+        residual, start[free], x_scale="jac", method="lm", xtol=1e-14, ftol=1e-14, max_nfev=400
     )
-    return params, FitReport(
-        model, float(np.sqrt(np.mean(error**2))), float(error.max()), len(theta)
-    )
+    found = start.copy()
+    found[free] = fit.x
+    return found
 
 
-def _plane(values: dict[str, float], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels on the model's image plane, shape (N, 2), and their squared radius, shape (N,)."""
-    m = (pixels - [values["cx"], values["cy"]]) / [values["fx"], values["fy"]]
-    return m, np.sum(m * m, axis=1)
+def image_fov_deg(fisheye: FisheyeParams) -> float:
+    """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d
+    stops growing and to 360.
+    """
+    limit = min(monotonic_limit(fisheye.coefficients), math.pi) * (1.0 - 1e-9)
+    right, low = fisheye.width - 0.5, fisheye.height - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
+    radius = np.linalg.norm(
+        (corners - [fisheye.cx, fisheye.cy]) / [fisheye.fx, fisheye.fy], axis=1
+    ).max()
+    values = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
+    low_angle, high_angle = 0.0, limit
+    for _ in range(80):  # bisection, to the last bit
+        middle = 0.5 * (low_angle + high_angle)
+        below = float(_kb4_radius(values, np.array([middle]))[0]) < radius
+        low_angle, high_angle = (middle, high_angle) if below else (low_angle, middle)
+    return 2.0 * math.degrees(high_angle)

@@ -5,7 +5,9 @@ import argparse
 from visthrow.common.arguments import ABOVE_ZERO, NUMBER
 from visthrow.view.camera import BOARD
 
-FORMATS = ("opencv", "kalibr", "ros", "basalt", "ocam")
+TOOLS = (
+    "Kalibr, OpenVINS, EuRoC, camodocal, VINS-Fusion, SVO, ORB-SLAM, basalt, ROS, OpenCV, OCamCalib"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,29 +46,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_calibrate(parser: argparse.ArgumentParser) -> None:
-    formats = ", ".join(FORMATS)
     parser.add_argument(
         "source",
         nargs="+",
         metavar="FILE",
-        help=f"pictures, a folder of them, or one calibration file ({formats})",
+        help=f"pictures, a folder of them, or one calibration file ({TOOLS})",
     )
     parser.add_argument("--board", nargs="+", metavar="WORD", help=f"of the pictures: {BOARD}")
     parser.add_argument(
         "--out", required=True, metavar="FILE", help="camera config to write (.toml)"
     )
     parser.add_argument(
-        "--format",
-        default="auto",
-        metavar="NAME",
-        help=f"of the calibration file: auto (the default), {formats}",
+        "--camera",
+        default="0",
+        metavar="N",
+        help="number from 0, or name, of the camera in a file of several (default: 0)",
     )
     parser.add_argument(
-        "--camera",
-        type=int,
-        default=0,
-        metavar="N",
-        help="number of the camera in a file of several (default: 0)",
+        "--model",
+        choices=("kb4", "radtan", "fov", "none"),
+        help="distortion model, where the calibration file names none or a wrong one",
     )
     fov = (
         "full field of view; default: the file's own, else what the image's corners see; for"

@@ -17,7 +17,8 @@ from camera.calibrate.boards import (
     find_board,
     reprojected,
 )
-from camera.calibrate.formats import read
+from camera.calibrate.files import read
+from camera.calibrate.foreign import HOLDS_PX
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
 from camera.overlay import draw_overlay
@@ -108,15 +109,17 @@ def calibrate(args: argparse.Namespace) -> int:
                 f"{len(args.source)} calibration files came; expected one (or pictures with"
                 " --board)"
             )
-        name, lens, fit = read(first, args.format, args.camera, args.fov_deg)
+        name, lens, fit = read(first, args.camera, args.fov_deg, args.model)
         said = f"from {first.name} ({name})"
         if fit.points:
             said += (
                 f", its {fit.model} model fitted to {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at"
-                " most over the image"
+                f" most over the image, {HOLDS_PX:g} px out to {fit.holds_deg / 2.0:.1f} deg off"
+                " the axis"
             )
         else:
             said += ", the same model: nothing was fitted"
+        said = "; ".join([said, *fit.remarks])
     text = (
         f"# Camera {said}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
     )
