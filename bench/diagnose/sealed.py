@@ -7,8 +7,9 @@ but logs and the config of the model. The truth's SHA-256 is put down before, th
 Three more throws of each world are held back; the model with the verdict's sizes and the model with
 the true ones predict them.
 
-    python -m bench.diagnose.sealed null=10 1x15=20 2x10=5 curve=50 sight=20 law=5 --jobs 8 --ledger
-    ledger.jsonl python -m bench.diagnose.ledger ledger.jsonl
+    python -m bench.diagnose.sealed null=10 1x15=20 2x10=5 curve=50 sight=20 law=5 \\
+        --jobs 8 --ledger ledger.jsonl
+    python -m bench.diagnose.ledger ledger.jsonl
 """
 
 import argparse

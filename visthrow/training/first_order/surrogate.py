@@ -13,7 +13,6 @@ R, payload q, s and the control period dt:
 
 The first line holds for each channel: controller, motors and queue. F and z are mean thrust and
 mean body z of the step, u = s - v, n and l are those of the rope as a taut, massless rod,
-
 and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the
 simulator under random commands by linear least squares;
 :mod:`visthrow.training.first_order.backward` has the derivatives."""
