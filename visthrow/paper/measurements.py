@@ -10,6 +10,9 @@ from visthrow.common.errors import StorageError
 from visthrow.view.parts import aligned
 
 FOLDER = Path(__file__).with_name("records") / "bench"
+PAGES = Path(__file__).with_name("records") / "pages"
+"""Figures that pages of an earlier commit held, beside what the pages hold now."""
+PAGE_KEYS = {"title", "source", "tables", "notes"}
 KEYS = {"bench", "title", "provenance", "tables", "notes", "figures"}
 """Of every record.
 
@@ -28,8 +31,15 @@ def body(record: dict[str, Any]) -> str:
     ).rstrip()
 
 
+def record_paths() -> list[Path]:
+    """Return the files of all shipped records: of programs, then of pages."""
+    return [*sorted(FOLDER.glob("*.json")), *sorted(PAGES.glob("*.json"))]
+
+
 def origin(record: dict[str, Any]) -> str:
     """Provenance of a record in a few lines of Markdown."""
+    if "source" in record:
+        return f"From {record['source']}."
     came = record["provenance"]
     processors = came["processors"]
     machine = f"{processors['cpu']}, {processors['cores']} cores"
@@ -54,7 +64,8 @@ def load(path: Path) -> dict[str, Any]:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise StorageError(f"{path.name}: not a readable record ({error})") from error
-    missing = KEYS - (record.keys() if isinstance(record, dict) else set())
+    keys = PAGE_KEYS if path.parent == PAGES else KEYS
+    missing = keys - (record.keys() if isinstance(record, dict) else set())
     if missing:
         raise StorageError(f"{path.name}: not a record; missing {sorted(missing)}")
     return record

@@ -160,6 +160,18 @@ def test_shipped_records_are_well_formed():
         assert measurements.origin(record)
 
 
+def test_records_of_pages_are_well_formed(capsys):
+    paths = sorted(measurements.PAGES.glob("*.json"))
+    assert paths
+    for path in paths:
+        for table in measurements.load(path)["tables"]:
+            assert all(len(row) == len(table["header"]) for row in table["rows"]), path.name
+    assert cli.main(["bench", "records", "training-page"]) == 0
+    printed = capsys.readouterr().out
+    assert "docs/explanation/training.md" in printed
+    assert "0.104 ± 0.056 m" in printed  # a figure of the paper's recipe
+
+
 TORCHRUN = "torchrun --nproc-per-node 2 -m visthrow.cli"
 RECORDS = sorted(measurements.FOLDER.glob("*.json"))
 

@@ -21,11 +21,11 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.errors import VisthrowError, suggest
     from visthrow.paper import measurements
 
-    kept = {path.stem: path for path in sorted(measurements.FOLDER.glob("*.json"))}
-    unknown = [name for name in args.names if name not in kept]
+    paths = {path.stem: path for path in measurements.record_paths()}
+    unknown = [name for name in args.names if name not in paths]
     if unknown:
-        raise VisthrowError(f"no record '{unknown[0]}'; {suggest(unknown[0], kept)}")
-    for name in args.names or kept:
-        record = measurements.load(kept[name])
+        raise VisthrowError(f"no record '{unknown[0]}'; {suggest(unknown[0], paths)}")
+    for name in args.names or paths:
+        record = measurements.load(paths[name])
         print(f"## {name}\n\n{measurements.origin(record)}\n\n{measurements.body(record)}\n")
     return 0
