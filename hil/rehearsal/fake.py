@@ -211,6 +211,7 @@ class Fake(ABC):
     """
 
     thrust_map: ThrustParams
+    paced = False  # whether a firmware's clock runs the plant now: it waits for the firmware's time
     # The real autopilots took 70 to 79 ms (ArduPilot), 86 to 98 ms (PX4) and 55 to 90 ms
     # (Betaflight) from a set-point to half of a step of 1.5 rad/s; the training simulator's own
     # vehicle takes 75 ms. What is missing is this delay [s].

@@ -104,7 +104,7 @@ class FakePx4(FakeMavlink):
         return super().field(name)
 
     def value(self, field: float, kind: int) -> float:
-        return px4.bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
+        return px4.parameter_value(field, kind)
 
     @property
     def ends(self) -> tuple[int, int]:

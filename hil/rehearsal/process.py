@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import inspect
 import json
+import math
 import signal
 import socket
 from pathlib import Path
@@ -132,13 +133,13 @@ def make_fake(
 def serve(
     fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
 ) -> dict[str, Any]:
-    """Fly in real time until ``after`` seconds after the landing, for ``most`` seconds, or until
-    Ctrl-C; returns the report.
+    """Fly in real time, or on a firmware's clock, until ``after`` seconds after the landing, for
+    ``most`` seconds, or until Ctrl-C; returns the report.
     """
     plant, begun, late = fake.plant, fake.plant.time, 0
-    start = (
-        clock.now() - begun
-    )  # where the machine is late the vehicle's clock is as late as the vehicle
+    # where the machine is late the vehicle's clock is as late as the vehicle
+    start = clock.now() - begun
+    heard: list[tuple[float, float]] = []  # first and last period on a firmware's clock
     fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
     fake.question_lag = 0.0
     asked = StopRequest((signal.SIGINT,))
@@ -150,7 +151,10 @@ def serve(
         while plant.time - begun < most and not stop.asked:
             time = plant.time + plant.period
             due = start + time
-            late += clock.now() > due
+            if fake.paced:
+                start, due = clock.now() - plant.time, -math.inf
+                heard = [*heard[:1], (clock.now(), plant.time)]
+            late += math.isfinite(due) and clock.now() > due
             while clock.now() < due:  # what comes meanwhile acts from when it comes
                 clock.wait_for([fake.port], due)
                 fake.hear()
@@ -160,6 +164,9 @@ def serve(
             if landed is not None and plant.time > landed + after:
                 break
     report = {**fake.report(), "late_periods": late}
+    if len(heard) > 1:
+        (begin, first), (end, last) = heard
+        report["speed"] = (last - first) / max(end - begin, 1e-9)
     if out is not None:
         out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report

@@ -12,6 +12,7 @@ import threading
 import numpy as np
 import pytest
 
+from hil.links.clock import ManualClock
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
@@ -19,6 +20,7 @@ from hil.rehearsal.bridges import ardupilot_bridge as ardupilot
 from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl, outputs
 from hil.rehearsal.fake import VEHICLE_ID, Options
 from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import serve
 from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 
@@ -64,6 +66,7 @@ def bridge(monkeypatch):
 def fly(bridge, frames):
     other = OtherSide(frames, bridge.port.getsockname())
     other.start()
+    bridge.paced = True  # it was heard: its next frame is waited for
     for _ in frames:
         bridge.step()
     other.join(PATIENCE)
@@ -112,11 +115,45 @@ def test_the_mechanisms_output_lets_the_ball_go(bridge):
     assert report["separation_time"] == pytest.approx(report["release_time"] + 0.06, abs=0.005)
 
 
-def test_without_a_frame_time_goes_on_and_nothing_is_flown(bridge, monkeypatch):
-    monkeypatch.setattr(ardupilot, "PATIENCE", 0.0)
+def test_time_goes_on_without_waiting_before_the_first_frame(bridge):
+    """Else the plant's clock is behind by all of the time that ArduPilot took to start."""
     bridge.step()
     assert bridge.plant.time == bridge.plant.period
-    assert (bridge.frames, bridge.repeated) == (0, 0)
+    assert (bridge.frames, bridge.repeated, bridge.paced) == (0, 0, False)
+
+
+def test_ardupilot_that_falls_silent_is_waited_for_once(bridge, monkeypatch):
+    fly(bridge, [(1, servos(1000, 1000, 1000, 1000))])
+    monkeypatch.setattr(ardupilot, "PATIENCE", 0.01)
+    bridge.step()
+    assert not bridge.paced
+
+
+def test_a_late_start_of_a_firmware_leaves_no_debt(monkeypatch):
+    """Periods on the firmware's own clock are not late, however far that is behind the wall's."""
+    clock = ManualClock()
+
+    class Paced:
+        paced, port, landing = False, None, {"landing_time": None}
+        period, time = 0.002, 0.0
+
+        def hear(self): ...
+
+        def deliver(self, time): ...
+
+        def step(self):
+            clock.time += 0.05 if self.time < 1.0 else self.period
+            self.time += self.period
+            self.paced = self.time > 1.0
+
+        def report(self):
+            return {}
+
+    fake = Paced()
+    fake.plant = fake
+    report = serve(fake, clock, 3.0)
+    assert report["late_periods"] <= 501
+    assert report["speed"] == pytest.approx(1.0)
 
 
 def test_strange_packets_are_none():

@@ -10,7 +10,7 @@ from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.params import HilParams
-from hil.rehearsal.bridges.px4_bridge import Px4Sih
+from hil.rehearsal.bridges.px4_bridge import ORIGIN, Motion, Place, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, Options
 from hil.rehearsal.fake_command import make_ball
 from hil.rehearsal.fake_mocap import MocapParams
@@ -18,48 +18,100 @@ from visthrow import config
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 STILL = np.zeros(3)
+LATITUDE, LONGITUDE, ALTITUDE = np.float32([47.397742, 8.545594, 489.4]).astype(float).tolist()
+"""SIH's origin by default [deg, deg, m], as its parameters hold it."""
 
 
-def test_a_small_swing_has_the_period_of_a_pendulum():
-    """2 pi sqrt(l / g), by the times at which the ball passes below the mount."""
+def fly(ball, seconds, place, interval=0.004, release=math.inf, phase=0.0):
+    """Fly a ball below a vehicle whose place is a function of time, known every so often [s]; times
+    and places of the ball.
+    """
+    known, track = ball.time - (1.0 + phase) * interval, []
+    while ball.time < seconds:
+        while known < ball.time + ball.period:
+            known += interval
+            step = 1e-4
+            vel = (place(known + step) - place(known - step)) / (2.0 * step)
+            ball.follow(Motion(known, place(known), vel, LEVEL, STILL))
+        ball.step(np.zeros(4), ball.time >= release)
+        track.append((ball.time, *ball.state["payload_pos_w"]))
+    return np.array(track)
+
+
+def nudged(time):
+    """A place that moves aside by 2 cm between two messages, and stays there."""
+    return np.array([0.02 * (time > 0.1017), 0.0, 2.0])
+
+
+def test_a_small_swing_has_the_period_of_a_pendulum_and_halves_as_in_the_simulator():
+    """2 pi sqrt(l / g), by the times at which the ball passes below the mount; below the
+    simulator's hovering vehicle a swing halves in 1.4 s.
+    """
     ball = make_ball("vision", 0)
-    ball.follow(np.array([0.0, 0.0, 2.0]), STILL, LEVEL, STILL)
-    ball.step(np.zeros(4), False)
-    ball.follow(
-        np.array([0.02, 0.0, 2.0]), STILL, LEVEL, STILL
-    )  # the mount jumps: the ball hangs beside it now
-    crossings, before = [], None
-    for _ in range(1200):
-        ball.step(np.zeros(4), False)
-        off = ball.state["payload_pos_w"][0] - 0.02
-        if before is not None and before < 0.0 <= off:
-            crossings.append(ball.time - ball.period * off / (off - before))
-        before = off
-    assert np.diff(crossings).mean() == pytest.approx(
-        2.0 * math.pi * math.sqrt(ball.length / 9.81), rel=0.01
+    track = fly(ball, 6.0, nudged)
+    time, off = track[:, 0], track[:, 1] - 0.02
+    rises = np.flatnonzero((off[:-1] < 0.0) & (off[1:] >= 0.0))
+    crossings = time[rises] - off[rises] * (time[rises + 1] - time[rises]) / (
+        off[rises + 1] - off[rises]
     )
-    assert np.linalg.norm(
-        ball.state["payload_pos_w"] - [0.02, 0.0, 2.0 + ball.mount_b[2]]
-    ) <= ball.length * (1.0 + 1e-9)
+    period = 2.0 * math.pi * math.sqrt(ball.length / 9.81)
+    assert np.diff(crossings).mean() == pytest.approx(period, rel=0.01)
+    early, late = (np.abs(off[(time > t) & (time < t + period)]).max() for t in (0.5, 3.3))
+    assert late / early == pytest.approx(0.25, abs=0.05)
+    reach = np.linalg.norm(track[-1, 1:] - [0.02, 0.0, 2.0 + ball.mount_b[2]])
+    assert reach <= ball.length * (1.0 + 1e-9)
+
+
+def test_the_damping_takes_little_off_a_throw():
+    """A throw's swing keeps its speed: at most 0.15 m/s^2 of it is lost."""
+    ball = make_ball("vision", 0)
+    fly(ball, 0.1, lambda t: np.array([0.0, 0.0, 2.0]))
+    ball._vel = np.array([3.0, 0.0, 0.0])
+    before = ball.state["payload_pos_w"].copy()
+    fly(ball, 0.105, lambda t: np.array([0.0, 0.0, 2.0]))
+    speed = np.linalg.norm(ball.state["payload_pos_w"] - before) / ball.period
+    assert speed == pytest.approx(3.0, abs=0.01)
 
 
 def test_a_release_at_a_steady_speed_falls_by_the_parabola():
     """The ball leaves with the vehicle's speed, and lands where g takes it."""
     ball, speed = make_ball("vision", 0), np.array([1.0, 0.5, 0.0])
-    place = np.array([0.0, 0.0, 2.0])
-    for n in range(1600):
-        ball.follow(place + n * ball.period * speed, speed, LEVEL, STILL)
-        ball.step(np.zeros(4), n * ball.period > 7.0)
-    found, height = ball.landing, 2.0 + ball.mount_b[2] - ball.length - ball.ground
-    assert found["landing_time"] - found["separation_time"] == pytest.approx(
+    fly(ball, 8.0, lambda t: np.array([0.0, 0.0, 2.0]) + t * speed, release=7.0)
+    landing, height = ball.landing, 2.0 + ball.mount_b[2] - ball.length - ball.ground
+    assert landing["landing_time"] - landing["separation_time"] == pytest.approx(
         math.sqrt(2.0 * height / 9.81), abs=0.02
     )
     assert not ball.attached
 
 
+@pytest.mark.parametrize("interval", [0.004, 0.01, 0.02])
+def test_the_throw_does_not_depend_on_how_often_the_vehicle_is_heard(interval):
+    """The mount moves smoothly between messages: accelerated at 8 m/s^2 along (1, 0, 1) and
+    released after 0.5 s, the ball lands at one place; moved in steps it lands up to 3.4 m off.
+    """
+
+    def place(time):
+        ahead = 4.0 * max(time, 0.0) ** 2 / math.sqrt(2.0)
+        return np.array([ahead, 0.0, 1.333 + ahead])
+
+    landings = []
+    for each, phase in ((0.001, 0.0), (interval, 0.0), (interval, 0.3)):
+        ball = make_ball("vision", 0)
+        fly(ball, 1.8, place, each, 0.5, phase)
+        landings.append(ball.landing["landing_w"][0])
+    assert landings[1:] == pytest.approx(landings[:1] * 2, abs=0.005)
+
+
+def test_a_ball_that_hangs_below_a_vehicle_on_the_ground_lies_on_it():
+    ball = make_ball("vision", 0)
+    fly(ball, 1.0, lambda t: np.array([0.0, 0.0, 0.1]))
+    assert ball.state["payload_pos_w"][2] == pytest.approx(ball.ground)
+    assert ball.attached
+
+
 class OtherSide:
-    """PX4's side of the bridge's own link: position, attitude and outputs; it hears which streams
-    are asked for.
+    """PX4's side of the bridge's own link: the true state, outputs, parameters; it hears which
+    streams are asked for.
     """
 
     def __init__(self, port):
@@ -68,41 +120,91 @@ class OtherSide:
         self.link.listen(self._hear)
 
     def _hear(self, message, arrival):
-        if (
-            message.get_type() == "COMMAND_LONG"
-            and message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL
-        ):
+        kind = message.get_type()
+        if kind == "COMMAND_LONG" and message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
             self.asked.add(int(message.param1))
+        elif kind == "PARAM_REQUEST_READ":
+            values = dict(zip(ORIGIN, (LATITUDE, LONGITUDE, ALTITUDE)))
+            value = (values[message.param_id], mav.MAV_PARAM_TYPE_REAL32, 1, 0)
+            self.link.send(mav.MAVLink_param_value_message(message.param_id.encode(), *value))
 
     def say(self, time, pos, yaw, output):
-        ms = int(1e3 * time)
-        self.link.send(mav.MAVLink_local_position_ned_message(ms, *pos, 0.0, 0.0, 0.0))
-        quat = (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
-        self.link.send(mav.MAVLink_attitude_quaternion_message(ms, *quat, 0.0, 0.0, 0.0))
+        """Say where the vehicle is, north, east, down of the origin [m], as PX4 cuts it to whole
+        units.
+        """
+        scale = 111_320.0 * math.cos(math.radians(LATITUDE))
+        lat, lon = LATITUDE + pos[0] / 111_183.0, LONGITUDE + pos[1] / scale
+        quat = [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
+        where = (int(1e7 * lat), int(1e7 * lon), int(1e3 * (ALTITUDE - pos[2])))
+        self.link.send(
+            mav.MAVLink_hil_state_quaternion_message(
+                int(1e6 * time), quat, 0.0, 0.0, 0.0, *where, 0, 0, 0, 0, 0, 0, 0, 0
+            )
+        )
         outputs = [1500] * 8 + [output] + [0] * 7
         self.link.send(mav.MAVLink_servo_output_raw_message(int(1e6 * time) % 2**32, 0, *outputs))
         self.link.pump(lambda: time)
 
 
-def test_the_bridge_hears_places_and_the_mechanism():
+@pytest.fixture
+def bridge():
     port, params = free_port(), config.load(HilParams, config.find("hil", "px4")).px4
     own = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
     poses = Link(UdpPort(Device("udpout", "127.0.0.1", free_port())), *VEHICLE_ID)
-    bridge = Px4Sih(make_ball("vision", 0), poses, MocapParams(), 0, Options(), params, own)
-    px4 = OtherSide(port)
+    made = Px4Sih(make_ball("vision", 0), poses, MocapParams(), 0, Options(), params, own)
+    made.other = OtherSide(port)
+    yield made
+    made.close()
+
+
+def test_the_bridge_hears_places_and_the_mechanism(bridge):
+    """PX4's clock is its own: 100 s ahead here."""
     for n in range(400):
-        px4.say(0.005 * n, (1.0, 2.0, -3.0), 0.3, 2000 if n < 300 else params.servo_open_us)
+        opens = bridge.params.servo_open_us
+        bridge.other.say(100.0 + 0.005 * n, (1.0, 2.0, -3.0), 0.3, 2000 if n < 300 else opens)
         bridge.step()
     now = bridge.plant.state
-    np.testing.assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=1e-6)
+    np.testing.assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=0.01)
     np.testing.assert_allclose(
         now["quat_wb"], [0.0, 0.0, -math.sin(0.15), math.cos(0.15)], atol=1e-6
     )
-    assert px4.asked >= {
-        mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-        mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    assert bridge.other.asked >= {
+        mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
+        mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
     }
     report = bridge.report()
     assert report["releases"] == 1
     assert 1.5 < report["separation_time"] < 1.6
-    bridge.close()
+
+
+def test_the_ball_is_hung_where_the_vehicle_is_first_heard(bridge):
+    """Also below one that hovers elsewhere by then: it hangs still from the first pose on."""
+    for n in range(200):
+        bridge.other.say(7.0 + 0.005 * n, (5.0, -4.0, -1.333), 0.0, 2000)
+        bridge.step()
+        if bridge.heard_of > 1:
+            off = bridge.plant.state["payload_pos_w"] - bridge.plant.state["pos_w"]
+            assert np.hypot(off[0], off[1]) < 0.02
+    assert bridge.heard_of > 100
+
+
+def test_the_place_is_smooth_though_px4_cuts_it_to_centimetres():
+    """Latitude comes in steps of 1.1 cm: beside a velocity the place follows within 8 mm, without
+    steps.
+    """
+    place, step = Place(LATITUDE, LONGITUDE, ALTITUDE), 0.004
+    track = []
+    for n in range(500):
+        north = 1.5 * n * step
+        message = mav.MAVLink_hil_state_quaternion_message(
+            0,
+            [1.0, 0.0, 0.0, 0.0],
+            *(0.0, 0.0, 0.0),
+            int(1e7 * (LATITUDE + north / 111_183.0)),
+            int(1e7 * LONGITUDE),
+            int(1e3 * ALTITUDE),
+            *(150, 0, 0, 0, 0, 0, 0, 0),
+        )
+        track.append(place.update(n * step, message)[0][0] - north)
+    assert np.abs(track).max() < 0.012
+    assert np.abs(np.diff(track)).max() < 2e-4

@@ -105,11 +105,12 @@ class MotorPlant(WirePlant):
     Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``:
     thrust goes with the square of the command and of the battery's voltage. The reference is the
     voltage that the controller's full thrust holds at. The vehicle stands still at its start, the
-    rope hanging, until its rotors nearly carry its weight.
+    rope hanging, until its rotors nearly carry its weight; where it comes down to the ground it
+    stands again, level.
 
     Attributes:
         force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it
-            still stands.
+            stands. touchdown: speed at which it first met the ground [m/s]; None before.
         quat_wb, rate_b: attitude xyzw and body rates [rad/s] now.
     """
 
@@ -132,12 +133,17 @@ class MotorPlant(WirePlant):
         self._stand: dict[str, np.ndarray] | None = self._plant.hold()
         self._look()
         self.force_b = np.array([0.0, 0.0, GRAVITY])
+        self._ground, self._floor = (
+            experiment.vehicle.collision_radius,
+            experiment.rope.payload_radius,
+        )
+        self.touchdown: float | None = None
 
     def look(self) -> dict[str, np.ndarray]:
-        """Attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the charge
-        now.
+        """Place, attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the
+        charge now.
         """
-        names = ("quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
+        names = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
         return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
 
     def rope(self) -> list[np.ndarray]:
@@ -164,8 +170,16 @@ class MotorPlant(WirePlant):
 
     @property
     def held(self) -> bool:
-        """Whether it still stands."""
+        """Whether it stands."""
         return self._stand is not None
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """As of `WirePlant`; a ball that hangs goes no deeper than the ground."""
+        now = super().state
+        ball = now["payload_pos_w"].copy()
+        ball[2] = max(ball[2], self._floor)
+        return now | {"payload_pos_w": ball}
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under motor commands, 0 to 1, shape (4,); release: see
@@ -177,14 +191,41 @@ class MotorPlant(WirePlant):
         )
         super().step(speed, release and not self.held, after)
         self._look()
-        if self._stand is None:
+        if self._stand is None and self._now["pos_w"][2] < self._ground:
+            self._set_down()
+        elif self._stand is None:
             push_w = (self._now["vel_w"] - vel_w) / self.period + np.array([0.0, 0.0, GRAVITY])
             self.force_b = rotate_back(self.quat_wb, push_w)
-        elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < CARRIED * self.mass[0] * GRAVITY:
+        elif self._k_f * np.sum(self._now["motor_speed"] ** 2) < CARRIED * self.weight:
             self._plant.hold(self._stand)
             self._look()
         else:
             self._stand = None
+
+    @property
+    def voltage(self) -> float:
+        """Of the battery under load [V]."""
+        return float(self._now["voltage"])
+
+    @property
+    def weight(self) -> float:
+        """Weight of what flies now [N]."""
+        return self.mass[0 if self._plant.state.attached[0] else 1] * GRAVITY
+
+    def _set_down(self) -> None:
+        """Put the vehicle on the ground, at rest and level, the rope straight."""
+        if self.touchdown is None:
+            self.touchdown = -float(self._now["vel_w"][2])
+        _, _, z, w = self.quat_wb
+        level = np.array([0.0, 0.0, z, w]) / max(np.hypot(z, w), 1e-9)
+        stand = self._plant.hold()
+        for name in ("vel_w", "rate_b", "cable_vel_w"):
+            stand[name][:] = 0.0
+        stand["quat_wb"][:], stand["cable_dir_w"][:] = level, (0.0, 0.0, -1.0)
+        stand["pos_w"][..., 2] = self._ground
+        self._stand, self.force_b = stand, np.array([0.0, 0.0, GRAVITY])
+        self._plant.hold(stand)
+        self._look()
 
 
 def make_motors(policy: str, seed: int) -> MotorPlant:

@@ -101,7 +101,7 @@ class Px4(MavlinkAutopilot):
         return mav.MAV_CMD_DO_SET_ACTUATOR, (*values, 0.0)
 
     def _stored(self, value: float, kind: int) -> float:
-        return bytes_to_integer(value) if kind == mav.MAV_PARAM_TYPE_INT32 else value
+        return parameter_value(value, kind)
 
     def _field(self, value: float, kind: int) -> float:
         return integer_to_bytes(value) if kind == mav.MAV_PARAM_TYPE_INT32 else value
@@ -171,6 +171,11 @@ class Px4(MavlinkAutopilot):
                 )
             )
         return rules
+
+
+def parameter_value(field: float, kind: int) -> float:
+    """Return a parameter's value out of a PARAM_VALUE's field, by its MAV_PARAM_TYPE."""
+    return bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
 
 
 def bytes_to_integer(value: float) -> float:

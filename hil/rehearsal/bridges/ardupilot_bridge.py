@@ -45,9 +45,8 @@ LOW, HIGH, NEAR = (
     2000.0,
     50.0,
 )  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
-# for a frame, after which the wall's clock goes on without one [s]: ArduPilot sleeps, or is not
-# there yet
-PATIENCE = 0.05
+# for the next frame of an ArduPilot that was heard [s]; then the plant goes on without it
+PATIENCE = 1.0
 
 FLIP = np.array([1.0, -1.0, -1.0])
 
@@ -77,6 +76,7 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
         "position": (FLIP * now["pos_w"]).tolist(),
         "velocity": (FLIP * now["vel_w"]).tolist(),
         "quaternion": [w, x, -y, -z],
+        "battery": {"voltage": plant.voltage, "current": 0.0},
     }
     return b"\n" + json.dumps(told).encode() + b"\n"
 
@@ -120,6 +120,7 @@ class ArduPilotSitl(Bridge):
         frame, a period as it was.
         """
         frame, to = self._frame()
+        self.paced = frame is not None
         if frame is None:
             super().fly()
             return
@@ -136,7 +137,7 @@ class ArduPilotSitl(Bridge):
         self._socket.sendto(state_line(self.plant.time, self.plant), to)
 
     def _frame(self) -> tuple[tuple[int, np.ndarray] | None, Any]:
-        while select.select([self._socket], [], [], PATIENCE)[0]:
+        while select.select([self._socket], [], [], PATIENCE if self.paced else 0.0)[0]:
             packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
             frame = outputs(packet)
             if frame is not None:
@@ -149,6 +150,7 @@ class ArduPilotSitl(Bridge):
     def report(self) -> dict[str, Any]:
         counts = {
             "held": self.plant.held,
+            "touchdown": self.plant.touchdown,
             "frames": self.frames,
             "repeated": self.repeated,
             "restarts": self.restarts,

@@ -40,6 +40,8 @@ class MotorPlant(WirePlant):
     quat_wb: np.ndarray
     rate_b: np.ndarray
     force_b: np.ndarray
+    voltage: float
+    touchdown: float | None
 
 
 class BetaflightSitl(Bridge):

@@ -1,46 +1,84 @@
 """The bridge: a ball on a rope below PX4's own simulated vehicle (SIH), and the poses of both
 bodies.
 
-PX4 flies the vehicle that its ``sihsim`` holds and tells where it is; the ball hangs below as a
-point on a massless rope, is dragged along, and flies freely once the mechanism's output has moved.
-The vehicle does not feel it: SIH takes no force from outside, so what a throw loses by the ball's
-pull does not show. The runner speaks to PX4 by itself.
+PX4 flies the vehicle that its ``sihsim`` simulates and reports the vehicle's true state; the ball
+hangs below as a point on a massless rope, is dragged along, and flies freely once the mechanism's
+output has moved. The vehicle does not feel it: SIH takes no force from outside. PX4's clock runs
+the ball, so that a busy machine slows both alike. The runner speaks to PX4 by itself.
 
-Source: docs.px4.io, Simulation-In-Hardware; MAVLink LOCAL_POSITION_NED, ATTITUDE_QUATERNION,
-SERVO_OUTPUT_RAW."""
+Source: docs.px4.io, Simulation-In-Hardware; PX4-Autopilot, src/modules/mavlink/streams/
+HIL_STATE_QUATERNION.hpp, src/modules/simulation/simulator_sih/sih.cpp."""
 
+import math
+import select
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from time import monotonic
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.links.backends.px4 import Px4Params
+from hil.links.backends.px4 import Px4Params, parameter_value
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.rehearsal.fake import Bridge, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import SLACK, MocapParams
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
 STEP = 0.001  # time step of the ball [s]
 
 STREAMS = {
-    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0.01,
-    mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0.01,
+    mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 0.004,
     mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.01,
 }
-"""Messages that PX4 is asked for, and their periods [s]."""
+"""Messages that PX4 is asked for, and their periods [s]: SIH steps at 250 Hz."""
 
-ASK_AGAIN = (
-    1.0  # between two requests for a stream [s]: an answer may be lost, and PX4 may start again
-)
+ORIGIN = ("SIH_LOC_LAT0", "SIH_LOC_LON0", "SIH_LOC_H0")  # of SIH's world [deg, deg, m]
+ASK_AGAIN = 1.0  # between two requests for a stream or a parameter [s]: an answer may be lost
+PATIENCE = 1.0  # for the next state of a PX4 that was heard [s]; then the ball goes on without it
 NEAR = 50.0  # an output this near to its target has arrived [us]
 FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down and forward, right, down to ours
+
+HALVING = 1.4  # a slow swing halves in this time, as below the simulator's hovering vehicle [s]
+MOST_DAMPING = 0.15  # of the ball [m/s^2], so that it takes 2 % off a throw
+
+EQUATOR, FLATTENING = 6378137.0, 1.0 / 298.257223563  # WGS 84 [m]
+SETTLING = 0.3  # in which the place, integrated from velocities, follows the latitude's steps [s]
+
+
+class Motion(NamedTuple):
+    """Where a vehicle is at a time [s]: place [m], velocity [m/s], attitude xyzw, rates [rad/s]."""
+
+    time: float
+    pos: np.ndarray
+    vel: np.ndarray
+    quat: np.ndarray
+    rate: np.ndarray
+
+
+def between(before: Motion, after: Motion, time: float) -> Motion:
+    """Return the motion at a time between two: a cubic of places and velocities, straight lines of
+    the rest.
+    """
+    span = after.time - before.time
+    if time >= after.time or span <= 0.0:
+        return after._replace(time=time)
+    s = max((time - before.time) / span, 0.0)
+    shift = after.pos - before.pos
+    bend_0, bend_1 = span * before.vel - shift, span * after.vel - shift
+    pos = before.pos + s * shift + s * (1.0 - s) * ((1.0 - s) * bend_0 - s * bend_1)
+    sign = 1.0 if before.quat @ after.quat >= 0.0 else -1.0
+    quat = (1.0 - s) * before.quat + s * sign * after.quat
+    vel, rate = (
+        (1.0 - s) * a + s * b for a, b in ((before.vel, after.vel), (before.rate, after.rate))
+    )
+    return Motion(time, pos, vel, quat / np.linalg.norm(quat), rate)
 
 
 @dataclass
 class HangingBall:
-    """A ball on a rope below a vehicle that moves as it is told, a `WirePlant`; raises `ValueError`
+    """A ball on a rope below a vehicle whose motion is given, a `WirePlant`; raises `ValueError`
     for a rope without length.
     """
 
@@ -59,14 +97,10 @@ class HangingBall:
         if not self.length > 0.0:
             raise ValueError(f"rope of {self.length} m; expected a length above 0")
         self.time = 0.0
-        self._pos, self._vel, self._quat, self._rate = (
-            np.zeros(3),
-            np.zeros(3),
-            np.array([0.0, 0.0, 0.0, 1.0]),
-            np.zeros(3),
-        )
-        self._mount: np.ndarray | None = None
-        self._ball, self._speed = np.array([0.0, 0.0, -self.length]), np.zeros(3)
+        still = Motion(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+        self._now, self._motions = still, deque[Motion]()
+        self._hangs = False
+        self._ball, self._vel = np.array([0.0, 0.0, -self.length]), np.zeros(3)
         self._trip: float | None = None
         self.attached = True
         self.landing: dict[str, Any] = {
@@ -75,25 +109,39 @@ class HangingBall:
             "separation_time": None,
         }
 
-    def follow(
-        self, pos_w: np.ndarray, vel_w: np.ndarray, quat_wb: np.ndarray, rate_b: np.ndarray
-    ) -> None:
-        """Where the vehicle is now [m], how fast [m/s], attitude xyzw and body rates [rad/s]."""
-        self._pos, self._vel, self._quat, self._rate = pos_w, vel_w, quat_wb, rate_b
+    def follow(self, motion: Motion) -> None:
+        """Take the vehicle's motion at a time, later than those before; the first one hangs the
+        ball below it.
+        """
+        self._motions.append(motion)
+        if not self._hangs:
+            self._hangs, self._now = True, motion._replace(time=self.time)
+            self._ball = self._mount(motion) - [0.0, 0.0, self.length]
+
+    @property
+    def until(self) -> float:
+        """Time up to which the vehicle's motion is known [s]."""
+        return self._motions[-1].time if self._motions else -math.inf
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by a period; see `WirePlant`. The command is PX4's matter."""
-        mount = self._pos + matrix_of_quat(self._quat) @ self.mount_b
-        if self._mount is None:
-            self._ball, self._mount = mount - [0.0, 0.0, self.length], mount
         if release and self._trip is None:
             self._trip = self.time + after
-        count = round(self.period / STEP)
-        for k in range(count):
-            self._advance(
-                self._mount + (k + 1) / count * (mount - self._mount), self.time + (k + 1) * STEP
-            )
-        self._mount, self.time = mount, self.time + self.period
+        for k in range(1, round(self.period / STEP) + 1):
+            self._move(self.time + k * STEP)
+        self.time += self.period
+
+    def _move(self, time: float) -> None:
+        """Advance vehicle and ball to a time."""
+        while self._motions and self._motions[0].time < time - SLACK:
+            self._now = self._motions.popleft()
+        if self._motions:
+            self._now = between(self._now, self._motions[0], time)
+        if self._hangs:
+            self._advance(self._mount(self._now), time)
+
+    def _mount(self, motion: Motion) -> np.ndarray:
+        return motion.pos + matrix_of_quat(motion.quat) @ self.mount_b
 
     def _advance(self, mount: np.ndarray, time: float) -> None:
         """One step of the ball: free flight, then back onto the rope where it is taut
@@ -101,18 +149,21 @@ class HangingBall:
         """
         if self.landing["landing_time"] is not None:
             return
-        before = self._ball
-        self._speed = self._speed - [0.0, 0.0, STEP * GRAVITY]
-        self._ball = before + STEP * self._speed
         if self.attached and self._trip is not None and time >= self._trip + self.lag:
             self.attached = False
             self.landing["separation_time"] = time
+        before = self._ball
+        self._vel = self._vel - [0.0, 0.0, STEP * GRAVITY]
+        if self.attached:
+            self._vel = self._damped(self._vel - self._now.vel) + self._now.vel
+        self._ball = before + STEP * self._vel
         if self.attached:
             off = self._ball - mount
             reach = float(np.linalg.norm(off))
             if reach > self.length:
                 self._ball = mount + off * (self.length / reach)
-            self._speed = (self._ball - before) / STEP
+            self._ball[2] = max(self._ball[2], self.ground)
+            self._vel = (self._ball - before) / STEP
         elif self._ball[2] <= self.ground:
             share = (before[2] - self.ground) / max(before[2] - self._ball[2], 1e-9)
             landed = before + share * (self._ball - before)
@@ -121,20 +172,60 @@ class HangingBall:
                 "landing_time": time - (1.0 - share) * STEP,
             }
 
+    def _damped(self, vel: np.ndarray) -> np.ndarray:
+        """Return a velocity relative to the vehicle after a step of damping."""
+        speed = float(np.linalg.norm(vel))
+        loss = min(2.0 * math.log(2.0) / HALVING * speed, MOST_DAMPING)
+        return vel * (1.0 - STEP * loss / max(speed, 1e-9))
+
     @property
     def state(self) -> dict[str, np.ndarray]:
+        now = self._now
         return {
-            "pos_w": self._pos,
-            "quat_wb": self._quat,
-            "vel_w": self._vel,
-            "rate_b": self._rate,
+            "pos_w": now.pos,
+            "quat_wb": now.quat,
+            "vel_w": now.vel,
+            "rate_b": now.rate,
             "payload_pos_w": self._ball,
             "attached": np.array(self.attached),
         }
 
 
+class Place:
+    """The vehicle's place from PX4's latitude, longitude and altitude: steps of 1 cm, which the
+    velocity bridges.
+    """
+
+    def __init__(self, latitude: float, longitude: float, altitude: float) -> None:
+        """Measure from an origin [deg, deg, m]."""
+        flat = FLATTENING * (2.0 - FLATTENING)
+        curve = 1.0 - flat * math.sin(math.radians(latitude)) ** 2
+        north = EQUATOR * (1.0 - flat) / curve**1.5
+        east = EQUATOR / math.sqrt(curve) * math.cos(math.radians(latitude))
+        self._origin = np.array([latitude, longitude, altitude])
+        self._scale = np.array([math.radians(north), -math.radians(east), 1.0])
+        self._time, self._pos, self._vel = -math.inf, np.zeros(3), np.zeros(3)
+
+    def update(self, time: float, message: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return place [m] and velocity [m/s] at a time [s], z up, by a HIL_STATE_QUATERNION."""
+        vel = FLIP * [rounded(v, 1e-2) for v in (message.vx, message.vy, message.vz)]
+        where = [rounded(message.lat, 1e-7), rounded(message.lon, 1e-7), rounded(message.alt, 1e-3)]
+        pos = self._scale * (where - self._origin)
+        step = time - self._time
+        if 0.0 < step < SETTLING:
+            expected = self._pos + 0.5 * step * (self._vel + vel)
+            pos = expected + step / SETTLING * (pos - expected)
+        self._time, self._pos, self._vel = time, pos, vel
+        return pos, vel
+
+
+def rounded(count: int, unit: float) -> float:
+    """Return the mean of the values that PX4 cuts to this count of a unit."""
+    return unit * (count + math.copysign(0.5, count) if count else 0.0)
+
+
 class Px4Sih(Bridge):
-    """See the head of this module; ``heard_of``: positions that came, ``last_output``: of the
+    """See the head of this module; ``heard_of``: states that came, ``last_output``: of the
     mechanism [us].
     """
 
@@ -155,11 +246,10 @@ class Px4Sih(Bridge):
         """
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.autopilot, self.port = params, autopilot, autopilot.port
-        self._pos, self._vel, self._asked = (
-            np.zeros(3),
-            np.zeros(3),
-            dict.fromkeys(STREAMS, -np.inf),
-        )
+        self._asked: dict[int | str, float] = {}
+        self._origin: dict[str, float] = {}
+        self._place: Place | None = None
+        self._offset = 0.0  # of PX4's clock to the plant's [s]
         self.heard_of, self.last_output = 0, None
         autopilot.listen(self._hear)
 
@@ -171,25 +261,48 @@ class Px4Sih(Bridge):
         if message.get_srcSystem() != self.params.system:
             return
         kind = message.get_type()
-        if kind == "LOCAL_POSITION_NED":
-            self.heard_of += 1
-            self._pos, self._vel = (
-                FLIP * (message.x, message.y, message.z),
-                FLIP
-                * (
-                    message.vx,
-                    message.vy,
-                    message.vz,
-                ),
-            )
-        elif kind == "ATTITUDE_QUATERNION" and self.heard_of:
-            quat = np.array([message.q2, -message.q3, -message.q4, message.q1], dtype=float)
-            rate = FLIP * (message.rollspeed, message.pitchspeed, message.yawspeed)
-            self.plant.follow(self._pos, self._vel, quat / np.linalg.norm(quat), rate)
+        if kind == "HIL_STATE_QUATERNION":
+            self._hear_state(message)
+        elif kind == "PARAM_VALUE" and message.param_id in ORIGIN:
+            value, kind = message.param_value, message.param_type
+            # up to 1.14 latitude and longitude are integers
+            unit = 1e-7 if kind == mav.MAV_PARAM_TYPE_INT32 else 1.0
+            self._origin[message.param_id] = unit * parameter_value(value, kind)
+            if len(self._origin) == len(ORIGIN) and self._place is None:
+                self._place = Place(*(self._origin[name] for name in ORIGIN))
         elif kind == "SERVO_OUTPUT_RAW":
             self.last_output = getattr(message, f"servo{self.params.servo_output}_raw", 0)
             near = abs(self.last_output - self.params.servo_open_us) <= NEAR
             self.output(bool(self.params.servo_output) and near, arrival)
+
+    def _hear_state(self, message: Any) -> None:
+        if self._place is None:
+            return
+        time = 1e-6 * message.time_usec - self._offset
+        if not self.heard_of or abs(time - self.plant.time) > PATIENCE:  # first, or after a pause
+            self._offset += time - self.plant.time
+            time = self.plant.time
+        elif time <= self.plant.until:
+            return
+        self.heard_of += 1
+        w, x, y, z = message.attitude_quaternion
+        quat = np.array([x, -y, -z, w], dtype=float)
+        rate = FLIP * (message.rollspeed, message.pitchspeed, message.yawspeed)
+        place = self._place.update(time, message)
+        self.plant.follow(Motion(time, *place, quat / np.linalg.norm(quat), rate))
+
+    def fly(self) -> None:
+        """Fly a period once PX4 has flown it; without PX4, a period as it was."""
+        wanted, end = self.plant.time + self.plant.period - SLACK, monotonic() + PATIENCE
+        while self.paced and self.plant.until < wanted and monotonic() < end:
+            select.select([self.port], [], [], end - monotonic())
+            self.hear()
+        super().fly()
+        self.paced = self.plant.until >= wanted
+
+    def deliver(self, time: float) -> None:
+        """Count the poses' latency on PX4's clock, which is ahead of the ball's."""
+        super().deliver(self.plant.until if self.paced else time)
 
     def flown(self) -> np.ndarray:
         """Return nothing: PX4 flies."""
@@ -204,25 +317,26 @@ class Px4Sih(Bridge):
 
     def speak(self) -> None:
         """Ask for what is not coming."""
-        now = self.plant.time
+        p = self.params
         for number, period in STREAMS.items():
-            if now - self._asked[number] >= ASK_AGAIN:
-                self._asked[number] = now
+            if self._due(number):
+                seven = (number, 1e6 * period, 0, 0, 0, 0, 0)
                 self.autopilot.send(
                     mav.MAVLink_command_long_message(
-                        self.params.system,
-                        self.params.component,
-                        mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-                        0,
-                        number,
-                        1e6 * period,
-                        0,
-                        0,
-                        0,
-                        0,
-                        0,
+                        p.system, p.component, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *seven
                     )
                 )
+        for name in ORIGIN:
+            if name not in self._origin and self._due(name):
+                self.autopilot.send(
+                    mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1)
+                )
+
+    def _due(self, what: int | str) -> bool:
+        due = self.plant.time - self._asked.get(what, -math.inf) >= ASK_AGAIN
+        if due:
+            self._asked[what] = self.plant.time
+        return due
 
     def close(self) -> None:
         super().close()

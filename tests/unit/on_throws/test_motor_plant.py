@@ -78,3 +78,17 @@ def test_the_ball_separates_the_mechanisms_lag_after_the_latch(plant):
     for _ in range(60):
         plant.step(np.full(4, hover), True)
     assert plant.landing["separation_time"] - asked == pytest.approx(0.06, abs=1e-6)
+
+
+def test_it_stands_on_the_ground_it_came_down_to_and_takes_off_again(plant):
+    """Whoever flies it finds out that it has landed, and may disarm."""
+    fly(plant, command_for(plant, 1.1 * plant.weight), 0.3)
+    fly(plant, command_for(plant, 0.7 * plant.weight), 2.0)
+    assert plant.held
+    assert plant.touchdown > 1.0
+    height = plant.state["pos_w"][2]
+    assert height == pytest.approx(0.08)
+    assert plant.state["payload_pos_w"][2] >= 0.033
+    assert plant.force_b == pytest.approx([0.0, 0.0, GRAVITY])
+    fly(plant, command_for(plant, 1.2 * plant.weight), 0.5)
+    assert plant.state["pos_w"][2] > height + 0.05
