@@ -10,11 +10,11 @@ matters for the first few steps. The state layout adds up its measured positions
 sends each seen corner's ray to the ground, a corner counting by the accuracy that its distance
 leaves.
 
-Where a layout is ``located`` the actor is given too where keypoints lie by the camera as it is
-configured: the network need then not learn the lens, but what is wrong with it. The goal is the
-mean of all steps of the throw, each weighted by what its distance leaves: noise averages out, and
-it is known while it is out of view. A corner that is not seen then reads where the fitted goal
-would be seen.
+Where a layout is ``located`` the actor is given the mean goal of all steps. A vision layout is
+given where keypoints lie by the camera as it is configured: the network need then not learn the
+lens, but what is wrong with it. The goal is the mean of all steps of the throw, each weighted by
+what its distance leaves: noise averages out, and it is known while it is out of view. A corner that
+is not seen then reads where the fitted goal would be seen.
 
 Source: weighted linear regression with a Gaussian prior on the slope (ridge), in sums that are
 carried from step to step."""
@@ -156,7 +156,7 @@ class Fitted(NamedTuple):
 
     sums: Tensor
     velocity: Tensor | None  # of the goal [m/s], shape (E, 2), where the layout has it
-    places: Tensor | None  # where the keypoints lie, shape (E, 6), where the layout has it
+    places: Tensor | None  # where they lie, shape (E, layout.located), where the layout has it
     frame: Tensor  # with corners that were not seen where they would be
     valid: Tensor | None
 
@@ -171,9 +171,11 @@ def fitted_goal(
     fresh: Tensor,
 ) -> Fitted:
     """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
-    if not layout.located:
+    if layout.name == "state" or not layout.located:
         sums, velocity = fit(sums, time, *measured_goal(layout, frame, valid, camera), fresh)
-        return Fitted(sums, velocity if layout.motion else None, None, frame, valid)
+        moves = velocity if layout.motion else None
+        places = place(sums, time, moves) - frame[:, :2] if layout.located else None
+        return Fitted(sums, moves, places, frame, valid)
     return _located(layout, frame, valid, camera, sums, time, fresh)
 
 

@@ -17,9 +17,9 @@ With E the batch (1 on board), the layouts are
     | payload keypoints, now and H steps back 8 (1 + H) | attached 1
     | validity of goal and payload keypoints 8
 
-With ``located`` it has where the keypoints lie 6 after them (:mod:`visthrow.onboard.goal_motion`).
-Either one, where goals move, has the fit of the goal's velocity 2
-(:mod:`visthrow.onboard.goal_motion`) at its end.
+With ``located`` ``vision`` has where the keypoints lie 6 after them, ``state`` the averaged goal 2
+(:mod:`visthrow.onboard.goal_motion`). Either one, where goals move, has the fit of the goal's
+velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
 
 A policy for many vehicles has besides what ``response`` earlier steps were like, velocity 3 | body
 rates 3 | previous action 4 each, newest first, and the vehicle's set-up
@@ -47,8 +47,8 @@ RESPONSE = 10
 SETUPS = {"none": 0, "told": 4, "exact": 24}
 """Widths of a vehicle's set-up, by what ``setup`` says."""
 
-LOCATED = 6
-"""Width of where keypoints lie (:mod:`visthrow.onboard.goal_motion`)."""
+LOCATED = {"state": 2, "vision": 6}
+"""Width of where goal and payload keypoints lie (:mod:`visthrow.onboard.goal_motion`)."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,11 @@ def layout_of(params: Any) -> Layout:
         2 if getattr(params, "goal_velocity", False) else 0
     )  # contracts hold what differs from the default
     response, setup = getattr(params, "response", 0), SETUPS[getattr(params, "setup", "none")]
+    places = LOCATED.get(params.layout, 0) if getattr(params, "located", False) else 0
     if params.layout == "state":
-        return Layout("state", 2, 3, params.history, 0, motion, 0, response, setup)
+        return Layout("state", 2, 3, params.history, 0, motion, places, response, setup)
     if params.layout == "vision":
-        bits, places = (
-            (KEYPOINTS if params.validity else 0),
-            (LOCATED if getattr(params, "located", False) else 0),
-        )
+        bits = KEYPOINTS if params.validity else 0
         return Layout("vision", 8, 8, params.history, bits, motion, places, response, setup)
     raise ValueError(f"observation layout {params.layout!r}; expected 'state' or 'vision'")
 
@@ -227,7 +225,8 @@ def observe(
             value.
         goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout
             has none.
-        places: where the keypoints lie, shape (E, 6); None where the layout has none.
+        places: where goal and keypoints lie, shape (E, layout.located); None where the layout has
+            none.
         answers: earlier steps, newest first, shape (E, R, 10): of :func:`answer`; None where the
             layout has none.
         setup: of the vehicle, shape (E, layout.setup); None where the layout has none.

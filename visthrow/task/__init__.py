@@ -57,8 +57,8 @@ class ObservationParams(Bounded):
     )
     # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
     goal_velocity: bool = False
-    # vision: whether the actor is given where the keypoints lie too; see
-    # visthrow.onboard.goal_motion
+    # whether the actor is given the mean goal of all steps, and in vision where the payload's
+    # keypoints lie; see visthrow.onboard.goal_motion
     located: bool = False
     # earlier steps of which the actor is given velocity, body rates and action: how this vehicle
     # answers
@@ -224,6 +224,9 @@ class PPOParams(Bounded):
     privileged: tuple[str, ...] = PRIVILEGED[
         :8
     ]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
+    # policy with a memory, a shipped name or a file: its estimator stays as it is, its network
+    # learns on; empty for an actor that looks at the observation itself
+    estimator: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -95,13 +95,12 @@ class Distillation:
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
         self._layout = ob.layout_of(SimpleNamespace(**contract))
-        if self._layout.name != "state" or self._layout.motion:
-            came = f"{self._layout.name!r}" + " with the goal's velocity" * bool(
-                self._layout.motion
-            )
+        beside = self._layout.motion + self._layout.located + self._layout.response
+        if self._layout.name != "state" or beside:
+            came = f"{self._layout.name!r}" + " with more than the paper's" * bool(beside)
             raise ConfigError(
-                f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state'"
-                " without it"
+                f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state',"
+                " without the goal's velocity, its mean and the response"
             )
         self.env = env = ThrowEnv(experiment, device, seed)
         self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon

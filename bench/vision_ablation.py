@@ -1,0 +1,229 @@
+"""What a vision policy needs beside keypoints: trainings over fresh seeds, thrown with and without
+faults.
+
+Each variant changes what ``vision`` is given or how it remembers; nothing else differs.
+
+    python -m bench.vision_ablation OUT --work runs/ablation    # goes on where it stopped
+
+``OUT`` receives archives of policies, logs and figures, ``OUT/figures.json`` all figures.
+"""
+
+import argparse
+import json
+import random
+import subprocess
+import sys
+import tarfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bench import start
+from visthrow import config
+from visthrow.common.storage import write_json
+
+ALONE = ("task.observation.located=false", "task.observation.response=0")
+SHORT = ("ppo.iterations=509",)  # 2.0e8 environment steps, the paper's number
+MEMORY = (
+    'algorithm="distillation"',
+    "ppo.environments=2048",
+    "distillation.iterations=1000",
+    "distillation.memory=256",
+)
+TUNED = (
+    *('ppo="ppo/adapt.toml"', "ppo.environments=16384", "ppo.iterations=300"),
+    *("ppo.hidden=[512,256,128]", "ppo.critic=[512,256,128]", 'ppo.products="bfloat16"'),
+    'ppo.privileged=["exact","payload_velocity","release_timer","time","mass","voltage","mount",'
+    '"pose_age"]',
+)
+VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "memory": ("vision", (*ALONE, *MEMORY)),
+    "keypoints": ("vision", (*ALONE, *SHORT)),
+    "both": ("vision", SHORT),
+    "located": ("vision", (ALONE[1], *SHORT)),
+    "response": ("vision", (ALONE[0], *SHORT)),
+    "state_averaged": (
+        "state_fast",
+        (
+            *("task.observation.located=true", "task.observation.response=8"),
+            *("task.start.goal_radius=2.5", *SHORT),
+        ),
+    ),
+}
+"""Variant -> configuration of ``configs/train`` and what it changes."""
+
+FAULTS = {
+    "20 % lost": "camera.noise.drop_probability=0.2",
+    "40 ms late": "task.observation.latency=[0.04,0.04]",
+    "2 % wrong": "camera.noise.wrong_probability=0.02",
+}
+"""One thing wrong with the camera -> the override that makes it so."""
+TARGETS, FAULT_TARGET, THROWS, SEED = (1.5, 2.0, 2.5), 2.0, 1600, 7
+LIMITS = {"memory": 230.0, "tuned": 80.0, "ppo": 200.0}
+"""Longest that a training may take [s]; a schedule that would take longer is shortened."""
+LEAST, RESERVE = 45.0, 15.0
+"""Time that a training must have to be begun, and what is kept for its throws [s]."""
+
+
+def trained(trainer: Any, seconds: float) -> dict[str, Any]:
+    """Train to the last iteration, or faster through the schedule so that it ends in time."""
+    begin, planned, rows = time.perf_counter(), trainer.algorithm.iterations, []
+    while True:
+        done = max(trainer.iteration / planned, (time.perf_counter() - begin) / seconds)
+        if done >= 1.0:
+            break
+        trainer.algorithm.iterations = trainer.iteration / done if trainer.iteration else planned
+        rows.append(trainer.step())
+    keys = ("iteration", "landing_error", "released", "value", "rollout_s", "learning_s")
+    return {
+        "seconds": time.perf_counter() - begin,
+        "iterations": trainer.iteration,
+        "planned": planned,
+        "steps": trainer.iteration * trainer.algorithm.samples,
+        "curve": [{key: row.get(key) for key in keys} for row in rows[::10]],
+    }
+
+
+def thrown(policy: Any, experiment: Any, device: str, count: int) -> dict[str, Any]:
+    """Throws at all targets, and at one with each fault."""
+    from visthrow.throws.loading import trained_in
+    from visthrow.training import protocol
+
+    policy, rows = policy.to(device), {}
+    faults = FAULTS if experiment.task.observation.layout == "vision" else {}
+    for name, change in {"": (), **{name: (value,) for name, value in faults.items()}}.items():
+        flown = trained_in(policy, "policy", change)
+        for target in (FAULT_TARGET,) if name else TARGETS:
+            throws = protocol.throw(flown, policy.actor(count), target, count, device, SEED)
+            rows[name or f"{target} m"] = throws.summary()
+    return rows
+
+
+def job(args: argparse.Namespace) -> int:
+    """Train one variant with one seed, throw, and write what came of it."""
+    from visthrow.task import Experiment
+    from visthrow.training.trainer import POLICY, Trainer, finish
+
+    name, seed, folder = args.job, args.seed, Path(args.work) / f"{args.job}-{args.seed}"
+    base, changes = VARIANTS[name.removesuffix("_tuned")]
+    if name.endswith("_tuned"):
+        start_policy = Path(args.work) / f"memory-{seed}" / POLICY
+        changes = (*ALONE, *TUNED, f'ppo.estimator="{start_policy}"')
+    limit = LIMITS.get(name, LIMITS["tuned" if name.endswith("_tuned") else "ppo"])
+    limit = min(limit, args.deadline - time.time() - RESERVE)
+    experiment = config.load(Experiment, config.find("train", base), [*changes, *args.overrides])
+    folder.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(experiment, args.devices[0], seed)
+    figures = trained(trainer, limit)
+    policy = finish(trainer, folder, {"training": figures})
+    figures["throws"] = thrown(policy, experiment, args.devices[0], args.throws)
+    write_json(folder / "figures.json", {"variant": name, "seed": seed, **figures})
+    return 0
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all trainings, several on each device, and pack what came of them."""
+    if args.job:
+        return job(args)
+    work, begin = Path(args.work), time.time()
+    work.mkdir(parents=True, exist_ok=True)
+    path = work / "seeds.json"
+    if not path.exists():
+        write_json(path, random.SystemRandom().sample(range(1, 10**6), args.seeds))
+    seeds = json.loads(path.read_text(encoding="utf-8"))
+    print("seeds:", *seeds, flush=True)
+    chosen = [name for name in VARIANTS if not args.only or name in args.only]
+    first, last = [["memory"], ["state_averaged"]]
+    middle = [name for name in chosen if name not in first + last]
+    jobs = [
+        (name, seed)
+        for group in (first, middle, last)
+        for seed in seeds
+        for name in group
+        if name in chosen
+    ]
+    deadline = begin + args.seconds
+    _work_off(jobs, args, deadline)
+    _pack(work, Path(args.out))
+    print(f"{time.time() - begin:.0f} s")
+    return 0
+
+
+def _work_off(jobs: list[tuple[str, int]], args: argparse.Namespace, deadline: float) -> None:
+    """Keep ``slots`` trainings running on each device until none is left or the time is over."""
+    work, running = Path(args.work), {}
+    free = [device for _ in range(args.slots) for device in args.devices]
+    while (jobs or running) and time.time() < deadline + 5.0:
+        for process, (name, seed, device, begin) in list(running.items()):
+            if process.poll() is None:
+                continue
+            del running[process]
+            free.append(device)
+            print(f"{name}-{seed}: {process.returncode}, {time.time() - begin:.0f} s", flush=True)
+            if name == "memory" and process.returncode == 0:
+                jobs.insert(0, ("memory_tuned", seed))
+        while jobs and free and deadline - time.time() > LEAST + RESERVE:
+            name, seed = jobs.pop(0)
+            if (work / f"{name}-{seed}" / "figures.json").exists():
+                if name == "memory":
+                    jobs.insert(0, ("memory_tuned", seed))
+                continue
+            device = free.pop(0)
+            running[_begun(name, seed, device, deadline, args)] = (name, seed, device, time.time())
+        if not running and deadline - time.time() <= LEAST + RESERVE:
+            break
+        time.sleep(0.5)
+    for process in running:
+        process.kill()
+    print("not begun:", *(f"{name}-{seed}" for name, seed in jobs), flush=True)
+
+
+def _begun(
+    name: str, seed: int, device: str, deadline: float, args: argparse.Namespace
+) -> subprocess.Popen:
+    words = [sys.executable, "-m", "bench.vision_ablation", args.out, "--work", args.work]
+    words += ["--job", name, "--seed", str(seed), "--devices", device]
+    words += ["--deadline", str(deadline), "--throws", str(args.throws)]
+    words += [part for item in args.overrides for part in ("--set", item)]
+    log = Path(args.work) / f"{name}-{seed}.log"
+    with log.open("w", encoding="utf-8") as file:
+        return subprocess.Popen(words, stdout=file, stderr=subprocess.STDOUT)
+
+
+def _pack(work: Path, out: Path) -> None:
+    """Write all figures, and everything else into four archives of like size."""
+    out.mkdir(parents=True, exist_ok=True)
+    figures = [json.loads(path.read_text()) for path in sorted(work.glob("*/figures.json"))]
+    write_json(out / "figures.json", figures)
+    for row in figures:
+        errors = {k: round(v.get("error_mean", -1.0), 4) for k, v in row["throws"].items()}
+        print(row["variant"], row["seed"], f"{row['iterations']} it", errors, flush=True)
+    files = sorted(work.rglob("*"), key=lambda path: path.stat().st_size, reverse=True)
+    files = [path for path in files if path.is_file() and path.suffix != ".pt"]
+    for number in range(4):
+        with tarfile.open(out / f"ablation-{number}.tar.gz", "w:gz", compresslevel=1) as archive:
+            for path in files[number::4]:
+                archive.add(path, path.relative_to(work))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    parser = start.parser_of(__doc__, record=False)
+    parser.add_argument("out", help="folder of the archives")
+    parser.add_argument("--work", default="runs/vision_ablation", help="folder of the trainings")
+    parser.add_argument("--devices", nargs="+", default=["cuda:0"])
+    parser.add_argument("--slots", type=int, default=3, help="trainings at once on a device")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=520.0, help="of all trainings together")
+    parser.add_argument("--throws", type=int, default=THROWS, help="at each target")
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, help="variants; default: all")
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    parser.add_argument("--job", help=argparse.SUPPRESS)
+    parser.add_argument("--seed", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--deadline", type=float, help=argparse.SUPPRESS)
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
