@@ -29,6 +29,7 @@ MEMORY = (
     'algorithm="distillation"',
     "ppo.environments=2048",
     "distillation.iterations=1000",
+    "distillation.layers=2",
     "distillation.memory=256",
 )
 TUNED = (

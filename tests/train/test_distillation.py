@@ -144,7 +144,7 @@ def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled, number):
     folder = tmp_path / "run"
     signalled(Distillation, words(folder), number)
     one, two = (Policy.load(run / "policy.npz").estimator for run in (whole, folder))
-    for name, value in vars(one).items():
+    for name, value in one.parts().items():
         np.testing.assert_array_equal(value.numpy(), getattr(two, name).numpy(), err_msg=name)
 
 
@@ -153,7 +153,7 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 2)
     trainer.algorithm.take_up(policy)
     taken = trainer.algorithm.export(policy.contract, {})
-    for name, value in vars(policy.estimator).items():
+    for name, value in policy.estimator.parts().items():
         torch.testing.assert_close(getattr(taken.estimator, name), value, rtol=0, atol=AGREES)
     assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
     assert "the policy is one with a memory" in capsys.readouterr().err

@@ -35,7 +35,7 @@ PATIENCE = 300.0
 
 def weights(trainer: Trainer) -> np.ndarray:
     policy = trainer.algorithm.export({}, {})
-    tensors = vars(policy.estimator).values() if policy.estimator is not None else policy.weights
+    tensors = policy.weights if policy.estimator is None else policy.estimator.parts().values()
     return torch.cat([t.float().flatten().cpu() for t in tensors]).numpy()
 
 

@@ -4,7 +4,7 @@ Onboard-safe.
 
 One step takes an observation o and the memory h of the steps before:
 
-    x = elu(W o' + b), o' normalised             encoder
+    x = elu(W o' + b), o' normalised             encoder, of one layer or two
     h = GRU(x, h)                                Cho et al., EMNLP 2014, as in torch.nn.GRUCell
     s = o[kept] + C h + c                        estimate; 0 in place of o where nothing is kept
 
@@ -38,6 +38,8 @@ class Estimator:
     output_weight: Tensor  # (S, H)
     output_bias: Tensor  # (S,)
     kept: Tensor  # (S,), entry of the observation that each estimate corrects, D for none; int64
+    inner_weight: Tensor | None = None  # (N, N), of the encoder's second layer, where it has one
+    inner_bias: Tensor | None = None  # (N,)
 
     def __post_init__(self) -> None:
         hidden, width = self.encoder_weight.shape[0], self.encoder_weight.shape[1]
@@ -53,19 +55,27 @@ class Estimator:
             "output_bias": (count,),
             "kept": (count,),
         }
+        if self.inner_weight is not None or self.inner_bias is not None:
+            expected |= {"inner_weight": (hidden, hidden), "inner_bias": (hidden,)}
+        parts = self.parts()
         for name, shape in expected.items():
-            came = tuple(getattr(self, name).shape)
+            came = tuple(parts[name].shape) if name in parts else None
             if came != shape:
                 raise PolicyError(f"estimator: {name} has shape {came}; expected {shape}")
-        for field in fields(self):
-            if not bool(torch.isfinite(getattr(self, field.name)).all()):
-                raise PolicyError(f"estimator: {field.name} holds numbers that are not finite")
+        for name, part in parts.items():
+            if not bool(torch.isfinite(part).all()):
+                raise PolicyError(f"estimator: {name} holds numbers that are not finite")
         if not bool(((self.kept >= 0) & (self.kept <= width)).all()) or not bool(
             (self.std > 0.0).all()
         ):
             raise PolicyError(
                 f"estimator; expected entries of 0 to {width} in kept and numbers above 0 in std"
             )
+
+    def parts(self) -> dict[str, Tensor]:
+        """Return the tensors that there are, by their fields' names."""
+        every = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: part for name, part in every.items() if part is not None}
 
     @property
     def obs_dim(self) -> int:
@@ -82,6 +92,8 @@ class Estimator:
         and the memory.
         """
         x = F.elu(F.linear((obs - self.mean) / self.std, self.encoder_weight, self.encoder_bias))
+        if self.inner_weight is not None:
+            x = F.elu(F.linear(x, self.inner_weight, self.inner_bias))
         memory = torch.gru_cell(
             x, memory, self.input_weight, self.memory_weight, self.input_bias, self.memory_bias
         )
@@ -93,6 +105,4 @@ class Estimator:
 
     def to(self, device: str | torch.device) -> "Estimator":
         """The estimator with its tensors on another device."""
-        return Estimator(
-            **{field.name: getattr(self, field.name).to(device) for field in fields(self)}
-        )
+        return Estimator(**{name: part.to(device) for name, part in self.parts().items()})

@@ -17,7 +17,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -255,10 +255,8 @@ class Policy:
             )
             arrays["normalizer_eps"] = np.array(self.eps)
         if self.estimator is not None:
-            arrays |= {
-                f"estimator_{field.name}": getattr(self.estimator, field.name).cpu().numpy()
-                for field in fields(Estimator)
-            }
+            for name, part in self.estimator.parts().items():
+                arrays[f"estimator_{name}"] = part.cpu().numpy()
         savez(path, arrays)
 
     @staticmethod
@@ -281,7 +279,11 @@ class Policy:
             estimator = None
             if header["format_version"] == FORMAT_VERSIONS[1]:
                 estimator = Estimator(
-                    **{field.name: take(f"estimator_{field.name}") for field in fields(Estimator)}
+                    **{
+                        field.name: take(f"estimator_{field.name}")
+                        for field in fields(Estimator)
+                        if field.default is MISSING or f"estimator_{field.name}" in arrays
+                    }
                 )
             return Policy(
                 tuple(take(f"layer{i}_weight") for i in range(count)),

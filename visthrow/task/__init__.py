@@ -297,6 +297,7 @@ class DistillationParams(Bounded):
     iterations: Count = 500
     horizon: Count = 72  # of a throw [control steps]
     hidden: Count = 256  # of the encoder
+    layers: Literal[1, 2] = 1  # of the encoder
     memory: Count = 128  # of the recurrent unit
     epochs: Count = 1
     minibatches: Count = 4

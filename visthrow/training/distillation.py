@@ -42,11 +42,14 @@ class Network(nn.Module):
     parts and shapes.
     """
 
-    def __init__(self, kept: Tensor, learnt: Tensor, width: int, hidden: int, memory: int):
+    def __init__(
+        self, kept: Tensor, learnt: Tensor, width: int, hidden: int, memory: int, layers: int = 1
+    ):
         """Begin with an estimate of what is kept: the entry of the observation that each estimate
         corrects, ``width`` for none, shape (S,).
 
         ``learnt``: which estimates are learnt, bool, shape (S,). width: D. hidden: N. memory: H.
+        layers: of the encoder, 1 or 2.
         """
         super().__init__()
         self.encoder, self.gru, self.output = (
@@ -54,6 +57,7 @@ class Network(nn.Module):
             nn.GRU(hidden, memory),
             nn.Linear(memory, len(kept)),
         )
+        self.inner = nn.Linear(hidden, hidden) if layers > 1 else None
         with torch.no_grad():
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
@@ -67,11 +71,13 @@ class Network(nn.Module):
         parts = [seen.mean, seen.std + seen.eps, self.encoder.weight, self.encoder.bias]
         parts += [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0]
         parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
+        parts += [] if self.inner is None else [self.inner.weight, self.inner.bias]
         return Estimator(*(part.detach() for part in parts))
 
     def forward(self, obs: Tensor) -> Tensor:
         """Estimates, shape (T, E, S), along throws, shape (T, E, D)."""
-        x, _ = self.gru(F.elu(self.encoder(self.normalizer(obs))))
+        x = F.elu(self.encoder(self.normalizer(obs)))
+        x, _ = self.gru(x if self.inner is None else F.elu(self.inner(x)))
         return F.pad(obs, (0, 1))[..., self.kept] + self.output(x) * self.learnt
 
 
@@ -95,21 +101,23 @@ class Distillation:
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
         self._layout = ob.layout_of(SimpleNamespace(**contract))
-        beside = self._layout.motion + self._layout.located + self._layout.response
-        if self._layout.name != "state" or beside:
-            came = f"{self._layout.name!r}" + " with more than the paper's" * bool(beside)
+        if self._layout.name != "state":
             raise ConfigError(
-                f"distillation.teacher {self.p.teacher!r} has the layout {came}; expected 'state',"
-                " without the goal's velocity, its mean and the response"
+                f"distillation.teacher {self.p.teacher!r} has the layout {self._layout.name!r};"
+                " expected 'state'"
+            )
+        if self._layout.motion or self._layout.located or self._layout.response:
+            raise ConfigError(
+                f"distillation.teacher {self.p.teacher!r} is given more than the paper's state"
+                " policy; expected one without goal_velocity, located and response"
             )
         self.env = env = ThrowEnv(experiment, device, seed)
         self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
         kept, learnt = _passed(env.layout, self._layout)
-        self.network = Network(kept, learnt, env.layout.dimension, self.p.hidden, self.p.memory).to(
-            device
-        )
+        sizes = (env.layout.dimension, self.p.hidden, self.p.memory, self.p.layers)
+        self.network = Network(kept, learnt, *sizes).to(device)
         ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
@@ -206,24 +214,21 @@ class Distillation:
         """Take the network's state into what flies, in place: a captured rollout reads these
         tensors.
         """
-        for name, value in vars(self.network.frozen()).items():
+        for name, value in self.network.frozen().parts().items():
             getattr(self._flying, name).copy_(value)
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         t = self.teacher.to("cpu")
-        estimator = Estimator(
-            **{
-                name: value.detach().cpu().clone()
-                for name, value in vars(self.average.module.frozen()).items()
-            }
-        )
+        parts = self.average.module.frozen().parts()
+        estimator = Estimator(**{name: part.cpu().clone() for name, part in parts.items()})
         return Policy(
             t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator
         )
 
     def take_up(self, policy: Policy) -> None:
         e, n = policy.estimator, self.network
-        if e is None or e.input_weight.shape != n.gru.weight_ih_l0.shape:
+        deep = e is not None and e.inner_weight is not None
+        if e is None or e.input_weight.shape != n.gru.weight_ih_l0.shape or deep != bool(n.inner):
             raise ConfigError(
                 "--from: the policy has no estimator of this configuration's shape to start from"
             )
@@ -237,6 +242,8 @@ class Distillation:
             "output.weight": e.output_weight,
             "output.bias": e.output_bias,
         }
+        if deep:
+            parts |= {"inner.weight": e.inner_weight, "inner.bias": e.inner_bias}
         n.load_state_dict(n.state_dict() | parts)
         n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
         self.average.module.load_state_dict(n.state_dict())
