@@ -38,8 +38,13 @@ TUNED = (
     'ppo.privileged=["exact","payload_velocity","release_timer","time","mass","voltage","mount",'
     '"pose_age"]',
 )
+WIDE = (
+    *("distillation.hidden=512", "distillation.epochs=2", "distillation.minibatches=8"),
+    *("distillation.iterations=600", "distillation.learning_rate=0.001"),
+)
 VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "memory": ("vision", (*ALONE, *MEMORY)),
+    "memory_wide": ("vision", (*ALONE, *MEMORY, *WIDE)),
     "keypoints": ("vision", (*ALONE, *SHORT)),
     "both": ("vision", SHORT),
     "located": ("vision", (ALONE[1], *SHORT)),
@@ -54,6 +59,9 @@ VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """Variant -> configuration of ``configs/train`` and what it changes."""
 
+MEMORIES = ("memory", "memory_wide")
+"""Variants that are distilled, and tuned by PPO afterwards."""
+
 FAULTS = {
     "20 % lost": "camera.noise.drop_probability=0.2",
     "40 ms late": "task.observation.latency=[0.04,0.04]",
@@ -61,7 +69,7 @@ FAULTS = {
 }
 """One thing wrong with the camera -> the override that makes it so."""
 TARGETS, FAULT_TARGET, THROWS, SEED = (1.5, 2.0, 2.5), 2.0, 1600, 7
-LIMITS = {"memory": 230.0, "tuned": 80.0, "ppo": 200.0}
+LIMITS = {"memory": 230.0, "memory_wide": 230.0, "tuned": 80.0, "ppo": 200.0}
 """Longest that a training may take [s]; a schedule that would take longer is shortened."""
 LEAST, RESERVE = 45.0, 15.0
 """Time that a training must have to be begun, and what is kept for its throws [s]."""
@@ -107,9 +115,10 @@ def job(args: argparse.Namespace) -> int:
     from visthrow.training.trainer import POLICY, Trainer, finish
 
     name, seed, folder = args.job, args.seed, Path(args.work) / f"{args.job}-{args.seed}"
-    base, changes = VARIANTS[name.removesuffix("_tuned")]
+    memory = name.removesuffix("_tuned")
+    base, changes = VARIANTS[memory]
     if name.endswith("_tuned"):
-        start_policy = Path(args.work) / f"memory-{seed}" / POLICY
+        start_policy = Path(args.work) / f"{memory}-{seed}" / POLICY
         changes = (*ALONE, *TUNED, f'ppo.estimator="{start_policy}"')
     limit = LIMITS.get(name, LIMITS["tuned" if name.endswith("_tuned") else "ppo"])
     limit = min(limit, args.deadline - time.time() - RESERVE)
@@ -135,15 +144,10 @@ def run(args: argparse.Namespace) -> int:
     seeds = json.loads(path.read_text(encoding="utf-8"))
     print("seeds:", *seeds, flush=True)
     chosen = [name for name in VARIANTS if not args.only or name in args.only]
-    first, last = [["memory"], ["state_averaged"]]
-    middle = [name for name in chosen if name not in first + last]
-    jobs = [
-        (name, seed)
-        for group in (first, middle, last)
-        for seed in seeds
-        for name in group
-        if name in chosen
-    ]
+    slow = [name for name in chosen if name in MEMORIES]
+    groups = [(seeds[: args.ahead], slow), (seeds, [name for name in chosen if name not in slow])]
+    groups += [(seeds[args.ahead :], slow)]
+    jobs = [(name, seed) for those, names in groups for seed in those for name in names]
     deadline = begin + args.seconds
     _work_off(jobs, args, deadline)
     _pack(work, Path(args.out))
@@ -162,13 +166,13 @@ def _work_off(jobs: list[tuple[str, int]], args: argparse.Namespace, deadline: f
             del running[process]
             free.append(device)
             print(f"{name}-{seed}: {process.returncode}, {time.time() - begin:.0f} s", flush=True)
-            if name == "memory" and process.returncode == 0:
-                jobs.insert(0, ("memory_tuned", seed))
+            if name in MEMORIES and process.returncode == 0:
+                jobs.insert(0, (f"{name}_tuned", seed))
         while jobs and free and deadline - time.time() > LEAST + RESERVE:
             name, seed = jobs.pop(0)
             if (work / f"{name}-{seed}" / "figures.json").exists():
-                if name == "memory":
-                    jobs.insert(0, ("memory_tuned", seed))
+                if name in MEMORIES:
+                    jobs.insert(0, (f"{name}_tuned", seed))
                 continue
             device = free.pop(0)
             running[_begun(name, seed, device, deadline, args)] = (name, seed, device, time.time())
@@ -216,6 +220,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--devices", nargs="+", default=["cuda:0"])
     parser.add_argument("--slots", type=int, default=3, help="trainings at once on a device")
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--ahead", type=int, default=3, help="seeds of those with memory first")
     parser.add_argument("--seconds", type=float, default=520.0, help="of all trainings together")
     parser.add_argument("--throws", type=int, default=THROWS, help="at each target")
     parser.add_argument("--only", nargs="+", choices=VARIANTS, help="variants; default: all")
