@@ -2,20 +2,23 @@
 lens against such pictures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from camera.fisheye import Fisheye
-from camera.params import FisheyeParams
+from camera.params import FisheyeParams, monotonic_limit
 
 DETECTED_AT_LEAST = 3
 """Views with a found board below which the intrinsics are not determined."""
 
 BEFORE = 0.17
 """Cosine of the angle off the axis up to which points start the fit of a pose: 80 deg."""
+
+WRONG_BOARD = 5.0
+"""Residual of a board over the median of all, above which its corners are another's."""
 
 VIEW_AT_LEAST = 6
 """Points of a partly seen board below which its pose is not determined well."""
@@ -88,11 +91,13 @@ class BoardReport:
         rms_px: Root mean square distance of corners and their reprojections over all views [px].
         image_rms_px: The same for each picture [px]; NaN where no board was found.
         points: Points of boards in all pictures.
+        left_out: Why a board was not used, by the number of its picture from 0.
     """
 
     rms_px: float
     image_rms_px: tuple[float, ...]
     points: int
+    left_out: dict[int, str] = field(default_factory=dict)
 
 
 def find_board(image: np.ndarray, board: BoardParams) -> View | None:
@@ -158,9 +163,9 @@ def calibrate_from_boards(
 ) -> tuple[FisheyeParams, BoardReport]:
     """Calibrate a fisheye from pictures of a board.
 
-    OpenCV's model folds past 90 deg off the axis, so every board must lie before the lens; the
-    polynomial found there goes on past 90 deg. Raises ValueError: pictures differ in size, too few
-    show the board, or OpenCV finds no solution.
+    OpenCV's model folds past 90 deg off the axis: a board that reaches past it is left out, as one
+    is that fits far worse than the others; the report says which and why. The polynomial goes on
+    past 90 deg. Raises ValueError: pictures differ in size, or too few show a board that fits.
 
     Args:
         images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3); at least three with the
@@ -174,7 +179,46 @@ def calibrate_from_boards(
     import cv2
 
     (height, width), found = find_boards(images, board)
-    views = [view for view in found if view is not None]
+    numbers = [i for i, view in enumerate(found) if view is not None]
+    left_out: dict[int, str] = {}
+    while True:
+        used = [i for i in numbers if i not in left_out]
+        if len(used) < DETECTED_AT_LEAST:
+            raise ValueError(
+                f"no fisheye fits the boards of {DETECTED_AT_LEAST} pictures; left out: "
+                + "; ".join(f"picture {i + 1}: {why}" for i, why in left_out.items())
+            )
+        views = [view for i in used if (view := found[i]) is not None]
+        try:
+            lens = _solved(views, width, height, fov_deg)
+        except cv2.error as error:
+            centre = np.array([width - 1.0, height - 1.0]) / 2.0
+            reach = [float(np.linalg.norm(v.pixels - centre, axis=1).max()) for v in views]
+            worst = int(np.argmax(reach))
+            said = str(error).strip().splitlines()[-1]
+            left_out[used[worst]] = (
+                f"reaches {reach[worst]:.0f} px from the image's centre, and OpenCV's model, which"
+                f" ends 90 deg off the axis, cannot be started with it ({said})"
+            )
+            continue
+        every = {
+            i: _residual(Fisheye(lens), view, board_pose(Fisheye(lens), view))
+            for i, view in zip(used, views)
+        }
+        sizes = {i: float(np.sqrt(2.0 * np.mean(every[i] ** 2))) for i in used}
+        limit = WRONG_BOARD * float(np.median(list(sizes.values())))
+        wrong = max(sizes, key=sizes.__getitem__)
+        if sizes[wrong] <= limit:
+            break
+        left_out[wrong] = f"is {sizes[wrong]:.2f} px off, the others {limit / WRONG_BOARD:.2f} px"
+    kept = [every.get(i) for i in range(len(found))]
+    return replace(lens, fov_deg=fov_deg), replace(_report(kept), left_out=left_out)
+
+
+def _solved(views: list[View], width: int, height: int, fov_deg: float) -> FisheyeParams:
+    """OpenCV's fisheye of boards; its field of view ends where it folds."""
+    import cv2
+
     # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step
     # inside the model.
     start = np.array(
@@ -186,31 +230,20 @@ def calibrate_from_boards(
     )
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
-    try:
-        _, matrix, k, rotations, translations = cv2.fisheye.calibrate(
-            [v.points_m[None] for v in views],
-            [v.pixels[None] for v in views],
-            (width, height),
-            start,
-            np.zeros((4, 1)),
-            flags=flags,
-            criteria=criteria,
-        )
-    except cv2.error as error:
-        raise ValueError(
-            f"OpenCV found no fisheye for {len(views)} boards: {str(error).strip()}"
-        ) from error
+    _, matrix, k, _, _ = cv2.fisheye.calibrate(
+        [v.points_m[None] for v in views],
+        [v.pixels[None] for v in views],
+        (width, height),
+        start,
+        np.zeros((4, 1)),
+        flags=flags,
+        criteria=criteria,
+    )
     fx, fy, cx, cy, k1, k2, k3, k4 = map(
         float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel())
     )
-    params = FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, fov_deg)
-    lens, poses = Fisheye(params), iter(zip(rotations, translations, strict=True))
-    return params, _report(
-        [
-            None if v is None else _residual(lens, v, np.concatenate(next(poses)).ravel())
-            for v in found
-        ]
-    )
+    widest = 1.999 * float(np.degrees(monotonic_limit((k1, k2, k3, k4))))
+    return FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, min(fov_deg, widest, 360.0))
 
 
 def check_boards(

@@ -72,8 +72,10 @@ def read(
     try:
         found = _cameras(_tree(path))
         if not found:
+            named = re.findall(r"[\w./-]+\.ya?ml", Path(path).read_text())
+            hint = f"; it names {', '.join(dict.fromkeys(named))}: one of these?" if named else ""
             raise ValueError(
-                f"holds no camera of a known tool; expected a calibration of {', '.join(BOXES)}"
+                f"holds no camera of a known tool; expected one of {', '.join(BOXES)}{hint}"
             )
         box, node, name = _chosen(found, camera)
         node = {**node, "asked_model": model} if model else node
@@ -319,18 +321,28 @@ def _svo(node: Node) -> Camera:
     return _model(core, label, values, _floats(given, "distortion.parameters"))
 
 
+VIKIT = {
+    "pinhole": "radtan",
+    "pinholeradialtangential": "radtan",
+    "pinholenodistortion": "none",
+    "pinholeequidistant": "kb4",
+    "atan": "fov",
+    "pinholeatan": "fov",
+}
+"""``cam_model`` -> distortion."""
+
+
 def _vikit(node: Node) -> Camera:
     kind = str(node["cam_model"]).lower()
-    cores = {"pinhole": "radtan", "pinholeequidistant": "kb4", "atan": "fov", "pinholeatan": "fov"}
-    if kind not in cores:
-        raise ValueError(f"cam_model is {node['cam_model']!r}; expected one of {list(cores)}")
+    if kind not in VIKIT:
+        raise ValueError(f"cam_model is {node['cam_model']!r}; expected one of {list(VIKIT)}")
     fx, fy, cx, cy = _floats([_any(node, f"cam_{k}") for k in KB4.split()[:4]], "cam_fx ...")
     if fx < 10.0:  # shares of the image, which count from its corner
         width, height = _size(node) or (0, 0)
         fx, fy, cx, cy = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5
     given = [_floats([node.get(f"cam_d{i}", 0.0)], f"cam_d{i}")[0] for i in range(5)]
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return _model("pinhole", cores[kind], values, given[: 1 if cores[kind] == "fov" else None])
+    return _model("pinhole", VIKIT[kind], values, given[: 1 if VIKIT[kind] == "fov" else None])
 
 
 def _matrix(node: Node) -> Camera:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.calibrate import files as files
+from camera.calibrate import boards, files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
 from camera.fisheye import Fisheye
 from camera.mount import rotate, rotation_from_vector
@@ -206,6 +206,39 @@ def test_calibration_from_rendered_boards():
     rays = torch.cat([rays, rays[:, [1, 0, 2]], -rays * torch.tensor([1.0, 1.0, -1.0])])
     error = (Fisheye(found).project(rays)[0] - lens.project(rays)[0]).norm(dim=-1)
     assert error.max() < 0.25
+
+
+@pytest.mark.parametrize("kind", ["past 90 deg", "wrong corners", "shifted corners"])
+def test_one_board_that_does_not_fit_is_left_out_by_its_number(kind, monkeypatch):
+    truth = FisheyeParams(
+        640, 640, 191.2, 191.0, 319.6, 321.1, -0.0132, -0.0041, 0.0017, -0.0005, 200.0
+    )
+    lens, board = Fisheye(truth), BoardParams(7, 5, 0.04)
+    rng = np.random.default_rng(0)
+
+    def view(turn, place):
+        rot_cb = rotation_from_vector(torch.tensor(turn, dtype=torch.float64)).numpy()
+        pixels, _ = lens.project(torch.from_numpy(board.corners_m() @ rot_cb.T + place))
+        return boards.View(board.corners_m(), pixels.numpy() + rng.normal(0.0, 0.1, (35, 2)))
+
+    def place():
+        return [rng.uniform(-0.4, 0.3), rng.uniform(-0.4, 0.3), rng.uniform(0.25, 0.5)]
+
+    views = [view(rng.normal(0.0, 0.4, 3), place()) for _ in range(15)]
+    bad = view([0.0, 1.3, 0.0], [0.35, 0.0, 0.02])  # 117 deg off the axis
+    if kind == "wrong corners":
+        pixels = views[0].pixels[::-1] + rng.normal(0.0, 30.0, (35, 2))
+        bad = boards.View(board.corners_m(), pixels)
+    elif kind == "shifted corners":
+        bad = boards.View(board.corners_m(), np.roll(views[1].pixels, 7, axis=0))
+    monkeypatch.setattr(
+        boards, "find_boards", lambda *_: ((640, 640), [*views[:5], bad, *views[5:]])
+    )
+    found, report = calibrate_from_boards([], board, 190.0)
+    assert list(report.left_out) == [5]
+    assert math.isnan(report.image_rms_px[5])
+    assert found.fx == pytest.approx(191.2, abs=0.6)
+    assert report.rms_px < 0.2
 
 
 def test_board_refusals():

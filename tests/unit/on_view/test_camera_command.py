@@ -376,7 +376,7 @@ def test_the_tool_is_told_from_the_text(kind, tmp_path):
     [
         (
             ["{notes}", "--out", "{out}"],
-            "no camera of a known tool; expected a calibration of basalt, kalibr, camodocal, svo",
+            "no camera of a known tool; expected one of basalt, kalibr, camodocal, svo",
         ),
         (["{ocam}", "--out", "{out}"], "lines of numbers.*expected five"),
         (["{folder}", "--out", "{out}"], r"--board \(missing\); expected --board chessboard"),

@@ -183,11 +183,11 @@ def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tupl
 
 
 def _by_picture(paths: list[Path], report: BoardReport) -> list[str]:
-    lines = zip(paths, report.image_rms_px, strict=True)
-    return [
-        f"{path.name:24s} " + ("no board found" if math.isnan(rms) else f"{rms:.3f} px")
-        for path, rms in lines
-    ]
+    lines = []
+    for i, (path, rms) in enumerate(zip(paths, report.image_rms_px, strict=True)):
+        missing = f"left out: {report.left_out[i]}" if i in report.left_out else "no board found"
+        lines.append(f"{path.name:24s} " + (missing if math.isnan(rms) else f"{rms:.3f} px"))
+    return lines
 
 
 def sentence(lens: FisheyeParams) -> str:
