@@ -53,6 +53,11 @@ def whole(tmp_path_factory):
     return folder
 
 
+def test_a_training_stops_at_the_first_loss_that_is_not_finite(tmp_path, capsys):
+    assert train(tmp_path / "run", "--set", "task.reward.scale=1e30") == 2
+    assert "iteration 1: value inf is not finite" in capsys.readouterr().err
+
+
 def test_a_run_leaves_config_log_checkpoint_summary_and_policy(whole):
     names = {p.name for p in whole.iterdir()}
     assert {

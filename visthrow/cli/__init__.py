@@ -110,6 +110,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"{hider} hides visthrow's own package of that name; rename it, or run the command"
                 " from another folder"
             )
+        if error.name == "mujoco.batch":
+            return _refuse(
+                "the package 'mujoco' here has no mujoco.batch, which mujoco-core 4 brings: MuJoCo"
+                " 3, which mjlab, newton and Isaac Lab ask for, was installed over it; install"
+                " 'visthrow[reference]' in an environment of its own"
+            )
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
             raise

@@ -4,6 +4,7 @@ that comes of it.
 
 import dataclasses
 import io
+import math
 import time
 from pathlib import Path
 from typing import Protocol
@@ -12,7 +13,7 @@ import torch
 
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.errors import CheckpointError, MismatchError
+from visthrow.common.errors import CheckpointError, MismatchError, TrainError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
@@ -125,6 +126,10 @@ def fitted(experiment: Experiment, policy: Policy) -> Experiment:
     )
 
 
+LOSSES = {"value", "surrogate", "entropy", "gradient_norm"}
+"""Figures of an iteration that must be finite for it to have learnt anything."""
+
+
 class Trainer:
     """One training run.
 
@@ -155,6 +160,7 @@ class Trainer:
             torch.cuda.synchronize()
         middle = time.perf_counter()
         figures = self.algorithm.learn(done)
+        self._check_losses(figures)
         times = {"rollout": middle - start, "learning": time.perf_counter() - middle}
         self.iteration += 1
         for part, spent in times.items():
@@ -164,6 +170,21 @@ class Trainer:
             | {f"{part}_s": spent for part, spent in times.items()}
             | {"iteration": self.iteration}
         )
+
+    def _check_losses(self, figures: dict[str, float]) -> None:
+        """Raise TrainError where a loss of this iteration is not finite, in any process."""
+        broken = [
+            f"{name} {figures[name]}"
+            for name in LOSSES & figures.keys()
+            if not math.isfinite(figures[name])
+        ]
+        if self.ranks.agree(int(bool(broken))):
+            what = ", ".join(sorted(broken)) or "a loss of another process"
+            raise TrainError(
+                f"iteration {self.iteration + 1}: {what} is not finite: nothing more is learnt;"
+                " expected finite losses: is task.reward.scale or a learning rate too large? The"
+                " last checkpoint is from before"
+            )
 
     def throw(self, target: float, count: int | None = None, seed: int = 12345) -> Throws:
         """Throws from hover with the current policy, :data:`EVALUATED` if not said; see

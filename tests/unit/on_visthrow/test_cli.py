@@ -159,6 +159,9 @@ def test_a_missing_optional_package_names_the_extra(command, capsys):
     command(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
     assert cli.main(["try"]) == 2
     assert "visthrow[reference]" in capsys.readouterr().err
+    command(ModuleNotFoundError("No module named 'mujoco.batch'", name="mujoco.batch"))
+    assert cli.main(["try"]) == 2
+    assert "MuJoCo 3" in capsys.readouterr().err
     command(ModuleNotFoundError("No module named 'visthrow.gone'", name="visthrow.gone"))
     with pytest.raises(ModuleNotFoundError):
         cli.main(["try"])
