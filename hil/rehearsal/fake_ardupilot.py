@@ -12,6 +12,7 @@ import numpy as np
 
 from hil.links.backends.ardupilot import (
     BRAKE,
+    FACTS,
     GUIDED,
     GUIDED_NOGPS,
     LAND_MODE,
@@ -46,10 +47,16 @@ class FakeArduPilot(FakeMavlink):
         "GUID_OPTIONS": 8.0,
         "ATC_ANGLE_BOOST": 0.0,
         "GUID_TIMEOUT": 0.5,
-        "EK3_SRC1_POSXY": 6.0,
+        "EK3_SRC1_POSXY": float(FACTS["position_source"]),
         "GRIP_ENABLE": 1.0,
+        "GRIP_TYPE": float(FACTS["gripper_servo"]),
+        "GRIP_RELEASE": float(FACTS["gripper_open"]),
         f"SERVO{SERVO}_FUNCTION": float(SERVO_GRIPPER),
     }
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        return FACTS["gripper_closed"], int(self.parameters["GRIP_RELEASE"])
 
     def listens(self) -> bool:
         return self.armed and self.mode in (GUIDED, GUIDED_NOGPS)

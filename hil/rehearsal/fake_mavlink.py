@@ -24,7 +24,6 @@ class FakeMavlink(Fake):
     usual_mode = pilots_mode = 0
     defaults: dict[str, float]  # parameters of a vehicle that is set up well
     tells_unknown = False  # by PARAM_ERROR, of a parameter that it does not have; else it is silent
-    ends = (1100, 1900)  # of the mechanism's output, closed and open [us]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -56,6 +55,11 @@ class FakeMavlink(Fake):
         elif kind == "PARAM_SET" and message.param_id in self.parameters:
             self.parameters[message.param_id] = self.value(message.param_value, message.param_type)
             self._tell_parameter(message.param_id)
+
+    @property
+    @abstractmethod
+    def ends(self) -> tuple[int, int]:
+        """Ends of the mechanism's output, closed and open [us]."""
 
     def beat_soon(self) -> None:
         """Say that mode or arming have changed, where it is prompt with that."""

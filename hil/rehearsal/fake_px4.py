@@ -16,10 +16,9 @@ from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
 from hil.rehearsal.fake_mavlink import FakeMavlink
 
-STREAM_FIRST, STREAM_GAP = (
-    1.0,
-    0.5,
-)  # set-points before OFFBOARD, and the longest gap in them: 2 Hz [s]
+FACTS = px4.FACTS
+# set-points before OFFBOARD, and the longest gap in them [s]
+STREAM_FIRST, STREAM_GAP = FACTS["stream_first"], 1.0 / FACTS["stream_hz"]
 
 INTEGERS = ("COM_OBL_RC_ACT", "EKF2_EV_CTRL", "PWM_AUX_FUNC1", "PWM_AUX_MIN1", "PWM_AUX_MAX1")
 
@@ -44,12 +43,12 @@ class FakePx4(FakeMavlink):
     thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
         "COM_OF_LOSS_T": 0.5,
-        "COM_OBL_RC_ACT": 5.0,
+        "COM_OBL_RC_ACT": float(FACTS["loss_hold"]),
         "EKF2_EV_CTRL": 11.0,
-        "PD_GRIPPER_TO": 1.0,
-        "PWM_AUX_FUNC1": 430.0,
-        "PWM_AUX_MIN1": 1000.0,
-        "PWM_AUX_MAX1": 2000.0,
+        "PD_GRIPPER_TO": FACTS["gripper_answer"],
+        "PWM_AUX_FUNC1": float(FACTS["gripper_function"]),
+        "PWM_AUX_MIN1": float(FACTS["sim_minimum"]),
+        "PWM_AUX_MAX1": float(FACTS["sim_maximum"]),
     }
     _stream_since = _last = -np.inf
 
@@ -87,7 +86,10 @@ class FakePx4(FakeMavlink):
         if answer == "denied":
             self.acknowledge(number, mav.MAV_RESULT_DENIED)
             return
-        if self.parameters["PWM_AUX_FUNC1"] == (430.0 if gripper else 301.0):
+        if (
+            self.parameters["PWM_AUX_FUNC1"]
+            == FACTS["gripper_function" if gripper else "actuator_function"]
+        ):
             self.open_mechanism()
         if gripper:
             self.acknowledge(number, mav.MAV_RESULT_IN_PROGRESS)
@@ -112,7 +114,7 @@ class FakePx4(FakeMavlink):
         actuator set's 1 is the maximum.
         """
         ends = int(self.parameters["PWM_AUX_MAX1"]), int(self.parameters["PWM_AUX_MIN1"])
-        return ends if self.parameters["PWM_AUX_FUNC1"] == 430.0 else ends[::-1]
+        return ends if self.parameters["PWM_AUX_FUNC1"] == FACTS["gripper_function"] else ends[::-1]
 
     def flown(self) -> np.ndarray:
         if (

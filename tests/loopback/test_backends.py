@@ -222,6 +222,8 @@ TRAPS = {
         "GUID_TIMEOUT": 3.0,
         "EK3_SRC1_POSXY": 3.0,
         "GRIP_ENABLE": 0.0,
+        "GRIP_TYPE": 0.0,
+        "GRIP_RELEASE": 1900.0,
         "SERVO9_FUNCTION": 33.0,
     },
     "px4": {
@@ -264,7 +266,7 @@ def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
 @pytest.mark.parametrize(
     ("kind", "names"),
     [
-        ("ardupilot", set(TRAPS["ardupilot"])),
+        ("ardupilot", set(TRAPS["ardupilot"]) - {"GRIP_TYPE", "GRIP_RELEASE"}),
         ("px4", set(TRAPS["px4"]) - {"PD_GRIPPER_TO", "PWM_AUX_MIN1"}),
         ("betaflight", {"rates_type", "roll_rc_rate", "pitch_rate", "yaw_expo"}),
     ],
@@ -276,6 +278,46 @@ def test_write_parameters_mends_them(kind, names):
     desk.turn(3.0)
     assert desk.status.fault is None
     assert set(desk.backend.audit.written) == names
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("ardupilot", "EK3_SRC1_POSXY"), ("px4", "EKF2_EV_CTRL")]
+)
+def test_an_autopilot_without_external_poses_needs_no_source_of_them(kind, name):
+    """Software knows its place by its own simulated GPS."""
+    desk = Desk(kind, f"{kind}.poses=false", parameters={name: 0.0})
+    desk.turn(0.5)
+    assert desk.status.fault is None
+
+
+def test_px4_in_software_has_no_minimum_of_an_output():
+    desk = Desk("px4", 'px4.output_parameter="PWM_MAIN_FUNC9"', parameters={"PWM_MAIN_FUNC9": 430})
+    desk.turn(1.5)
+    assert desk.status.fault is None
+    assert desk.backend.audit.refused == {"PWM_MAIN_MIN9": "no such parameter"} | {
+        "PD_GRIPPER_EN": "no such parameter"
+    }
+
+
+def test_parameters_of_the_config_are_audited_and_written():
+    """A vehicle in software becomes the policy's by them."""
+    wanted, found = ("px4.parameters.SIH_MASS=0.272",), {"SIH_MASS": 1.0}
+    desk = Desk("px4", *wanted, parameters=found)
+    desk.turn(0.5)
+    assert desk.backend.audit.problems == ["SIH_MASS is 1; expected 0.272"]
+    desk = Desk("px4", *wanted, parameters=found, write=True)
+    desk.turn(3.0)
+    assert desk.status.fault is None
+    assert desk.fake.parameters["SIH_MASS"] == pytest.approx(0.272)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("ardupilot", "GUID_TIMEOUT"), ("px4", "COM_OF_LOSS_T")]
+)
+def test_a_second_of_the_last_rates_is_too_long(kind, name):
+    desk = Desk(kind, parameters={name: 1.0})
+    desk.turn(0.5)
+    assert desk.backend.audit.problems == [f"{name} is 1; expected above 0, at most 0.5"]
 
 
 def test_betaflight_is_not_written_while_it_is_armed():

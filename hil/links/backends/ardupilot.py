@@ -7,9 +7,9 @@ Without bit 3 of GUID_OPTIONS thrust is read as a climb rate; with ATC_ANGLE_BOO
 tilt; DO_SET_SERVO is accepted on an output that has a function and moves nothing; the last
 set-point is flown until GUID_TIMEOUT.
 
-Source: ArduCopter/Parameters.cpp (GUID_OPTIONS, GUID_TIMEOUT), AC_AttitudeControl.cpp
-(ANGLE_BOOST), AP_Gripper (GRIP_), SRV_Channel (SERVOn_FUNCTION 28 is Gripper), AP_NavEKF_Source.cpp
-(EK3_SRC1_POSXY 6 is ExternalNav)."""
+A gripper closes at GRIP_GRAB and opens at GRIP_RELEASE, which by default is the lower one.
+
+Source: `hil.links.facts`, ardupilot.toml."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,12 +17,17 @@ from typing import Literal
 from hil.links.backends.audit import Rule, bits, equal, within
 from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND
+from hil.links.facts import values
 from hil.links.pymav import mav
 from visthrow.common.errors import ConfigError
 
-GUIDED, LOITER, LAND_MODE, BRAKE, GUIDED_NOGPS = 4, 5, 9, 17, 20  # mode numbers of ArduCopter
-THRUST_AS_THRUST = 8  # bit 3 of GUID_OPTIONS
-SERVO_GRIPPER, SERVO_DISABLED = 28, 0  # values of SERVOn_FUNCTION
+FACTS = values("ardupilot")
+GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE = (
+    FACTS[mode] for mode in ("guided", "guided_nogps", "loiter", "brake", "land")
+)
+THRUST_AS_THRUST = FACTS["thrust_option"]  # bit of GUID_OPTIONS
+SERVO_GRIPPER, SERVO_DISABLED = FACTS["gripper_function"], FACTS["servo_disabled"]
+MOST_SILENCE = 0.5  # of GUID_TIMEOUT [s]: at a throw's rates a vehicle turns over in a second
 
 
 @dataclass(frozen=True)
@@ -82,16 +87,14 @@ class ArduPilot(MavlinkAutopilot):
             within(
                 "GUID_TIMEOUT",
                 0.0,
-                1.0,
-                0.5,
+                MOST_SILENCE,
+                MOST_SILENCE,
                 "so long the last rates are flown when the runner is gone [s]",
             ),
-            equal(
-                "EK3_SRC1_POSXY",
-                6.0,
-                "holding after the throw needs an external position (ExternalNav)",
-            ),
         ]
+        if p.poses:
+            why = "holding after the throw needs an external position (ExternalNav)"
+            rules.append(equal("EK3_SRC1_POSXY", FACTS["position_source"], why))
         function = f"SERVO{p.servo_output}_FUNCTION"
         if p.release == "servo":
             rules.append(
@@ -102,9 +105,16 @@ class ArduPilot(MavlinkAutopilot):
                 )
             )
         else:
-            rules.append(equal("GRIP_ENABLE", 1.0, "DO_GRIPPER is refused without it"))
+            rules += [
+                equal("GRIP_ENABLE", 1.0, "DO_GRIPPER is refused without it"),
+                equal(
+                    "GRIP_TYPE",
+                    FACTS["gripper_servo"],
+                    "a servo; it is read at the start alone: set it and start again",
+                    writable=False,
+                ),
+            ]
             if p.servo_output:
-                rules.append(
-                    equal(function, SERVO_GRIPPER, "the gripper's output, which is read back")
-                )
+                why = "the gripper's output, which is read back"
+                rules += [equal(function, SERVO_GRIPPER, why), self._open_end("GRIP_RELEASE")]
         return rules

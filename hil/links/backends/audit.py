@@ -34,7 +34,7 @@ def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
         name,
         f"{value:g}",
         why,
-        lambda v: abs(v - value) < 1e-6,
+        lambda v: abs(v - value) <= 1e-6 * max(1.0, abs(value)),
         (lambda _: value) if writable else None,
     )
 

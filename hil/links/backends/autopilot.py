@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from hil.links.backends.audit import Audit, Rule
+from hil.links.backends.audit import Audit, Rule, equal
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Release
 from hil.links.backends.thrust import ThrustParams
 from hil.links.mavlink_link import Link, attitude_target
@@ -53,6 +53,9 @@ class AutopilotParams(Bounded):
         int, Bound(0, 16)
     ]  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
     servo_open_us: Annotated[int, Bound(500, 2500)]  # there, with the mechanism open [us]
+    # whether the motion capture's poses are sent to it as well; else it knows its place by itself
+    poses: bool
+    parameters: dict[str, float]  # that it must have besides
 
 
 class MavlinkAutopilot(Autopilot, ABC):
@@ -95,7 +98,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         link.roster.moved.append(self._came_back)
 
     def _begin_audit(self) -> None:
-        rules = self._rules() if self.params.audit else ()
+        extra = [equal(*row, "by the config") for row in self.params.parameters.items()]
+        rules = [*self._rules(), *extra] if self.params.audit else ()
         self.audit = Audit(
             rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell
         )
@@ -112,6 +116,17 @@ class MavlinkAutopilot(Autopilot, ABC):
     @abstractmethod
     def _rules(self) -> list[Rule]:
         """Return what its parameters must be."""
+
+    def _open_end(self, name: str, optional: bool = False) -> Rule:
+        """Return the rule of the parameter that says where the mechanism's output is open."""
+        opens = self.params.servo_open_us
+        return Rule(
+            name,
+            f"{opens} (servo_open_us)",
+            "the output with the mechanism open, which is read back [us]",
+            lambda v: abs(v - opens) <= SERVO_NEAR,
+            optional=optional,
+        )
 
     @abstractmethod
     def _role(self, mode: int) -> str | None:

@@ -3,37 +3,34 @@
 SET_ATTITUDE_TARGET in OFFBOARD, DO_GRIPPER or DO_SET_ACTUATOR, Hold (AUTO.LOITER), Land
 (AUTO.LAND).
 
-OFFBOARD is refused until set-points have come for a second, and left when they cease for
-COM_OF_LOSS_T; so the runner streams first and asks then. DO_GRIPPER is answered IN_PROGRESS first,
-and ACCEPTED after PD_GRIPPER_TO whatever moves: the read-back of the output is what says that it
-did. A gripper opens at the minimum of its output. Integer parameters travel as bytes in a float
-field.
+OFFBOARD is left when set-points cease for COM_OF_LOSS_T, and up to 1.17 refused until they have
+come for a second; so the runner streams first and asks then. DO_GRIPPER is answered IN_PROGRESS
+first, and ACCEPTED after PD_GRIPPER_TO whatever moves: the read-back of the output is what says
+that it did. A gripper opens at the minimum of its output. Integer parameters travel as bytes in a
+float field.
 
-Source: docs.px4.io, Offboard Mode and Parameter Reference (COM_OF_LOSS_T, COM_OBL_RC_ACT,
-EKF2_EV_CTRL, PD_GRIPPER_TO, PWM_AUX_MIN1; PD_GRIPPER_EN up to 1.16); the output functions
-(Peripheral via Actuator Set 1 is 301, Gripper 430) are those of Actuator Configuration."""
+Source: `hil.links.facts`, px4.toml."""
 
 import struct
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from hil.links.backends.audit import Rule, bits, equal, within
-from hil.links.backends.autopilot import SERVO_NEAR, AutopilotParams, MavlinkAutopilot
+from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND
+from hil.links.facts import values
 from hil.links.pymav import mav
 from visthrow.config.bounds import Bound
 
-MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = (
-    3,
-    4,
-    6,
-)  # main modes, bits 16 to 23 of a heartbeat's custom mode
-AUTO_LOITER, AUTO_LAND = 3, 6  # sub-modes of AUTO, bits 24 to 31
-# set-points are streamed for this long before OFFBOARD is asked for; PX4 wants more than 1 s [s]
-STREAM_FIRST = 1.2
-STREAM_GAP = 0.3  # a longer pause begins the stream anew: PX4 counts on at least 2 Hz [s]
-LAND_OR_HOLD = (4.0, 5.0)  # values of COM_OBL_RC_ACT: Land, Hold
-POSITION_BITS = 3  # bits of EKF2_EV_CTRL: horizontal and vertical position
+FACTS = values("px4")
+# main modes, bits 16 to 23 of a heartbeat's custom mode, and sub-modes of AUTO, bits 24 to 31
+MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = FACTS["posctl"], FACTS["auto"], FACTS["offboard"]
+AUTO_LOITER, AUTO_LAND = FACTS["auto_loiter"], FACTS["auto_land"]
+# set-points are streamed for this long before OFFBOARD is asked for; a longer pause begins anew [s]
+STREAM_FIRST, STREAM_GAP = FACTS["stream_first"] + 0.2, 0.6 / FACTS["stream_hz"]
+LAND_OR_HOLD = (FACTS["loss_land"], FACTS["loss_hold"])  # values of COM_OBL_RC_ACT
+POSITION_BITS = FACTS["vision_horizontal"] | FACTS["vision_vertical"]  # of EKF2_EV_CTRL
+MOST_LOSS = 0.5  # of COM_OF_LOSS_T [s]: at a throw's rates a vehicle turns over in a second
 
 
 @dataclass(frozen=True)
@@ -112,8 +109,8 @@ class Px4(MavlinkAutopilot):
             within(
                 "COM_OF_LOSS_T",
                 0.0,
-                1.0,
-                0.5,
+                MOST_LOSS,
+                MOST_LOSS,
                 "so long the last rates are flown when the runner is gone [s]",
             ),
             Rule(
@@ -123,14 +120,18 @@ class Px4(MavlinkAutopilot):
                 lambda v: v in LAND_OR_HOLD,
                 lambda _: LAND_OR_HOLD[0],
             ),
-            bits(
-                "EKF2_EV_CTRL", POSITION_BITS, "holding after the throw needs an external position"
-            ),
         ]
-        if p.release == "gripper":
+        if p.poses:
+            why = "holding after the throw needs an external position"
+            rules.append(bits("EKF2_EV_CTRL", POSITION_BITS, why))
+        return [*rules, *self._mechanism_rules()]
+
+    def _mechanism_rules(self) -> list[Rule]:
+        p, rules, gripper = self.params, [], self.params.release == "gripper"
+        if gripper:
             rules += [
                 Rule(
-                    "PD_GRIPPER_EN",
+                    FACTS["gripper_enable"],
                     "1, or none since 1.17",
                     "DO_GRIPPER is not answered without it",
                     lambda v: v == 1.0,
@@ -146,30 +147,14 @@ class Px4(MavlinkAutopilot):
                 ),
             ]
         if p.output_parameter:
-            function = 430.0 if p.release == "gripper" else 300.0 + p.gripper
-            rules.append(
-                equal(
-                    p.output_parameter,
-                    function,
-                    "what drives the output that the mechanism hangs on",
-                )
-            )
-        open_end = {-1.0: "MIN", 1.0: "MAX"}.get(
-            -1.0 if p.release == "gripper" else p.actuator_open
-        )
-        if p.servo_output and open_end is not None and "FUNC" in p.output_parameter:
-            name, why = (
-                p.output_parameter.replace("FUNC", open_end),
-                "the output with the mechanism open, which is read back [us]",
-            )
-            rules.append(
-                Rule(
-                    name,
-                    f"{p.servo_open_us} (servo_open_us)",
-                    why,
-                    lambda v: abs(v - p.servo_open_us) <= SERVO_NEAR,
-                )
-            )
+            actuator = FACTS["actuator_function"] + p.gripper - 1
+            function = FACTS["gripper_function"] if gripper else actuator
+            why = "what drives the output that the mechanism hangs on"
+            rules.append(equal(p.output_parameter, function, why))
+        opens = FACTS["gripper_open"] if gripper else p.actuator_open
+        end = {-1.0: "MIN", 1.0: "MAX"}.get(opens)
+        if p.servo_output and end is not None and "FUNC" in p.output_parameter:
+            rules.append(self._open_end(p.output_parameter.replace("FUNC", end), optional=True))
         return rules
 
 

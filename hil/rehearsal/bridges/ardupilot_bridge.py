@@ -24,16 +24,18 @@ import numpy as np
 from hil.errors import LinkError
 from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.device import LARGEST_DATAGRAM
+from hil.links.facts import values
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_bridge import MotorPlant
 from hil.rehearsal.fake import Bridge, Options
 from hil.rehearsal.fake_mocap import MocapParams
 
-SERVOS = 9002  # UDP port on which ArduPilot finds the simulation
+FACTS = values("ardupilot")
+SERVOS = FACTS["json_port"]  # UDP port on which ArduPilot finds the simulation
 HEAD = struct.Struct(
     "<HHI"
 )  # magic, frames a second that it would like, number of the frame; outputs [us] follow
-MAGIC = {18458: 16, 29569: 32}  # outputs of a packet by its magic
+MAGIC = {FACTS["json_magic_16"]: 16, FACTS["json_magic_32"]: 32}  # outputs of a packet by its magic
 
 OURS = (2, 0, 1, 3)
 """Where front left, front right, rear left, rear right stand among the outputs of a quadrotor X

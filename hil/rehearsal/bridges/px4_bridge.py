@@ -30,7 +30,7 @@ STEP = 0.001  # time step of the ball [s]
 
 STREAMS = {
     mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 0.004,
-    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.01,
+    mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: 0.004,
 }
 """Messages that PX4 is asked for, and their periods [s]: SIH steps at 250 Hz."""
 
