@@ -4,9 +4,21 @@ Importing the package is cheap: every heavy library is imported by the module th
 """
 
 import os
+from typing import Any
 
 __version__ = "0.1.0"
 
 # rsl_rl imports GitPython, which raises at import where no git binary is installed unless it is
 # told to stay quiet.
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+
+__all__ = ["compare", "diagnose", "fly", "train"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a command of :mod:`visthrow.api` when it is first used."""
+    if name not in __all__:
+        raise AttributeError(f"module 'visthrow' has no attribute '{name}'")
+    from visthrow import api
+
+    return getattr(api, name)

@@ -1,0 +1,140 @@
+"""Exported networks give the policy's actions: ONNX by ONNX's own evaluator, C by a compiler."""
+
+import ctypes
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from visthrow import cli
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.training.gymnasium_env import SingleThrowEnv, ThrowVectorEnv
+
+THROWS, STEPS = 100, 100
+"""10,000 steps: throws side by side, each with its memory carried on."""
+TOLERANCE = 1e-5
+"""float32 sums in another order; actions are of the size of 1."""
+SHIPPED = ("state", "vision", "any")
+FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+
+
+def recurrent_policy(seed: int = 5) -> Policy:
+    """Return a small policy with a memory, random weights."""
+    from visthrow.onboard.estimator import Estimator
+
+    draw = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=draw) / shape[-1] ** 0.5
+
+    estimator = Estimator(
+        mean=normal(6),
+        std=1.0 + normal(6).abs(),
+        encoder_weight=normal(8, 6),
+        encoder_bias=normal(8),
+        input_weight=normal(15, 8),
+        input_bias=normal(15),
+        memory_weight=normal(15, 5),
+        memory_bias=normal(15),
+        output_weight=normal(4, 5),
+        output_bias=normal(4),
+        kept=torch.tensor([0, 6, 2, 6]),
+    )
+    weights = (normal(7, 4), normal(5, 7))
+    return Policy(weights, (normal(7), normal(5)), "elu", {}, estimator=estimator)
+
+
+def policies() -> dict[str, Policy]:
+    """Return the shipped policies and one with a memory."""
+    return {name: Policy.load(find_policy(name)) for name in SHIPPED} | {
+        "recurrent": recurrent_policy()
+    }
+
+
+POLICIES = policies()
+
+
+def rollout(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
+    """Return observations (T, E, D) about the policy's own and its actions (T, E, A)."""
+    generator = torch.Generator().manual_seed(11)
+    shape = (STEPS, THROWS, policy.obs_dim)
+    obs = 1.5 * torch.randn(shape, generator=generator)
+    if policy.mean is not None and policy.estimator is None:
+        obs = policy.mean + policy.std * obs
+    memory, actions = policy.begin(THROWS), []
+    for row in obs:
+        action, memory = policy.step(row, memory)
+        actions.append(action)
+    return obs.numpy(), torch.stack(actions).numpy()
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_onnx_gives_the_policys_actions(name, tmp_path):
+    from onnx.reference import ReferenceEvaluator
+
+    from visthrow.export.onnx_file import write_onnx
+
+    policy = POLICIES[name]
+    write_onnx(policy, tmp_path / "policy.onnx")
+    session = ReferenceEvaluator(str(tmp_path / "policy.onnx"))
+    obs, expected = rollout(policy)
+    memory = policy.begin(THROWS).numpy()
+    for row, action in zip(obs, expected, strict=True):
+        inputs = {"obs": row} | ({"memory": memory} if policy.estimator else {})
+        outputs = session.run(None, inputs)
+        memory = outputs[1] if policy.estimator else memory
+        np.testing.assert_allclose(outputs[0], action, rtol=0.0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
+    from visthrow.export.c_source import write_c
+
+    policy = POLICIES[name]
+    source, library = tmp_path / "policy.c", tmp_path / "policy.so"
+    write_c(policy, source)
+    subprocess.run(["gcc", *FLAGS, str(source), "-o", str(library), "-lm"], check=True)
+    symbols = subprocess.run(["nm", "-D", str(library)], capture_output=True, text=True, check=True)
+    assert "malloc" not in symbols.stdout
+    function = ctypes.CDLL(str(library)).visthrow_policy
+    floats = np.ctypeslib.ndpointer(np.float32, flags="C_CONTIGUOUS")
+    function.argtypes, function.restype = [floats, floats, floats], None
+    obs, expected = rollout(policy)
+    memories = np.zeros((THROWS, max(policy.begin(1).shape[1], 1)), np.float32)
+    found = np.empty_like(expected)
+    for t in range(STEPS):
+        for e in range(THROWS):
+            function(np.ascontiguousarray(obs[t, e], np.float32), memories[e], found[t, e])
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
+
+
+def test_the_command_writes_by_the_ending_and_refuses_others(tmp_path, capsys):
+    assert cli.main(["policy", "export", "state", "--out", str(tmp_path / "p.c")]) == 0
+    assert (tmp_path / "p.c").read_text().startswith("/* Network of a visthrow policy")
+    assert "35 observations, 5 actions" in capsys.readouterr().out
+    assert cli.main(["policy", "export", "state", "--out", str(tmp_path / "p.tflite")]) == 2
+    assert "expected a name that ends in .onnx or .c" in capsys.readouterr().err
+    assert not (tmp_path / "p.tflite").exists()
+
+
+def test_gymnasiums_checker_passes():
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(SingleThrowEnv("state"), skip_render_check=True)
+
+
+def test_a_batch_of_throws_ends_and_starts_anew():
+    env = ThrowVectorEnv("state", count=8, seed=3)
+    first, _ = env.reset(seed=3)
+    assert first.shape == env.observation_space.shape
+    again, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(first, again)
+    fall = np.tile(np.float32([-1.0, 0.0, 0.0, 0.0, -1.0]), (8, 1))
+    for _ in range(100):
+        _, _, terminated, truncated, infos = env.step(fall)
+        if terminated.any():
+            break
+    assert terminated.any(), "vehicles without thrust must crash within two seconds"
+    assert not truncated.any()
+    assert not infos["final_info"]["released"][terminated].any()

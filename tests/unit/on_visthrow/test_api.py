@@ -1,0 +1,40 @@
+"""The commands from Python: the options of the command line as keywords."""
+
+import pytest
+
+import visthrow
+from visthrow import api
+from visthrow.common.errors import VisthrowError
+
+
+def test_keywords_become_options():
+    assert api._words("--seed", 3, False) == ["--seed", "3"]
+    assert api._words("--targets", (1.5, 2.0), False) == ["--targets", "1.5", "2.0"]
+    assert api._words("--set", {"rope.length": 0.4, "a": 1}, True) == [
+        "--set",
+        "rope.length=0.4",
+        "--set",
+        "a=1",
+    ]
+    assert api._words("--no-report", True, False) == ["--no-report"]
+    assert api._words("--json", None, False) == []
+
+
+def test_a_throw_a_comparison_and_a_training(tmp_path):
+    log = visthrow.fly("state", target=1.5, device="cpu", out=tmp_path / "fly")
+    assert log.meta["goal_w"][0] == 1.5
+    figures = visthrow.compare("state", throws=2, targets=[2.0], device="cpu", out=tmp_path / "c")
+    assert figures
+    policy = visthrow.train(
+        "laptop", iterations=1, set={"ppo.environments": 64}, device="cpu", out=tmp_path / "t"
+    )
+    assert policy.action_dim == 5
+
+
+def test_mistakes_raise():
+    with pytest.raises(VisthrowError, match="not a valid command"):
+        visthrow.compare("state", no_such_option=1)
+    with pytest.raises(VisthrowError, match="no_such_policy"):
+        visthrow.fly("no_such_policy")
+    with pytest.raises(AttributeError, match="no attribute 'throw'"):
+        _ = visthrow.throw

@@ -1,0 +1,43 @@
+"""``visthrow policy``: export a policy's network to other programs."""
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the action of the command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    export = actions.add_parser(
+        "export",
+        help="write the network as ONNX or C",
+        description="Write a policy's network as ONNX (.onnx) or C99 (.c), by the ending.",
+        epilog=(
+            "examples:\n"
+            "  visthrow policy export vision --out vision.onnx\n"
+            "  visthrow policy export runs/mine/policy.npz --out policy.c\n"
+        ),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    export.add_argument("policy", metavar="POLICY", help="a shipped name or a policy file")
+    export.add_argument("--out", metavar="FILE", required=True, help="FILE.onnx or FILE.c")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export a policy."""
+    from visthrow.common.errors import PolicyError
+    from visthrow.export.c_source import write_c
+    from visthrow.export.onnx_file import write_onnx
+    from visthrow.onboard.policy import Policy, find_policy
+
+    writers = {".onnx": write_onnx, ".c": write_c}
+    writer = writers.get(Path(args.out).suffix)
+    if writer is None:
+        raise PolicyError(f"--out {args.out}; expected a name that ends in {' or '.join(writers)}")
+    policy = Policy.load(find_policy(args.policy))
+    writer(policy, args.out)
+    memory = 0 if policy.estimator is None else policy.estimator.memory
+    print(
+        f"wrote {args.out}: {policy.obs_dim} observations, {policy.action_dim} actions,"
+        f" a memory of {memory}"
+    )
+    return 0
