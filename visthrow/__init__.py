@@ -3,6 +3,7 @@
 Importing the package is cheap: every heavy library is imported by the module that uses it.
 """
 
+import importlib
 import os
 from typing import Any
 
@@ -16,9 +17,7 @@ __all__ = ["compare", "diagnose", "fly", "train"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a command of :mod:`visthrow.api` when it is first used."""
+    """Import a command of :mod:`visthrow.cli.api` when it is first used."""
     if name not in __all__:
         raise AttributeError(f"module 'visthrow' has no attribute '{name}'")
-    from visthrow import api
-
-    return getattr(api, name)
+    return getattr(importlib.import_module("visthrow.cli.api"), name)

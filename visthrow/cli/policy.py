@@ -24,9 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export a policy."""
+    from visthrow.cli.c_source import write_c
+    from visthrow.cli.onnx_file import write_onnx
     from visthrow.common.errors import PolicyError
-    from visthrow.export.c_source import write_c
-    from visthrow.export.onnx_file import write_onnx
     from visthrow.onboard.policy import Policy, find_policy
 
     writers = {".onnx": write_onnx, ".c": write_c}

@@ -3,7 +3,7 @@
 import pytest
 
 import visthrow
-from visthrow import api
+from visthrow.cli import api
 from visthrow.common.errors import VisthrowError
 
 

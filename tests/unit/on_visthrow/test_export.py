@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from visthrow import cli
+from visthrow.cli.gymnasium_env import SingleThrowEnv, ThrowVectorEnv
 from visthrow.onboard.policy import Policy, find_policy
-from visthrow.training.gymnasium_env import SingleThrowEnv, ThrowVectorEnv
 
 THROWS, STEPS = 100, 100
 """10,000 steps: throws side by side, each with its memory carried on."""
@@ -73,7 +73,7 @@ def rollout(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
 def test_onnx_gives_the_policys_actions(name, tmp_path):
     from onnx.reference import ReferenceEvaluator
 
-    from visthrow.export.onnx_file import write_onnx
+    from visthrow.cli.onnx_file import write_onnx
 
     policy = POLICIES[name]
     write_onnx(policy, tmp_path / "policy.onnx")
@@ -89,7 +89,7 @@ def test_onnx_gives_the_policys_actions(name, tmp_path):
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
-    from visthrow.export.c_source import write_c
+    from visthrow.cli.c_source import write_c
 
     policy = POLICIES[name]
     source, library = tmp_path / "policy.c", tmp_path / "policy.so"
