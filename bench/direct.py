@@ -27,7 +27,8 @@ from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from hil.poses.track import BodyState, Track
 from hil.rehearsal.fake import SetPoints, WirePlant
 from hil.rehearsal.fake_mocap import SLACK, Mocap, MocapParams
-from hil.rehearsal.process import KINDS, load_plant
+from hil.rehearsal.process import load_fake, load_plant
+from tests.fakes import KINDS
 from visthrow import config
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import Pilot
@@ -70,7 +71,8 @@ class Direct:
         )
         place = tuple(plant.state["pos_w"].astype(float).tolist())
         self._hover = Hovering(place, 0.0, plant.max_thrust, self.pilot.period)
-        self._late = KINDS[params.backend].usual_delay if params.backend in KINDS else 0.0
+        kind = KINDS.get(params.backend)
+        self._late = load_fake(kind).usual_delay if kind else 0.0
         self._set_points = SetPoints()
         self._coming: deque[Pose] = deque()
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.fakes import KINDS
 from visthrow.common.arguments import EXIT_INTERRUPTED
 from visthrow.common.errors import VisthrowError
 
@@ -149,7 +150,7 @@ class Pair:
             *command,
             "fake",
             "--kind",
-            self.kind,
+            KINDS[self.kind],
             "--device",
             f"udpout:127.0.0.1:{port}",
             "--msp-port",

@@ -55,8 +55,7 @@ Ctrl-C, SIGTERM and SIGHUP abort.
 FLIES = ("run", "record", "calibrate")
 FLAG, OVERRIDES = {"action": "store_true"}, {"dest": "overrides", "action": "append", "default": []}
 KINDS = (
-    "ardupilot, px4, betaflight, crazyflie; or a bridge to software: betaflight-sitl,"
-    " ardupilot-sitl, px4-sih"
+    "ardupilot, or module:class; or a bridge to software: betaflight-sitl, ardupilot-sitl, px4-sih"
 )
 PLANTS = "visthrow.throws.wire_plant:make, behind a firmware :make_motors"
 FILE = "of the recording: .rrd (rerun) or .mcap (Foxglove); default: run.rrd in the folder"
@@ -195,7 +194,7 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
         ("fake",),
         "--msp-port",
         None,
-        "where the fake Betaflight or Crazyflie listens",
+        "where a fake listens that has a port of its own",
         {"type": PORT, "default": 14561},
     ),
     (

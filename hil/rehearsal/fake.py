@@ -262,6 +262,11 @@ class Fake(ABC):
         self._going_on: dict[str, float] = {}
         self.taken = self._open = False
 
+    @staticmethod
+    def open_port(number: int) -> Port | None:
+        """Open a port for commands; None: they come on the link of the poses."""
+        return None
+
     def happened(self, text: str) -> None:
         """Note something that the autopilot did by itself, or was told; what goes on from one
         period to the next is one event.

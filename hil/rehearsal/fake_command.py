@@ -21,7 +21,7 @@ from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.bridges.px4_bridge import HangingBall, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
 from hil.rehearsal.fake_mocap import MocapParams
-from hil.rehearsal.process import KINDS, AnsweringPort, ListeningPort, load_plant, make_fake, serve
+from hil.rehearsal.process import FAKES, load_fake, load_plant, make_fake, serve
 from visthrow import config
 from visthrow.common.errors import suggest
 from visthrow.common.storage import writable
@@ -40,9 +40,6 @@ SITL = {"betaflight-sitl": MOTORS, "ardupilot-sitl": MOTORS, "px4-sih": BALL}
 """Kinds of fake that are a bridge to a firmware in software, and what makes the vehicle behind it.
 """
 
-MSP_PORT = (  # of one that is taken
-    "--msp-port PORT, and in the run --set {kind}.device={device}:127.0.0.1:PORT"
-)
 BRIDGE_ID = (254, 190)  # MAVLink ids of the bridge where it listens to an autopilot itself
 # from the mechanism's output to separation below PX4's vehicle [s], as
 # `visthrow.throws.wire_plant.MECHANISM`
@@ -56,8 +53,9 @@ def fake(args: argparse.Namespace) -> int:
         Options, "", [*args.overrides, f"answer={args.answer}"], "options of the fake"
     )
     mocap = MocapParams(rate=args.rate)
-    if args.kind not in {*KINDS, *SITL}:
-        raise RunError(f"--kind {args.kind}; {suggest(args.kind, {*KINDS, *SITL})}")
+    kinds = {*FAKES, *SITL}
+    if ":" not in args.kind and args.kind not in kinds:
+        raise RunError(f"--kind {args.kind}; {suggest(args.kind, kinds)}, or module:class")
     plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
     if out is not None:
         writable(out.parent)
@@ -70,16 +68,7 @@ def fake(args: argparse.Namespace) -> int:
         if args.kind in SITL:
             flown = _bridge(args, (plant, link, mocap, args.seed, options), ends)
         else:
-            port, other = (
-                None,
-                MSP_PORT.format(
-                    kind=args.kind, device="tcp" if args.kind == "betaflight" else "udpout"
-                ),
-            )
-            if args.kind == "betaflight":
-                port = ListeningPort(args.msp_port, other)
-            elif args.kind == "crazyflie":
-                port = AnsweringPort(check_device(f"udp:127.0.0.1:{args.msp_port}"), other)
+            port = load_fake(args.kind).open_port(args.msp_port)
             flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
             print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
         ends.callback(flown.close)

@@ -6,30 +6,19 @@ import inspect
 import json
 import math
 import signal
-import socket
 from pathlib import Path
 from typing import Any
 
 from hil.control.realtime import collected
-from hil.errors import LinkError, RunError
+from hil.errors import RunError
 from hil.links.clock import Clock
-from hil.links.device import LARGEST_DATAGRAM, UdpPort, refused
 from hil.links.mavlink_link import Link
 from hil.rehearsal.fake import Fake, Options, WirePlant
-from hil.rehearsal.fake_ardupilot import FakeArduPilot
-from hil.rehearsal.fake_betaflight import FakeBetaflight
-from hil.rehearsal.fake_crazyflie import FakeCrazyflie
 from hil.rehearsal.fake_mocap import MocapParams
-from hil.rehearsal.fake_px4 import FakePx4
 from visthrow.common.arguments import StopRequest
 from visthrow.common.errors import suggest
 
-KINDS = {
-    "ardupilot": FakeArduPilot,
-    "px4": FakePx4,
-    "betaflight": FakeBetaflight,
-    "crazyflie": FakeCrazyflie,
-}
+FAKES = {"ardupilot": "hil.rehearsal.fake_ardupilot:FakeArduPilot"}
 # the process ends this long after the payload has landed [s]: the vehicle has landed by then
 AFTER_LANDING = 10.0
 
@@ -50,67 +39,18 @@ def load_plant(target: str, policy: str, seed: int) -> WirePlant:
     return make(policy, seed)
 
 
-class ListeningPort:
-    """A TCP port of this machine that serves one peer at a time: what a flight controller in
-    software offers.
+def load_fake(kind: str) -> type[Fake]:
+    """Return the class of a fake: of :data:`FAKES`, or any that is given as ``module:class``.
+
+    Raises `RunError`: no such class.
     """
-
-    whole, sender, peer = False, None, None
-
-    def __init__(self, number: int, other: str = "") -> None:
-        """Listen on a port of the loopback address; raises `LinkError` where it is taken, or there
-        is none of that number.
-
-        ``other``: as of `hil.links.device.refused`.
-        """
-        if not 1 <= number <= 65535:
-            raise LinkError(f"tcp port {number}; expected 1 to 65535")
-        try:
-            self._server = socket.create_server(("127.0.0.1", number), backlog=1)
-        except OSError as error:
-            raise refused(f"tcp:127.0.0.1:{number}", number, error, other) from error
-        self._server.setblocking(False)
-        self._peer: socket.socket | None = None
-
-    def read(self) -> bytes | None:
-        if self._peer is None:
-            try:
-                self._peer, _ = self._server.accept()
-            except OSError:
-                return None
-            self._peer.setblocking(False)
-            self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        try:
-            data = self._peer.recv(LARGEST_DATAGRAM)
-        except BlockingIOError:
-            return None
-        except OSError:
-            data = b""
-        if not data:  # the peer has gone: the next one may come
-            self._peer.close()
-            self._peer = None
-        return data or None
-
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        try:
-            return self._peer is not None and self._peer.send(data) == len(data)
-        except OSError:
-            return False
-
-    def fileno(self) -> int:
-        return (self._peer or self._server).fileno()
-
-    def close(self) -> None:
-        for one in (self._server, self._peer):
-            if one is not None:
-                one.close()
-
-
-class AnsweringPort(UdpPort):
-    """A UDP port that answers whoever spoke last: what a vehicle in software offers."""
-
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        return super().write(data, to or self.sender)
+    module, _, name = FAKES.get(kind, kind).partition(":")
+    if not name:
+        raise RunError(f"fake of kind '{kind}'; {suggest(kind, FAKES)}, or module:class")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise RunError(f"fake of kind '{kind}': {error}; expected module:class") from error
 
 
 def make_fake(
@@ -122,12 +62,11 @@ def make_fake(
     options: Options | None = None,
     port: Any = None,
 ) -> Fake:
-    """Return a fake of a kind, with its port of MSP for Betaflight, of CRTP for the Crazyflie;
-    raises `RunError` for an unknown kind.
+    """Return a fake of a kind; ``port``: where its commands come by another port than the link's.
+
+    Raises `RunError`: unknown kind.
     """
-    if kind not in KINDS:
-        raise RunError(f"fake of kind '{kind}'; {suggest(kind, KINDS)}")
-    return KINDS[kind](plant, link, mocap, seed, options, port)
+    return load_fake(kind)(plant, link, mocap, seed, options, port)
 
 
 def serve(

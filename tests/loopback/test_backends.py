@@ -10,8 +10,8 @@ from hil.control.loop import Loop
 from hil.control.states import OperatorInput
 from hil.links import msp
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
-from hil.rehearsal.fake_px4 import LAND as PX4_LAND
-from hil.rehearsal.fake_px4 import OFFBOARD, POSCTL, custom
+from tests.fakes.fake_px4 import LAND as PX4_LAND
+from tests.fakes.fake_px4 import OFFBOARD, POSCTL, custom
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers, throw

@@ -21,9 +21,9 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.poses.sources.opening import open_source
 from hil.rehearsal.fake import VEHICLE_ID, Options
-from hil.rehearsal.fake_crazyflie import FakeCrazyflie
 from hil.rehearsal.fake_mocap import MocapParams
-from hil.rehearsal.process import AnsweringPort
+from tests.fakes.fake_crazyflie import FakeCrazyflie
+from tests.fakes.ports import AnsweringPort
 from tests.hil_flight import AutoOperator
 from tests.sitl.direct import FlightClock
 from visthrow import config

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from hil.control.recording.playback import replay
+from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
 from visthrow.onboard.actions import hover_action
@@ -88,7 +89,7 @@ class Pair:
                 *COMMAND,
                 "fake",
                 "--kind",
-                kind,
+                KINDS[kind],
                 "--device",
                 f"udpout:{self.device}",
                 "--msp-port",

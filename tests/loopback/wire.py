@@ -16,6 +16,7 @@ from hil.poses.sources.opening import parties
 from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
 from hil.rehearsal.fake_mocap import MocapParams
 from hil.rehearsal.process import make_fake
+from tests.fakes import KINDS
 from tests.hil_flight import AutoOperator
 from tests.mocap_faults import MocapFault
 from visthrow import config
@@ -124,9 +125,8 @@ def peers(
     mine, its = pipe()
     mine.whole = its.whole = False
     more = Options(answer=answer, **options)
-    fake = make_fake(
-        kind, plant, Link(there, *VEHICLE_ID, key=key), mocap or MocapParams(), seed, more, its
-    )
+    far = Link(there, *VEHICLE_ID, key=key)
+    fake = make_fake(KINDS[kind], plant, far, mocap or MocapParams(), seed, more, its)
     fake.spoil = MocapFault(*mocap_fault, seed).spoil
     roster = Roster(parties(params, True, True))
     clock, link = (

@@ -13,7 +13,8 @@ from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
 from hil.rehearsal.fake import Options, Witness
-from hil.rehearsal.process import ListeningPort, make_fake
+from hil.rehearsal.process import make_fake
+from tests.fakes.ports import ListeningPort
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe
 from visthrow import config
@@ -138,8 +139,8 @@ def test_options_of_a_fake():
         read_options(["answer=maybe"])
     with pytest.raises(ConfigError, match=r"servo_delay is -0.1; expected 0 or more"):
         read_options(["servo_delay=-0.1"])
-    with pytest.raises(RunError, match="did you mean 'px4'"):
-        make_fake("px5", LevelPlant(), None)
+    with pytest.raises(RunError, match="did you mean 'ardupilot'"):
+        make_fake("ardupilo", LevelPlant(), None)
 
 
 def test_the_msp_port_serves_one_peer_after_another():
@@ -151,7 +152,7 @@ def test_the_msp_port_serves_one_peer_after_another():
         LinkError,
         match=rf"tcp:127\.0\.0\.1:{number}: another program has it.*ss -tlnp.*: --msp-port PORT",
     ):
-        ListeningPort(number, "--msp-port PORT")
+        ListeningPort(number)
     with pytest.raises(LinkError, match="tcp port 99999; expected 1 to 65535"):
         ListeningPort(99_999)
     assert port.read() is None

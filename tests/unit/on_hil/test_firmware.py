@@ -26,7 +26,7 @@ from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, Options
 from hil.rehearsal.fake_mocap import MocapParams
-from hil.rehearsal.process import ListeningPort
+from tests.fakes.ports import ListeningPort
 from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 

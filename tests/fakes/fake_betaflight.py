@@ -25,6 +25,7 @@ from hil.links.backends.betaflight import (
 )
 from hil.links.backends.rates import RATES_TYPES, RatesParams, Sticks
 from hil.rehearsal.fake import PortFake
+from tests.fakes.ports import ListeningPort
 
 IDLE_AFTER, DISARM_AFTER = (
     0.36,
@@ -55,6 +56,10 @@ SIZES = {
 
 class FakeBetaflight(PortFake):
     """See the head of this module."""
+
+    @staticmethod
+    def open_port(number: int) -> ListeningPort:
+        return ListeningPort(number)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

@@ -11,7 +11,9 @@ import numpy as np
 
 from hil.links import crtp
 from hil.links.backends.crazyflie import FULL, MODES
+from hil.links.device import Device
 from hil.rehearsal.fake import PortFake
+from tests.fakes.ports import AnsweringPort
 
 LEVELS_AFTER, STOPS_AFTER = (
     0.5,
@@ -26,6 +28,10 @@ class FakeCrazyflie(PortFake):
     """See the head of this module; ``placed`` holds external poses that came, position [m] and
     attitude xyzw.
     """
+
+    @staticmethod
+    def open_port(number: int) -> AnsweringPort:
+        return AnsweringPort(Device("udp", "127.0.0.1", number))
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
