@@ -3,6 +3,7 @@ installed.
 """
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -28,6 +29,11 @@ MAY_USE = {
     "hil": {"hil", "camera", *ONBOARD},
 }
 NUMPY_WARP_ONLY = {"torch", "cv2", "kornia", "rerun", "rsl_rl", "tensordict", "matplotlib"}
+OPTIONAL_ROOMS = ("visthrow.paper", "visthrow.detector_training", "hil.rehearsal")
+EXTRAS = (  # packages that an installation without extras lacks
+    *("mujoco", "piqp", "pyulog", "rosbags", "h5py", "mcap", "skimage", "submitit", "serial"),
+    *("cflib", "cyclonedds", "natnet", "motioncapture", "mujoco_warp", "aeroid"),
+)
 BLOCKED_ON_BOARD = ("sim", "warp", "rsl_rl", "tensordict", "mujoco")
 
 
@@ -85,6 +91,53 @@ def test_onboard_modules_import_only_onboard_modules():
         if target.split(".")[0] in PACKAGES and not allowed(target, known)
     ]
     assert not wrong
+
+
+@pytest.mark.parametrize("room", OPTIONAL_ROOMS)
+def test_nothing_imports_an_optional_room_from_outside(room):
+    inside = ROOT / room.replace(".", "/")
+    wrong = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for package in PACKAGES
+        for path in sources(package)
+        if not path.is_relative_to(inside)
+        for name in imported(path)
+        if allowed(name, {room})
+    ]
+    assert not wrong
+
+
+def test_an_optional_room_names_its_extra(monkeypatch, capsys):
+    from visthrow.cli import main
+
+    monkeypatch.setitem(sys.modules, "piqp", None)
+    monkeypatch.delitem(sys.modules, "visthrow.paper.baseline.rival", raising=False)
+    assert main(["compare", "baseline", "--throws", "1"]) == 2
+    assert "pip install 'visthrow[paper]'" in capsys.readouterr().err
+
+
+def test_the_core_trains_flies_compares_and_diagnoses_without_the_extras(tmp_path):
+    """Optional rooms and the packages of extras are hidden, as where they are not installed."""
+    tiny = ["--set", "ppo.iterations=1", "--set", "ppo.environments=8"]
+    commands = [
+        ["train", "laptop", *tiny, "--out", "trained"],
+        ["fly", "--policy", "state", "--out", "flown"],
+        ["compare", "trained/policy.npz", "--throws", "1", "--targets", "1.5", "--out", "compared"],
+        ["diagnose", "check", "flown/flight.npz", "--no-pictures"],
+        ["diagnose", "explain", "flown/flight.npz", "--only", "com_x", "--no-report"],
+    ]
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys({(*EXTRAS, *OPTIONAL_ROOMS, "bench", "tests")!r}))
+from visthrow.cli import main
+for words in {commands!r}:
+    device = [] if words[1] == "check" else ["--device", "cpu"]
+    assert main([*words, *device]) == 0, words
+"""
+    run = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert result.returncode == 0, result.stderr
 
 
 def test_sim_uses_numpy_and_warp_only():
