@@ -4,9 +4,7 @@ A packet is a header, port in the high half and channel in the low two bits, and
 ``udpout:`` devices each datagram is a packet, as cflib's UDP driver and Bitcraze's software in the
 loop have it; ``radio://`` and ``usb://`` addresses go through cflib.
 
-Source: bitcraze.io, CRTP; crazyflie-firmware, src/modules/interface/crtp.h, crtp_commander_rpyt.c
-(legacy set-point), param_logic.c (set by name), supervisor; cflib, crtp/udpdriver.py,
-crazyflie/supervisor.py."""
+Source: `hil.links.facts`, crazyflie; cflib, crtp/udpdriver.py."""
 
 import struct
 from dataclasses import dataclass
@@ -14,33 +12,13 @@ from typing import Any
 
 from hil.errors import LinkError
 from hil.links.device import check_device, open_port
+from hil.links.facts import values
 from visthrow.common.extras import load_extra
 
-PARAM, COMMANDER, LOCALIZATION, SUPERVISOR = 2, 3, 6, 9  # ports
+FACTS = values("crazyflie")
+MOST = FACTS["packet_data"] + 1  # bytes of a packet
 
-BY_NAME, GENERIC, INFO, COMMAND = 3, 1, 0, 1
-"""Channels: of parameters by name, of localization's further messages, of the supervisor's state
-and commands.
-"""
-
-SET_POINT, POSE = struct.Struct("<fffH"), struct.Struct("<B7f")
-
-EXTERNAL_POSE, SET_BY_NAME, UINT8, STATE, ARM, ANSWER = (
-    8,
-    0,
-    0x08,
-    0x0C,
-    0x01,
-    0x80,
-)  # types within packets
-ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED = (
-    1 << 1,
-    1 << 3,
-    1 << 4,
-    1 << 5,
-    1 << 6,
-)  # bits of the supervisor's state
-MOST = 31  # bytes of a packet
+MANUAL, POSITION, POSE = struct.Struct("<B3fHB"), struct.Struct("<B4f"), struct.Struct("<B7f")
 
 CFLIB = ("radio://", "usb://", "serial://")
 
@@ -55,25 +33,36 @@ class Packet:
 
     def pack(self) -> bytes:
         """Return its bytes as they go out."""
-        return bytes([(self.port & 0xF) << 4 | self.channel & 3]) + self.data
+        return bytes([(self.port & 0xF) << FACTS["header_shift"] | self.channel & 3]) + self.data
 
 
 def unpack(data: bytes) -> Packet | None:
     """Return the packet of some bytes; None where they are none."""
-    return Packet(data[0] >> 4, data[0] & 3, data[1:]) if 1 <= len(data) <= MOST else None
+    if not 1 <= len(data) <= MOST:
+        return None
+    return Packet(data[0] >> FACTS["header_shift"], data[0] & 3, data[1:])
 
 
-def set_point(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
-    """Return the legacy set-point: thrust of 65535, body rates forward, left, up [deg/s]; the
-    firmware's pitch is nose down.
+def manual(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
+    """Return the manual set-point in rate mode: thrust of 65535, body rates forward, left, up
+    [deg/s].
     """
-    roll, pitch, yaw = rates_dps
-    return Packet(COMMANDER, 0, SET_POINT.pack(roll, -pitch, yaw, thrust)).pack()
+    axes = zip(rates_dps, ("roll", "pitch", "yaw"))
+    signed = (FACTS[f"manual_{axis}_sign"] * rate for rate, axis in axes)
+    data = MANUAL.pack(FACTS["manual"], *signed, thrust, FACTS["manual_rate"])
+    return Packet(FACTS["port_generic"], FACTS["channel_set_point"], data).pack()
+
+
+def position(place_w: tuple[float, ...], yaw_deg: float) -> bytes:
+    """Return the set-point of a place [m], z up, and heading [deg] that it is to hold by itself."""
+    data = POSITION.pack(FACTS["position"], *place_w, yaw_deg)
+    return Packet(FACTS["port_generic"], FACTS["channel_set_point"], data).pack()
 
 
 def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
     """Return the position [m], z up, and attitude xyzw for its estimator."""
-    return Packet(LOCALIZATION, GENERIC, POSE.pack(EXTERNAL_POSE, *pos, *quat)).pack()
+    data = POSE.pack(FACTS["external_pose"], *pos, *quat)
+    return Packet(FACTS["port_localization"], FACTS["channel_pose"], data).pack()
 
 
 def named(name: str) -> bytes:
@@ -83,12 +72,26 @@ def named(name: str) -> bytes:
 
 def set_parameter(name: str, value: int) -> bytes:
     """Return a parameter of eight bits, by its name."""
-    return Packet(PARAM, BY_NAME, bytes([SET_BY_NAME]) + named(name) + bytes([UINT8, value])).pack()
+    data = bytes([FACTS["set_by_name"]]) + named(name) + bytes([FACTS["type_uint8"], value])
+    return Packet(FACTS["port_param"], FACTS["channel_by_name"], data).pack()
 
 
 def arm(on: bool) -> bytes:
     """Return the request to arm or disarm."""
-    return Packet(SUPERVISOR, COMMAND, bytes([ARM, on])).pack()
+    data = bytes([FACTS["arm"], on])
+    return Packet(FACTS["port_supervisor"], FACTS["channel_command"], data).pack()
+
+
+def ask_state() -> bytes:
+    """Return the question for the supervisor's state."""
+    data = bytes([FACTS["ask_state"]])
+    return Packet(FACTS["port_supervisor"], FACTS["channel_info"], data).pack()
+
+
+def ask_protocol() -> bytes:
+    """Return the question for the protocol's version."""
+    data = bytes([FACTS["ask_protocol"]])
+    return Packet(FACTS["port_platform"], FACTS["channel_version"], data).pack()
 
 
 class CflibPort:

@@ -1,32 +1,67 @@
-"""A fake Crazyflie on a CRTP port; the poses come from the motion capture's bridge beside it.
+"""A Crazyflie by its firmware's source, on a CRTP port; the poses come from the motion capture's
+bridge beside it.
 
-Set-points are angles until both modes were set to rates, and fly nothing until one without thrust
-unlocked it and it was armed. Pitch is nose down. Silence of its commander levels it after 0.5 s and
-stops its motors after 2 s. An unknown parameter is answered with an error."""
+Written from the source alone, not from the back-end: `hil.links.facts`, crazyflie, has file and
+line of each behaviour. Packets are decoded (crtp_commander_rpyt.c, crtp_commander_generic.c), kept
+by priority (commander.c), cut by the supervisor's states (supervisor_state_machine.c), and flown as
+the PID controller takes them (controller_pid.c): roll and pitch as rates or angles, yaw as a rate
+that moves the yaw that is held. What follows the rates is the vehicle of the training. A set-point
+of a place is held by the fakes' own controller.
+
+Left out: the legacy modes althold, poshold and posSet (nothing flies then), trajectories, DSHOT's
+check of the rotors, and the integral of roll and pitch angles."""
 
 import math
+import struct
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hil.links import crtp
-from hil.links.backends.crazyflie import FULL, MODES
 from hil.links.device import Device
+from hil.links.facts import values
 from hil.rehearsal.fake import PortFake
 from tests.fakes.ports import AnsweringPort
+from visthrow.common.rotations import rotate_back, tilt_and_heading
+from visthrow.onboard.hover import GRAVITY
 
-LEVELS_AFTER, STOPS_AFTER = (
-    0.5,
-    2.0,
-)  # silence of set-points [s]: COMMANDER_WDT_TIMEOUT_STABILIZE and _SHUTDOWN
-LEAST = 1000  # Thrust below this is none (MIN_THRUST)
+FACTS = values("crazyflie")
+HOOK = "hook.open"  # parameter of the app that moves the mechanism
+DEFAULTS = {"flightmode.stabModeRoll": 1, "flightmode.stabModePitch": 1, "stabilizer.controller": 0}
+"""Parameters that the firmware starts with, where these are not what they have to be."""
 
-ENOENT = 2
+PASSED, READY, FLYING, LEVEL, LANDED, LOCKED, CRASHED = (
+    "pre-flight checks passed",
+    "ready to fly",
+    "flying",
+    "warning, level out",
+    "landed",
+    "locked",
+    "crashed",
+)
+MAY_FLY = (READY, FLYING, LEVEL, LANDED)  # states in which the motors may turn
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """What the commander holds: angles and rates in degrees, as its packets have them."""
+
+    time: float = -math.inf  # when it came [s]
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    thrust: float = 0.0  # of 65535
+    rates: tuple[bool, bool, bool] = (True, True, True)  # roll, pitch, yaw; else angles
+    place_w: tuple[float, ...] | None = None  # [m]; None: none is held
 
 
 class FakeCrazyflie(PortFake):
-    """See the head of this module; ``placed`` holds external poses that came, position [m] and
-    attitude xyzw.
+    """See the head of this module.
+
+    Attributes:
+        placed: external poses that came, position [m] and attitude xyzw. supervisor: its state.
+        protocol: version that it tells. priority: of the set-point that is flown.
+        hook_opens: value of the mechanism's parameter that opens it.
     """
 
     @staticmethod
@@ -36,106 +71,284 @@ class FakeCrazyflie(PortFake):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.armed = False
+        # a change of the yaw rate comes as a pulse, which moves the yaw that is held
+        self.witness.limits = (*self.witness.limits[:3], math.inf)
+        needed = {name: value for name, value in FACTS.items() if "." in name}
         self.parameters: dict[str, float] = {
-            **dict.fromkeys(MODES, 1),
-            "hook.open": 0,
+            **needed,
+            **DEFAULTS,
+            HOOK: 0,
             **self.options.parameters,
         }
         self.placed: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
-        self._locked, self._heard, self._stopped = True, -math.inf, False
+        self.protocol, self.priority, self.hook_opens = FACTS["protocol_state"], 0, 1
+        self.supervisor = PASSED
+        self.held = SetPoint()  # by the commander
+        self._locked = FACTS["thrust_locked"]  # thrust of legacy set-points
+        self._begun = False  # whether somebody holds it in the hand no longer
+        self._turned = -math.inf  # of the supervisor [s]
+        self._since = self._thrust_at = 0.0  # of the supervisor's state, of the last thrust [s]
+        self._tilted: float | None = None
+        self._velocity = np.zeros(3)
+        self._force = np.array([0.0, 0.0, 1.0])  # specific force, body frame, of one g
+        self._yaw_held, self._yaw_sum = 0.0, 0.0  # [rad], [rad s]
 
     def came(self, data: bytes) -> None:
-        packet = crtp.unpack(data)
-        if packet is not None and not self.silent:
-            self._hear(packet)
+        if self.silent or not data:
+            return
+        port, channel = data[0] >> FACTS["header_shift"], data[0] & 3
+        places = {
+            (FACTS["port_setpoint"], 0): self._legacy,
+            (FACTS["port_generic"], FACTS["channel_set_point"]): self._generic,
+            (FACTS["port_localization"], FACTS["channel_pose"]): self._pose,
+            (FACTS["port_supervisor"], FACTS["channel_info"]): self._tell_state,
+            (FACTS["port_supervisor"], FACTS["channel_command"]): self._command,
+            (FACTS["port_platform"], FACTS["channel_version"]): self._tell_version,
+            (FACTS["port_param"], FACTS["channel_by_name"]): self._set_parameter,
+        }
+        take = places.get((port, channel))
+        if take is not None and len(data) > 1:
+            take(data[1:])
 
-    def _hear(self, packet: crtp.Packet) -> None:
-        place, data = (packet.port, packet.channel), packet.data
-        if place == (crtp.COMMANDER, 0) and len(data) == crtp.SET_POINT.size:
-            self._set_point(*crtp.SET_POINT.unpack(data))
-        elif (
-            place == (crtp.LOCALIZATION, crtp.GENERIC)
-            and len(data) == crtp.POSE.size
-            and data[0] == crtp.EXTERNAL_POSE
-        ):
-            values = crtp.POSE.unpack(data)[1:]
-            self.placed.append((values[:3], values[3:]))
-        elif place == (crtp.SUPERVISOR, crtp.INFO) and data[:1] == bytes([crtp.STATE]):
-            flying, stopped = bool(self.last_thrust > 0.0), self._stopped
-            state = (
-                crtp.CAN_FLY
-                | crtp.ARMED * self.armed
-                | crtp.FLYING * flying
-                | crtp.LOCKED * stopped
-            )
-            self._answer(
-                crtp.SUPERVISOR,
-                crtp.INFO,
-                bytes([crtp.STATE | crtp.ANSWER]) + state.to_bytes(4, "little"),
-            )
-        elif (
-            place == (crtp.SUPERVISOR, crtp.COMMAND)
-            and data[:1] == bytes([crtp.ARM])
-            and len(data) == 2
-        ):
-            self.armed = bool(data[1]) and self.options.arming and not self._stopped
-            self.happened("armed" if self.armed else "disarmed")
-        elif place == (crtp.PARAM, crtp.BY_NAME) and data[:1] == bytes([crtp.SET_BY_NAME]):
-            self._set_parameter(data)
+    def _answer(self, port: str, channel: str, data: bytes) -> None:
+        header = bytes([FACTS[port] << FACTS["header_shift"] | FACTS[channel]])
+        self.later(self.options.answer_delay, lambda: self.port.write(header + data))
 
-    def _answer(self, port: int, channel: int, data: bytes) -> None:
-        self.later(
-            self.options.answer_delay,
-            lambda: self.port.write(crtp.Packet(port, channel, data).pack()),
+    def _legacy(self, data: bytes) -> None:
+        """Take a legacy set-point: roll, pitch, yaw, thrust."""
+        roll, pitch, yaw, thrust = struct.unpack_from("<3fH", data)
+        if self.priority == 0:
+            self._locked = True
+        if thrust == 0:
+            self._locked = False
+        none = self._locked or thrust < FACTS["legacy_least"]
+        mode = {name: self.parameters[f"flightmode.{name}"] for name in ("althold", "poshold")}
+        if mode["althold"] or mode["poshold"] or self.parameters["flightmode.posSet"]:
+            self.happened("legacy set-point in another mode")
+            none = True
+        rates = tuple(
+            self.parameters[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch", "Yaw")
         )
+        yaw = FACTS["legacy_yaw_sign"] * yaw if rates[2] else yaw
+        thrust = 0 if none else min(thrust, FACTS["legacy_most"])
+        self._commanded(SetPoint(self.plant.time, roll, pitch, yaw, thrust, rates))
+
+    def _generic(self, data: bytes) -> None:
+        """Take a generic set-point; one of an unknown type stops the motors."""
+        kind, data = data[0], data[1:]
+        if kind == FACTS["manual"]:
+            if len(data) != struct.calcsize("<3fHb"):
+                self.happened("assertion failed: restarted")
+                self._go(LOCKED)
+                return
+            roll, pitch, yaw, thrust, rate = struct.unpack("<3fHb", data)
+            rates = (rate == FACTS["manual_rate"],) * 2
+            self._commanded(SetPoint(self.plant.time, roll, pitch, yaw, thrust, (*rates, True)))
+        elif kind == FACTS["position"]:
+            *place, yaw = struct.unpack_from("<4f", data)
+            self._commanded(SetPoint(self.plant.time, yaw=yaw, place_w=tuple(place)))
+        else:
+            self._commanded(SetPoint(self.plant.time))
+
+    def _commanded(self, set_point: SetPoint) -> None:
+        """Hand a set-point to the commander, which drops it where another one has priority."""
+        taken = FACTS["priority_crtp"] >= self.priority
+        if taken:
+            self.held, self.priority = set_point, FACTS["priority_crtp"]
+        turns = (
+            set_point.roll,
+            FACTS["manual_pitch_sign"] * set_point.pitch,
+            set_point.yaw,
+        )
+        thrust = 0.0
+        if set_point.thrust > 0.0:
+            thrust = self.thrust_map.thrust(set_point.thrust / FACTS["manual_thrust"])
+        flies = taken and set_point.place_w is None and self.supervisor in MAY_FLY
+        self.set_point((thrust, *map(math.radians, turns)), flies)
+
+    def receiver_speaks(self) -> None:
+        """Let a set-point of an external receiver come, without thrust."""
+        self.held, self.priority = SetPoint(self.plant.time), FACTS["priority_receiver"]
+        self.forget()
+
+    def _pose(self, data: bytes) -> None:
+        if data[0] == FACTS["external_pose"] and len(data) >= struct.calcsize("<B7f"):
+            numbers = struct.unpack_from("<7f", data, 1)
+            self.placed.append((numbers[:3], numbers[3:]))
+
+    def _tell_state(self, data: bytes) -> None:
+        if data[0] != FACTS["ask_state"]:
+            return
+        state = {
+            "can_arm": self.supervisor == PASSED,
+            "armed": self.armed,
+            "can_fly": self.supervisor in MAY_FLY,
+            "flying": self.supervisor in (FLYING, LEVEL),
+            "locked": self.supervisor == LOCKED,
+            "crashed": self.supervisor == CRASHED,
+        }
+        bits = sum(FACTS[name] for name, on in state.items() if on)
+        told = bytes([FACTS["ask_state"] | FACTS["answer"]]) + struct.pack("<H", bits)
+        self._answer("port_supervisor", "channel_info", told)
+
+    def _tell_version(self, data: bytes) -> None:
+        if data[0] == FACTS["ask_protocol"]:
+            told = bytes([FACTS["ask_protocol"]]) + struct.pack("<i", self.protocol)
+            self._answer("port_platform", "channel_version", told)
+
+    def _command(self, data: bytes) -> None:
+        if data[0] != FACTS["arm"] or len(data) < 2:
+            return
+        wanted = bool(data[1])
+        if wanted and not (self.supervisor == PASSED and self.options.arming):
+            return
+        if wanted != self.armed:
+            self.armed = wanted
+            self.happened("armed" if wanted else "disarmed")
 
     def _set_parameter(self, data: bytes) -> None:
+        if data[0] != FACTS["set_by_name"] or data.count(b"\0") < 2:
+            return
         group, name, rest = data[1:].split(b"\0", 2)
-        known = f"{group.decode()}.{name.decode()}"
-        error = 0 if known in self.parameters and len(rest) == 2 else ENOENT
-        if not error:
-            self.parameters[known] = rest[1]
-        if known == "hook.open" and rest[1:] == b"\1":
+        known = f"{group.decode('ascii', 'replace')}.{name.decode('ascii', 'replace')}"
+        if known not in self.parameters:
+            error = FACTS["no_entry"]
+        elif len(rest) < 2 or rest[0] != FACTS["type_uint8"]:
+            error = FACTS["wrong_type"]
+        else:
+            error, self.parameters[known] = 0, rest[1]
+        if known == HOOK and error == 0 and rest[1] == self.hook_opens:
             self.note_release()
             if self.options.answer == "silent":
                 return
             self.witness.answered()
-            error = ENOENT if self.options.answer == "denied" else error
+            error = FACTS["no_entry"] if self.options.answer == "denied" else error
             self.open_mechanism()
-        self._answer(crtp.PARAM, crtp.BY_NAME, data[: -len(rest)] + bytes([error]))
+        told = data[: len(data) - len(rest)] + bytes([error])
+        self._answer("port_param", "channel_by_name", told)
 
-    def _set_point(self, roll: float, pitch: float, yaw: float, thrust: int) -> None:
-        self._heard = self.plant.time
-        self._locked &= thrust != 0
-        rates = tuple(math.radians(rate) for rate in (roll, -pitch, yaw))
-        command = (
-            self.thrust_map.thrust(min(thrust, FULL) / FULL) if thrust >= LEAST else 0.0,
-            *rates,
-        )
-        self.set_point(
-            command,
-            self.armed and not self._locked and not any(self.parameters[mode] for mode in MODES),
-        )
+    def _go(self, state: str) -> None:
+        """Enter a state of the supervisor; those that may not fly disarm."""
+        if state == self.supervisor:
+            return
+        self.supervisor, self._since = state, self.plant.time
+        self.happened(state)
+        if state not in MAY_FLY:
+            self.armed = False
+
+    def _supervise(self) -> None:
+        """Take a turn of the supervisor, where one is due."""
+        time = self.plant.time
+        if time - self._turned < 1.0 / FACTS["supervisor_rate"] - 1e-9:
+            return
+        self._turned = time
+        age, in_state = time - self.held.time, time - self._since
+        flying = time - self._thrust_at < FACTS["flying_hold"] and self._begun
+        tumbled = self._tumbled()
+        if self.parameters["stabilizer.stop"] and self.supervisor != LOCKED:
+            self._go(LOCKED)
+        elif self.supervisor == PASSED and self.armed and not tumbled:
+            self._go(READY)
+        elif self.supervisor == READY:
+            if tumbled or in_state > FACTS["preflight"] or not self.armed:
+                self._go(PASSED)
+            elif flying:
+                self._go(FLYING)
+        elif self.supervisor in (FLYING, LEVEL) and age > FACTS["stops_after"]:
+            self._go(LOCKED)
+        elif self.supervisor in (FLYING, LEVEL) and tumbled:
+            self._go(CRASHED if self.supervisor == FLYING else LOCKED)
+        elif self.supervisor == FLYING and not self.armed:
+            self._go(PASSED)
+        elif self.supervisor in (FLYING, LEVEL) and (self.supervisor == LEVEL) != (
+            age > FACTS["levels_after"]
+        ):
+            self._go(LEVEL if self.supervisor == FLYING else FLYING)
+        elif self.supervisor == FLYING and not flying:
+            self._go(LANDED)
+        elif self.supervisor == LANDED:
+            if in_state > FACTS["landing"] or not self.armed:
+                self._go(PASSED)
+            elif flying:
+                self._go(FLYING)
+
+    def _tumbled(self) -> bool:
+        """Return whether it was tilted, or on its head, for too long."""
+        time, up = self.plant.time, self._force[2]
+        free = bool(np.all(np.abs(self._force) < FACTS["free_fall"]))
+        if free or up >= FACTS["tilt_share"]:
+            self._tilted = None
+            return False
+        self._tilted = time if self._tilted is None else self._tilted
+        over = up < FACTS["over_share"] and time - self._tilted > FACTS["over_time"]
+        return over or time - self._tilted > FACTS["tilt_time"]
 
     def take(self) -> None:
         """Stop all: there is no pilot beside the runner, but its emergency stop."""
-        self.armed, self._stopped = False, True
-        self.happened("emergency stop")
+        self.parameters["stabilizer.stop"] = 1
 
     def flown(self) -> np.ndarray:
         """Return the command of this period; before the runner has it somebody holds it in the
         hand.
         """
-        quiet = self.plant.time - self._heard
-        if self._target is None or not self.followed:
+        self._sense()
+        self._supervise()
+        place_w, target = self.held.place_w, self._target
+        may = self.supervisor in MAY_FLY and not self.parameters["motorPowerSet.enable"]
+        thrust = 0.0 if target is None or not may else target[0]
+        if may and place_w is not None and self._begun:
+            thrust = 1.0
+        self._begun |= thrust > 0.0
+        if not self._begun:
             return self.hold(self._place)
-        if quiet > STOPS_AFTER or not self.armed:
-            self.happened("motors off")
+        if thrust == 0.0:
+            self._yaw_held, self._yaw_sum = self._heading(), 0.0
             return np.zeros(4)
-        if quiet > LEVELS_AFTER:
-            self.happened("commander: level")
-            return np.array([self._target[0], 0.0, 0.0, 0.0])
-        return self._target
+        self._thrust_at = self.plant.time
+        if place_w is not None:
+            return self.hold(np.array(place_w))
+        return np.array([thrust, *self._rates(target)])
+
+    def _sense(self) -> None:
+        """Take the accelerometer's specific force by the change of velocity."""
+        now = self.plant.state
+        velocity = now["vel_w"].astype(float)
+        pull = (velocity - self._velocity) / self.plant.period / GRAVITY + np.array([0.0, 0.0, 1.0])
+        self._velocity = velocity
+        if self._begun:
+            self._force = rotate_back(now["quat_wb"][None].astype(float), pull[None])[0]
+
+    def _heading(self) -> float:
+        return tilt_and_heading(tuple(self.plant.state["quat_wb"].tolist()))[1]
+
+    def _rates(self, target: np.ndarray) -> np.ndarray:
+        """Return the body rates that the PID controller asks for [rad/s], forward, left, up."""
+        rates, level = target[1:].copy(), self.supervisor == LEVEL
+        x, y, z, w = map(float, self.plant.state["quat_wb"])
+        angles = (
+            math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+            math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0)),
+        )
+        for axis in range(2):
+            if level or not self.held.rates[axis]:
+                wanted = 0.0 if level else rates[axis]
+                rates[axis] = FACTS["level_p"] * (wanted - angles[axis])
+        dt, turned = self.plant.period, float(self.plant.state["rate_b"][2])
+        if level:
+            rates[2] = 0.0
+        if self.held.rates[2] or level:
+            self._yaw_held += rates[2] * dt
+        else:
+            self._yaw_held = rates[2]
+        error = math.remainder(self._yaw_held - self._heading(), 2.0 * math.pi)
+        self._yaw_sum += error * dt
+        rates[2] = FACTS["yaw_p"] * error + FACTS["yaw_i"] * self._yaw_sum - FACTS["yaw_d"] * turned
+        return rates
 
     def report(self) -> dict[str, Any]:
-        return {**super().report(), "poses": len(self.placed), "parameters": self.parameters}
+        return {
+            **super().report(),
+            "poses": len(self.placed),
+            "supervisor": self.supervisor,
+            "parameters": self.parameters,
+        }

@@ -1,160 +1,214 @@
-"""The Crazyflie's back-end and its fake: a whole throw over CRTP in lock step, signs, and what each
-refuses.
+"""The Crazyflie's back-end against its firmware's behaviour by the source, in lock step.
+
+Throws over CRTP, signs, priorities, silence, versions, and what each refuses.
 """
 
 import math
+import struct
 import sys
 
 import numpy as np
 import pytest
 
+from bench.crazyflie import fly
 from bench.processes import free_port
-from hil.control.loop import Loop
-from hil.control.runner import Runner
 from hil.errors import LinkError
 from hil.links import crtp
-from hil.links.backends import make_backend, mechanism_lag
+from hil.links.backends import make_backend
 from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
 from hil.links.backends.crazyflie import Crazyflie
 from hil.links.device import Device, UdpPort
+from hil.links.facts import values
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
-from hil.poses.sources.opening import open_source
-from hil.rehearsal.fake import VEHICLE_ID, Options
-from hil.rehearsal.fake_mocap import MocapParams
-from tests.fakes.fake_crazyflie import FakeCrazyflie
+from hil.rehearsal.fake import VEHICLE_ID
+from tests.fakes.fake_crazyflie import CRASHED, FLYING, LEVEL, LOCKED, FakeCrazyflie
 from tests.fakes.ports import AnsweringPort
-from tests.hil_flight import AutoOperator
-from tests.sitl.direct import FlightClock
+from tests.level import LevelPlant
+from tests.loopback.test_backends import HOVER, Desk
 from visthrow import config
-from visthrow.onboard.policy import Policy, find_policy
-from visthrow.throws.wire_plant import make
+
+FACTS = values("crazyflie")
+LEGACY = struct.Struct("<3fH")
+NEAR = 0.06
+"""Of a single landing [m]: sixty land 0.025 m off in the mean, 0.06 m at most."""
 
 
-class Desk:
-    """Fake and back-end, period by period."""
-
-    def __init__(self, **options):
-        self.number, poses = free_port(), free_port()
-        over = [
-            f'crazyflie.device="udpout:127.0.0.1:{self.number}"',
-            f'link.device="udp:127.0.0.1:{poses}"',
-        ]
-        self.params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
-        port = AnsweringPort(Device("udp", "127.0.0.1", self.number))
-        link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
-        self.fake = FakeCrazyflie(
-            make("vision", 0), link, MocapParams(), 0, Options(**options), port=port
-        )
-        self.backend = make_backend(self.params)
-
-    def turn(self, seconds, command=None, ask=None):
-        end, tick = self.fake.plant.time + seconds, 0.0
-        while self.fake.plant.time < end - 1e-9:
-            now = self.fake.plant.time
-            if now >= tick:
-                tick = now + 0.02
-                if ask is not None:
-                    self.backend.ask(ask, now)
-                if command is not None:
-                    self.backend.send(command, now)
-                self.backend.service(now)
-            self.fake.step()
-
-    def close(self):
-        self.backend.close()
-        self.fake.close()
+def desk(**options):
+    return Desk("crazyflie", **options)
 
 
-@pytest.fixture
-def desk():
-    made = []
-
-    def build(**options):
-        made.append(Desk(**options))
-        return made[-1]
-
-    yield build
-    for one in made:
-        one.close()
-
-
-def test_a_whole_throw(desk, tmp_path):
-    """Taken, armed, thrown, released and recovered by the runner; the vehicle's poses go to its
-    estimator.
-    """
-    one = desk()
-    clock = FlightClock(one.fake)
-    source, _, _ = open_source(one.params, tmp_path, clock)
-    runner = Runner(
-        one.params, Policy.load(find_policy("vision")), one.backend, mechanism_lag(one.params)
-    )
-    runner.watcher = one.backend.place
-    loop = Loop(runner, source, clock, AutoOperator())
-    while one.fake.plant.time < 9.0 and one.fake.plant.landing["landing_time"] is None:
-        loop.turn(False)
-    landing = one.fake.plant.landing["landing_w"]
-    source.close()
-    assert landing is not None, runner.machine.reason
-    assert math.hypot(landing[0] - 2.0, landing[1]) < 0.1
-    assert one.backend.release_record.state == ACCEPTED
-    assert len(one.fake.placed) > 100
-    place = np.array(one.fake.placed[-1][0])
-    assert np.linalg.norm(place - one.fake.plant.state["pos_w"]) < 0.1
+@pytest.mark.parametrize("seed", [100, 101])
+def test_a_whole_throw(seed):
+    """Taken, armed, thrown, released and recovered; the vehicle's poses go to its estimator."""
+    off, summary, fake = fly(seed)
+    assert off < NEAR, summary["reason"]
+    assert fake.witness.breaches == []
+    assert (fake.witness.releases, fake.supervisor) == (1, FLYING)
+    place = np.array(fake.placed[-1][0])
+    assert len(fake.placed) > 100
+    assert np.linalg.norm(place - fake.plant.state["pos_w"]) < 0.1
 
 
-def test_rates_come_as_they_are_meant(desk):
+def test_yaw_the_other_way_round_lands_no_throw():
+    off, summary, _ = fly(100, yaw=-1)
+    assert off is None
+    assert summary["aborted"]
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_vehicle_turns_as_it_was_commanded(axis):
     """Roll right, nose down and yaw left are positive with us."""
-    one = desk()
-    one.turn(0.5, (0.0, 0.0, 0.0, 0.0), FOLLOW)
-    assert one.backend.status(one.fake.plant.time).mode == FOLLOW
-    weight = one.fake.plant.mass[0] * 9.81
-    for axis in range(3):
-        rates = [0.0, 0.0, 0.0]
-        rates[axis] = 1.0
-        one.turn(0.06, (weight, *rates))
-        thrust, *told = one.fake._target
-        assert told == pytest.approx(rates, abs=1e-3)
-        assert thrust == pytest.approx(weight, rel=1e-3)
-        one.turn(0.1, (weight, 0.0, 0.0, 0.0))
+    one = desk().follow()
+    rates = [0.0, 0.0, 0.0]
+    rates[axis] = 1.0
+    one.turn(0.06, (HOVER[0], *rates))
+    thrust, *turns = one.fake.plant.commands[-1]
+    assert thrust == pytest.approx(HOVER[0], rel=1e-3)
+    assert turns[axis] == pytest.approx(1.3 if axis == 2 else 1.0, abs=0.3)
+    assert [turn for i, turn in enumerate(turns) if i != axis] == pytest.approx([0.0, 0.0])
 
 
-def test_silence_levels_and_then_stops_the_motors(desk):
+def test_legacy_set_points_mean_what_the_firmware_makes_of_them():
+    """Locked until one without thrust came, yaw the other way round, angles by default."""
+    fake = desk().follow().fake
+    fake._locked, fake.parameters["flightmode.stabModeRoll"] = True, 1
+    header = bytes([FACTS["port_setpoint"] << 4])
+    for thrust, held in ((30000, 0), (0, 0), (65535, FACTS["legacy_most"]), (999, 0)):
+        fake.came(header + LEGACY.pack(5.0, 6.0, 7.0, thrust))
+        assert fake.held.thrust == held
+    assert fake.held.rates == (False, True, True)
+    assert (fake.held.roll, fake.held.pitch, fake.held.yaw) == (5.0, 6.0, -7.0)
+
+
+def test_a_receiver_has_priority():
+    one = desk().follow()
+    one.turn(0.1, HOVER)
+    one.fake.receiver_speaks()
+    held = one.fake.held
+    one.turn(0.1, HOVER)
+    assert one.fake.held is held, "set-points by CRTP are dropped"
+    assert one.fake.plant.commands[-1][0] == 0.0
+
+
+def test_modes_that_others_have_set_are_set_again():
+    """Each parameter that changes what a set-point means is put right before anything is armed."""
+    wrong = {"flightmode.althold": 1, "flightmode.stabModeYaw": 1, "stabilizer.controller": 2}
+    fake = desk(parameters=wrong).follow().fake
+    for name, value in FACTS.items():
+        if "." in name:
+            assert fake.parameters[name] == value
+
+
+@pytest.mark.parametrize("name", ["stabilizer.controller", "flightmode.posSet", "hook.open"])
+def test_nothing_flies_while_a_setting_is_missing(name):
+    tables = []
+    one = desk(tell=tables.append)
+    del one.fake.parameters[name]
+    one.turn(6.0, None, FOLLOW)
+    assert not one.fake.armed
+    assert one.status.fault == f"parameter audit: {name} wrong, see the table"
+    assert "no such parameter" in tables[0]
+
+
+def test_nothing_is_set_in_flight():
+    one = desk(parameters={"stabilizer.controller": 2})
+    one.fake.supervisor, one.fake._supervise = FLYING, lambda: None
+    one.turn(0.5)
+    assert one.status.note == "it flies: land it first"
+    assert one.fake.parameters["stabilizer.controller"] == 2
+
+
+def test_a_firmware_without_manual_set_points_is_refused():
     one = desk()
-    one.turn(0.5, (0.0, 0.0, 0.0, 0.0), FOLLOW)
-    one.turn(0.3, (one.fake.plant.mass[0] * 9.81, 0.0, 0.0, 0.0))
-    for _ in range(500):
+    one.fake.protocol = 10
+    one.turn(1.0, None, FOLLOW)
+    assert not one.fake.armed
+    assert one.backend.audit.problems == ["protocol is 10; expected 12 or newer"]
+
+
+def test_silence_levels_it_and_then_stops_the_motors():
+    """As of commander and supervisor: thrust as it was, roll and pitch level, then locked."""
+    one = desk().follow()
+    one.turn(0.3, HOVER)
+    begun = one.now
+    while one.fake.supervisor != LOCKED:
         one.fake.step()
-    told = [text for _, text in one.fake.events]
-    assert told[:3] == ["armed", "commander: level", "motors off"]
+    told = {text: time - begun for time, text in one.fake.events}
+    assert told[LEVEL] == pytest.approx(FACTS["levels_after"], abs=0.06)
+    assert told[LOCKED] == pytest.approx(FACTS["stops_after"], abs=0.06)
+    one.fake.step()
+    assert one.fake.plant.commands[-1] == (0.0, 0.0, 0.0, 0.0)
+    one.turn(0.3, HOVER)
+    assert "locked: restart it" in one.status.note
+
+
+def test_a_vehicle_on_its_head_is_crashed_and_is_said_to_be():
+    one = desk().follow()
+    one.turn(0.3, HOVER)
+    one.fake._force = np.array([0.0, 0.0, -1.0])
+    one.fake._sense = lambda: None
+    one.turn(0.4, HOVER)
+    assert one.fake.supervisor == CRASHED
+    assert "crashed" in one.status.note
+
+
+def test_a_vehicle_that_is_handed_back_holds_its_place():
+    one = desk().follow()
+    one.turn(0.3, HOVER)
+    place = one.fake.plant.state["pos_w"].copy()
+    one.backend.place("vehicle", _Track(place))
+    for _ in range(200):
+        one.turn(0.02)
+        one.backend.hand_back(one.now)
+    assert one.fake.supervisor == FLYING, "set-points of a place keep its watchdog quiet"
+    assert one.fake.held.place_w == pytest.approx(place, abs=1e-6)
+
+
+class _Track:
+    """A track of one pose."""
+
+    def __init__(self, place):
+        self.place = place
+
+    def sample(self):
+        from hil.poses.pose import Pose
+
+        return (Pose(0.0, 0.0, "vehicle", tuple(self.place), (0.0, 0.0, 0.0, 1.0)),)
 
 
 @pytest.mark.parametrize(
     ("answer", "state", "note"),
-    [("denied", FAILED, "not known"), ("silent", FAILED, "no final answer")],
+    [
+        ("accepted", ACCEPTED, ""),
+        ("denied", FAILED, "not known"),
+        ("silent", FAILED, "no final answer"),
+    ],
 )
-def test_a_release_that_is_not_answered_well_has_failed(desk, answer, state, note):
-    one = desk(answer=answer)
-    one.turn(0.5, (0.0, 0.0, 0.0, 0.0), FOLLOW)
-    one.backend.release(one.fake.plant.time)
-    one.turn(1.0, (one.fake.plant.mass[0] * 9.81, 0.0, 0.0, 0.0))
+def test_a_release_is_answered_or_has_failed(answer, state, note):
+    one = desk(answer=answer).follow()
+    one.backend.release(one.now)
+    one.turn(1.0, HOVER)
     assert one.backend.release_record.state == state
     assert note in one.backend.release_record.note
 
 
-def test_nothing_flies_before_its_set_points_are_rates(desk):
-    """A firmware without the parameters: it is never armed, and the note says why."""
-    one = desk()
-    del one.fake.parameters["flightmode.stabModeRoll"]
-    one.turn(1.0, (0.0, 0.0, 0.0, 0.0), FOLLOW)
-    assert not one.fake.armed
-    assert one.backend.status(one.fake.plant.time).note == "its set-points are being set to rates"
+def test_packets_of_another_length_or_type_end_a_flight():
+    """A manual set-point that is cut restarts the firmware; an unknown type stops the motors."""
+    header = bytes([FACTS["port_generic"] << 4])
+    one = desk().follow()
+    one.fake.came(header + bytes([FACTS["manual"]]) + bytes(14))
+    assert one.fake.supervisor == LOCKED
+    one = desk().follow()
+    one.fake.came(header + bytes([200]))
+    assert one.fake.held.thrust == 0.0
 
 
 def test_packets_and_devices(monkeypatch):
     assert crtp.unpack(b"") is None
     assert crtp.unpack(bytes(40)) is None
-    assert crtp.set_point(1, (1.0, 2.0, 3.0)) == b"\x30" + crtp.SET_POINT.pack(1.0, -2.0, 3.0, 1)
+    packed = struct.pack("<B3fHB", 11, 1.0, -2.0, 3.0, 7, 1)
+    assert crtp.manual(7, (1.0, 2.0, 3.0)) == b"\x70" + packed
     assert crtp.set_parameter("a.b", 1) == b"\x23\x00a\0b\0\x08\x01"
     with pytest.raises(LinkError, match="is refused"):
         crtp.open_crtp("/bin/sh", False)
@@ -162,3 +216,26 @@ def test_packets_and_devices(monkeypatch):
     with pytest.raises(LinkError, match="crazyflie"):
         crtp.open_crtp("radio://0/80/2M", False)
     assert Crazyflie.holds is False
+
+
+def test_by_udp():
+    """The software in the loop's datagrams: heard, set, armed."""
+    number, poses = free_port(), free_port()
+    over = [
+        f'crazyflie.device="udpout:127.0.0.1:{number}"',
+        f'link.device="udp:127.0.0.1:{poses}"',
+    ]
+    params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
+    port = AnsweringPort(Device("udp", "127.0.0.1", number))
+    link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
+    fake, backend = FakeCrazyflie(LevelPlant(), link, port=port), make_backend(params)
+    try:
+        for _ in range(400):
+            backend.ask(FOLLOW, fake.plant.time)
+            backend.service(fake.plant.time)
+            fake.step()
+        assert backend.status(fake.plant.time).mode == FOLLOW
+        assert math.isfinite(fake.plant.time)
+    finally:
+        backend.close()
+        fake.close()

@@ -9,6 +9,7 @@ from hil.control.loop import Loop
 from hil.control.runner import Runner
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.betaflight import Betaflight
+from hil.links.backends.crazyflie import Crazyflie
 from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
@@ -94,7 +95,12 @@ class PlantClock:
         self._until(when, ports[0])
 
 
-CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
+CONFIGS = {
+    "ardupilot": "fake",
+    "px4": "fake_px4",
+    "betaflight": "fake_betaflight",
+    "crazyflie": "fake_crazyflie",
+}
 
 
 def peers(
@@ -123,7 +129,7 @@ def peers(
     )
     here, there = pipe()
     mine, its = pipe()
-    mine.whole = its.whole = False
+    mine.whole = its.whole = kind == "crazyflie"
     more = Options(answer=answer, **options)
     far = Link(there, *VEHICLE_ID, key=key)
     fake = make_fake(KINDS[kind], plant, far, mocap or MocapParams(), seed, more, its)
@@ -138,10 +144,14 @@ def peers(
     source = MavlinkSource(link, params.source.senders, clock.now)
     if kind == "betaflight":
         backend = Betaflight(mine, params.betaflight, write, tell)
+    elif kind == "crazyflie":
+        backend = Crazyflie(mine, params.crazyflie, tell)
     else:
         backend = make_backend(params, link, write, tell)
     loaded = loaded or Policy.load(find_policy(policy))
-    return Runner(params, loaded, backend, mechanism_lag(params)), source, clock, fake
+    runner = Runner(params, loaded, backend, mechanism_lag(params))
+    runner.watcher = getattr(backend, "place", None)
+    return runner, source, clock, fake
 
 
 def cut(runner, source, clock, operator, recorder, seconds, tell):

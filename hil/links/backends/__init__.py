@@ -69,7 +69,7 @@ def make_backend(
             port if folder is None else LoggedPort(port, folder / MSP_LOG), vehicle, write, tell
         )
     elif name == "crazyflie":
-        backend = Crazyflie(open_crtp(vehicle.device, vehicle.remote), vehicle)
+        backend = Crazyflie(open_crtp(vehicle.device, vehicle.remote), vehicle, tell)
     elif link is None:
         raise RunError(f"backend {name} without a MAVLink link; expected source.kind mavlink")
     else:

@@ -1,36 +1,43 @@
-"""Crazyflie over CRTP: body rates and thrust as legacy set-points in rate mode, the release as a
-parameter, poses to its estimator.
+"""Crazyflie over CRTP: body rates and thrust as manual set-points, the release as a parameter,
+poses to its estimator.
 
-It has no hold of its own that takes over in mid flight here: the runner's hover controller flies
-before and after the throw. Silence of 0.5 s levels it, of 2 s stops the motors (its commander's
-watchdog). Thrust stays locked until a set-point without thrust came. A set-point means rates only
-after ``flightmode.stabModeRoll`` and ``stabModePitch`` were set to 0, which is done, and answered,
-before anything is armed.
+The runner's hover controller flies before and after the throw. A manual set-point says itself that
+it holds rates, and its thrust is neither locked nor cut; it flies as soon as the vehicle is armed.
+Legacy set-points, which others may send, mean what the parameters of ``flightmode`` say. These,
+the controller and the motors' override are set, and answered, before anything is armed. Silence
+levels the vehicle, and stops its motors later (its supervisor). A vehicle that is handed back holds
+its place by its own position controller, as long as it hears set-points of a place.
 
-Source: crazyflie-firmware, crtp_commander_rpyt.c, commander.c (COMMANDER_WDT_TIMEOUT),
-supervisor.c, param_logic.c (paramSetByName)."""
+Source: `hil.links.facts`, crazyflie."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from hil.links import crtp
+from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, equal
 from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
 from hil.links.backends.thrust import ThrustParams
 from hil.links.device import Port, chunks
+from hil.links.facts import facts, values
 from hil.poses.pose import VEHICLE
 from hil.poses.track import Track
 from visthrow.common.errors import ConfigError
+from visthrow.common.rotations import tilt_and_heading
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 
-FULL = 60000  # most of 65535 that the firmware takes (MAX_THRUST)
-MODES = ("flightmode.stabModeRoll", "flightmode.stabModePitch")  # parameters that are 0 for rates
+FACTS = values("crazyflie")
+MODES = tuple(name for name in FACTS if "." in name)  # parameters that are set before it is armed
 
-ASK, KEEP_ALIVE, SET_AGAIN = 0.1, 0.02, 0.2
-"""Between two questions for its state, two set-points before it is flown, two tries of a parameter
-[s].
-"""
+ASK, SET_AGAIN = 0.1, 0.2  # between two questions for its state, two requests to arm [s]
+SHORTEST = 0.02  # that a change of the yaw rate is spread over, at least [s]: a period
 
-BLOCKS = {crtp.TUMBLED: "tumbled", crtp.LOCKED: "locked: restart it"}
+BLOCKS = {
+    FACTS["tumbled"]: "tumbled",
+    FACTS["locked"]: "locked: restart it",
+    FACTS["crashed"]: "crashed: recover or restart it",
+    FACTS["deck_fault"]: "a deck reports a fault",
+}
 
 
 @dataclass(frozen=True)
@@ -66,25 +73,53 @@ class Crazyflie(OnPort):
 
     name, protocol = "crazyflie", "CRTP"
 
-    def __init__(self, port: Port, params: CrazyflieParams) -> None:
+    def __init__(
+        self, port: Port, params: CrazyflieParams, tell: Callable[[str], None] | None = None
+    ) -> None:
+        """Speak CRTP on an open port; ``tell`` is handed the table of settings."""
         super().__init__(port, params.silence)
         self.params = params
         self.release_record = Release(params.release_timeout)
         self.poses = 0
-        self._state = 0
-        self._told: dict[str, bool] = dict.fromkeys(MODES, False)  # whether its answer came
-        self._asked = self._sent = self._set = -1e9
+        self.audit = Audit(self._rules(), self._ask, None, tell)
+        self._state, self._speaks = 0, False
+        self._place: tuple[tuple[float, ...], float] | None = None  # position [m], heading [deg]
+        self._yaw = 0.0, -1e9  # rate of yaw that was wanted last [rad/s], when [s]
+        self._asked = self._armed_at = -1e9
+
+    def _rules(self) -> list[Rule]:
+        why = {name: fact.means for name, fact in facts(self.name).items()}
+        oldest = FACTS["protocol_state"]
+        return [
+            Rule(
+                "protocol",
+                f"{oldest} or newer",
+                "firmware of 2026.04: an older one stops its motors at a manual set-point, or"
+                " tells no state",
+                lambda v: v >= oldest,
+            ),
+            *(equal(name, FACTS[name], why[name], False) for name in MODES),
+            equal(self.params.release_parameter, 0.0, "the mechanism, closed", False),
+        ]
+
+    def _ask(self, name: str) -> None:
+        """Ask for the version, or set a parameter: its answer says that it is so."""
+        if name == "protocol":
+            self._put(crtp.ask_protocol())
+        else:
+            self._put(crtp.set_parameter(name, FACTS.get(name, 0)))
 
     def _hint(self) -> str:
         return "it is being armed" if self._taken and not self._raised else ""
 
     def _known(self) -> tuple[str, str]:
-        if not all(self._told.values()):
-            return "its set-points are being set to rates", WAIT
+        if not self.audit.done:
+            flies = self._state & FACTS["flying"]
+            return "it flies: land it first" if flies else "its settings are being set", WAIT
         blocked = [text for bit, text in BLOCKS.items() if self._state & bit]
         if blocked:
             return ", ".join(blocked), WAIT
-        armed = bool(self._state & crtp.ARMED)
+        armed = bool(self._state & FACTS["armed"])
         if armed and self._taken:
             self._raised = True
             return "", FOLLOW
@@ -94,17 +129,36 @@ class Crazyflie(OnPort):
         """Hand a pose of the vehicle to its estimator, as it was taken; for `Runner.watcher`."""
         pose = track.sample()[0]
         if body == VEHICLE and self.params.external_pose and pose.quat is not None:
+            self._place = pose.pos, math.degrees(tilt_and_heading(pose.quat)[1])
             self.poses += self._put(crtp.external_pose(pose.pos, pose.quat))
 
     def send(self, command: tuple[float, ...], now: float) -> bool:
         thrust, *rates = command
-        armed = bool(self._state & crtp.ARMED) and self._taken
-        share = self.params.thrust.share(thrust) if armed else 0.0
+        if not (self._state & FACTS["armed"] and self._taken):
+            thrust, rates = 0.0, [0.0, 0.0, 0.0]
+        share = self.params.thrust.share(thrust)
+        rates[2] = self._moved_yaw(rates[2], now)
         x, y, z = (math.degrees(rate) for rate in rates)
-        self._sent = now
-        return self._put(
-            crtp.set_point(round(FULL * share), (x, y, z) if armed else (0.0, 0.0, 0.0))
-        )
+        return self._put(crtp.manual(round(FACTS["manual_thrust"] * share), (x, y, z)))
+
+    def _moved_yaw(self, rate: float, now: float) -> float:
+        """Return the yaw rate to send for one that is wanted [rad/s].
+
+        A yaw rate moves the yaw that is held, and the error of that makes the vehicle turn: in a
+        steady turn it is ``(1 + D) / P`` of the rate. A change of the wanted rate brings its part
+        of the error within one period.
+        """
+        last, when = self._yaw
+        self._yaw = rate, now
+        error = (1.0 + FACTS["yaw_d"]) / FACTS["yaw_p"] * (rate - last)
+        return rate + error / max(now - when, SHORTEST)
+
+    def hand_back(self, now: float) -> None:
+        """Let it hold the place of its last pose by its own controller; without poses fall silent:
+        its supervisor acts.
+        """
+        if self._place is not None:
+            self._put(crtp.position(*self._place))
 
     def rearm(self) -> None:
         """Forget the last release; the mechanism closes, so that the next payload can
@@ -119,41 +173,47 @@ class Crazyflie(OnPort):
                 self._hear(packet, now)
         if now - self._asked >= ASK:
             self._asked = now
-            self._put(crtp.Packet(crtp.SUPERVISOR, crtp.INFO, bytes([crtp.STATE])).pack())
-        if now - self._set >= SET_AGAIN:
-            self._set = now
-            for name, told in self._told.items():
-                if not told:
-                    self._put(crtp.set_parameter(name, 0))
-            ready = self._taken and not self._over and all(self._told.values())
-            if ready and not self._state & crtp.ARMED and not self._raised:
-                self._put(crtp.arm(True))
+            self._put(crtp.ask_state())
+            if not self._speaks:
+                self._put(crtp.ask_protocol())
+        if self._speaks and not self._state & FACTS["flying"]:  # nothing is set in flight
+            self.audit.service(now)
+        ready = self._taken and not self._over and self.audit.done and not self.audit.problems
+        armed = self._raised or bool(self._state & FACTS["armed"])
+        if ready and not armed and now - self._armed_at >= SET_AGAIN:
+            self._armed_at = now
+            self._put(crtp.arm(True))
         if self.release_record.due(now):
             self._put(crtp.set_parameter(self.params.release_parameter, 1))
-        if now - self._sent >= KEEP_ALIVE and not self._raised and not self._over:
-            self.send((0.0, 0.0, 0.0, 0.0), now)  # without thrust: unlocks it
 
     def finish(self, now: float) -> None:
         """Stop the motors."""
         self._over = True
-        self._put(crtp.set_point(0, (0.0, 0.0, 0.0)))
+        self._put(crtp.manual(0, (0.0, 0.0, 0.0)))
         self._put(crtp.arm(False))
 
     def _hear(self, packet: crtp.Packet, now: float) -> None:
-        if (packet.port, packet.channel) == (crtp.SUPERVISOR, crtp.INFO) and packet.data[
-            :1
-        ] == bytes([crtp.STATE | crtp.ANSWER]):
-            self._heard, self._state = now, int.from_bytes(packet.data[1:5], "little")
-        elif (packet.port, packet.channel) == (crtp.PARAM, crtp.BY_NAME) and packet.data[
-            :1
-        ] == bytes([crtp.SET_BY_NAME]):
-            known, refused = packet.data[1:-1], packet.data[-1] != 0
-            for mode in MODES:
-                self._told[mode] |= known == crtp.named(mode) and not refused
-            if known == crtp.named(self.params.release_parameter) and self.release_record.state in (
-                PENDING,
-                ACCEPTED,
-            ):
-                self.release_record.answer(
-                    not refused, "the parameter is not known to the firmware"
-                )
+        place, data = (packet.port, packet.channel), packet.data
+        self._speaks = True
+        state, version = FACTS["ask_state"] | FACTS["answer"], FACTS["ask_protocol"]
+        if len(data) < 3:
+            return
+        if (*place, data[0]) == (FACTS["port_supervisor"], FACTS["channel_info"], state):
+            self._heard, self._state = now, int.from_bytes(data[1:5], "little")
+        elif (*place, data[0]) == (FACTS["port_platform"], FACTS["channel_version"], version):
+            self.audit.feed("protocol", int.from_bytes(data[1:5], "little"))
+        elif place == (FACTS["port_param"], FACTS["channel_by_name"]):
+            self._hear_set(data[1:-1], data[-1])
+
+    def _hear_set(self, name: bytes, error: int) -> None:
+        """Take the answer to a parameter that was set."""
+        release = self.params.release_parameter
+        for rule in self.audit.rules:
+            if name == crtp.named(rule):
+                if error == 0:
+                    self.audit.feed(rule, float(FACTS.get(rule, 0)))
+                else:
+                    missing = error == FACTS["no_entry"]
+                    self.audit.refuse(rule, NO_SUCH_PARAMETER if missing else error)
+        if name == crtp.named(release) and self.release_record.state in (PENDING, ACCEPTED):
+            self.release_record.answer(error == 0, "the parameter is not known to the firmware")

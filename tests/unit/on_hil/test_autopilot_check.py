@@ -12,7 +12,7 @@ from hil.control.states import OperatorInput
 from hil.errors import RunError
 from hil.flight import autopilot_record
 from hil.links.backends.base import DryRun
-from hil.links.backends.crazyflie import Crazyflie
+from hil.links.backends.betaflight import Betaflight
 from hil.links.backends.thrust import LEAST_SHARES
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
@@ -92,8 +92,10 @@ def test_the_summary_keeps_what_the_autopilot_said(run):
 
 
 def test_an_autopilot_without_settings_to_audit_is_listened_to(capsys):
-    params = config.load(HilParams, config.find("hil", "fake_crazyflie"))
-    check = AutopilotCheck(params, Crazyflie(pipe()[0], params.crazyflie))
+    params = config.load(
+        HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]
+    )
+    check = AutopilotCheck(params, Betaflight(pipe()[0], params.betaflight))
     runner = Runner(params, Policy.load(find_policy("state")), DryRun())
     check.tick(0.0, runner)
     assert check.results(0.0, runner.mass) == [
