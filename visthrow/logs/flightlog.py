@@ -50,6 +50,7 @@ STANDARD_CHANNELS = {
     "keypoints_valid": ChannelSpec("bool", "none", (None,), "which of them the camera sees"),
     "goal_w": ChannelSpec("m", "world", (3,), "target of the throw"),
     "attached": ChannelSpec("bool", "none", (), "whether the payload still hangs on the vehicle"),
+    "flying": ChannelSpec("bool", "none", (), "whether it is armed and in the air"),
     "mode": ChannelSpec("1", "none", (), "who commands: 0 hover controller, 1 policy"),
     "separation": ChannelSpec(
         "m", "world", (3,), "payload's centre as the rope let go; one sample at that time"

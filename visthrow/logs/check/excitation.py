@@ -68,7 +68,9 @@ def look(log: FlightLog) -> list[Row]:
     figures = excitation(log)
     rows = [Row("excited", "", "ok", _words(figures), figures)]
     if figures.get("still"):
-        text = "the vehicle never left its place: nothing about its flight can be answered"
+        why = "the autopilot was never armed and in the air"
+        why = why if "grounded" in figures else "the vehicle never left its place"
+        text = f"{why}: nothing about its flight can be answered"
         rows.append(Row("excited", "", "bad", text, {"still": 1}))
     elif figures.get("idle"):
         text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
@@ -146,6 +148,11 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
     _, time, pos = found
     above, period = pos[:, 2] - np.percentile(pos[:, 2], 1), np.median(np.diff(time))
     up = above > 0.15 * np.max(above) if np.max(above) > 0.3 else np.ones(len(above), bool)
+    if "flying" in log and len(log["flying"].time):
+        up &= log["flying"].hold(time)
+        if not np.any(log["flying"].values):
+            figures["grounded"] = figures["still"] = 1.0
+            return np.inf, -np.inf
     figures["seconds_flown"] = float(np.sum(up) * period)
     figures["height_range_m"] = float(np.ptp(pos[:, 2]))
     figures["seconds_low"] = float(np.sum(up & (pos[:, 2] < 0.3)) * period)

@@ -11,6 +11,7 @@ import numpy as np
 from visthrow.logs.check import excitation, physics, relations, signals, thrust
 from visthrow.logs.check.rows import NOTHING, Known, Row, Verdict, worst
 from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.readers.vehicles import Vehicle
 
 _ALIKE = 0.2  # logs that share a larger part of their samples are copies of one another
 _ONE_PAYLOAD = 0.005  # two logs whose payloads' paths agree to this [m] hold one payload
@@ -44,7 +45,7 @@ def check(logs: Sequence[FlightLog], known: Known = NOTHING) -> list[Checked]:
     return [Checked(label(log, i), of) for i, (log, of) in enumerate(zip(logs, rows))]
 
 
-CONTRADICT = ("frames", "units", "delay", "thrust", "excited")
+CONTRADICT = ("vehicle", "frames", "units", "delay", "thrust", "excited")
 """Topics in which a bad finding keeps a log from naming causes: the channels are not of one flight
 and clock.
 """
@@ -95,6 +96,10 @@ def _look(log: FlightLog, known: Known) -> list[Row]:
         if np.sum(channel.valid) >= signals.FEW_SAMPLES
     }
     usable = FlightLog(full, log.meta)
+    kind = str(log.meta.get("vehicle", ""))
+    if kind and not Vehicle(kind).rotors_alone:
+        text = f"of a {kind}: only its channels are looked at; expected a vehicle of rotors"
+        return [*rows, Row("vehicle", "", "bad", text)]
     return rows + physics.look(usable, known) + thrust.look(usable, known) + excitation.look(usable)
 
 
@@ -119,6 +124,18 @@ def _reader(log: FlightLog) -> list[Row]:
         rows.append(Row("gaps", "", "warn", "ends without its end marker: cut short", {}))
     if log.meta.get("damaged"):
         rows.append(Row("gaps", "", "warn", "damaged stretches in the file", {}))
+    rows += [Row("gaps", "", "warn", f"left out: {part}") for part in log.meta.get("left_out", ())]
+    for name in log.channels:
+        notes = signals.notes_of(log, name)
+        if flagged := notes.get("invalid by the source"):
+            text = (
+                f"{100 * flagged / len(log[name].time):.0f} % of the samples are not valid by the"
+                f" autopilot's own word ({notes['flagged']})"
+            )
+            rows.append(Row("values", name, "warn", text, {"flagged": flagged}))
+        if resets := notes.get("resets"):
+            text = f"the estimate was reset {resets} times: it jumps there"
+            rows.append(Row("values", name, "warn", text, {"resets": resets}))
     return rows
 
 

@@ -36,6 +36,7 @@ _RAILED = (
 _SWITCHES = (
     "release_command",
     "attached",
+    "flying",
     "mode",
 )  # channels that rest on one of few values by their nature
 _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")

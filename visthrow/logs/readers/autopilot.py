@@ -6,99 +6,180 @@ All of them are north-east-down and forward-right-down; ours become x north, y w
 forward, left, up."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.readers.messages import Messages, read_dataflash, read_telemetry, read_ulog
+from visthrow.logs.readers.messages import (
+    Fields,
+    Messages,
+    read_dataflash,
+    read_telemetry,
+    read_ulog,
+)
 from visthrow.logs.readers.table import make_channel
+from visthrow.logs.readers.vehicles import Vehicle, vehicle_of
 
 NED = "x,-y,-z"  # our axes in the autopilot's, world and body alike
+WIDEST_EPH = 5.0  # PX4's COM_POS_FS_EPH: a position worse than this is none [m]
+Range = tuple[str, float, float]
+"""A field, and the least and largest value with which a sample is valid."""
+
+
+@dataclass(frozen=True)
+class Tap:
+    """Fields of one kind of message that make a channel."""
+
+    message: str
+    # its columns may hold {0} to {3}, motors front left, front right, rear left, rear right, from 0
+    entry: ChannelMap
+    good: tuple[Range, ...] = ()  # a sample is valid where all of these fields that it has are so
+    only: tuple[Range, ...] = ()  # rows of other values are of another kind
 
 
 def _t(
-    message: str, fields: str, channel: str, unit: str, kind: str = "vector", **more
-) -> tuple[str, ChannelMap]:
-    """Fields of one kind of message that make a channel; of those to one channel the first that is
-    there is used.
+    message: str,
+    fields: str,
+    channel: str,
+    unit: str,
+    kind: str = "vector",
+    good: str = "",
+    only: tuple[Range, ...] = (),
+    axes: str = NED,
+    **more,
+) -> Tap:
+    """A tap; of those to one channel the first that is there is used. ``good``: flags that are 1
+    where a sample is valid, or quality, which is 0 or more.
     """
     columns, turned = tuple(fields.split()), kind != "vector"
-    axes = NED if turned or len(columns) == 3 else ""
     order = "wxyz" if kind == "quaternion" else "xyzw"
-    return message, ChannelMap(
-        channel, columns, unit, kind, order, axes=axes, body_axes=NED if turned else "", **more
+    conditions = tuple(RANGES.get(flag, (flag, 1.0, math.inf)) for flag in good.split())
+    entry = ChannelMap(
+        channel,
+        columns,
+        unit,
+        kind,  # type: ignore[arg-type]
+        order,
+        axes=axes if turned or len(columns) == 3 else "",
+        body_axes=NED if turned else "",
+        **more,
+    )
+    return Tap(message, entry, conditions, only)
+
+
+RANGES = {
+    "quality": ("quality", 0.0, math.inf),  # -1: the tracker has failed
+    "Q": ("Q", 0.0, math.inf),
+    "Ign": ("Ign", 0.0, 0.0),
+    "eph": ("eph", 0.0, WIDEST_EPH),
+}
+"""Flags that are no plain flags."""
+FOUR = "{0} {1} {2} {3}"
+
+
+def _motors(pattern: str) -> str:
+    """Columns of four motors, of a pattern with an asterisk where the motor's number stands."""
+    return " ".join(pattern.replace("*", place) for place in FOUR.split())
+
+
+def _vector(name: str, count: int = 3) -> str:
+    return " ".join(f"{name}[{i}]" for i in range(count))
+
+
+def _odometry(message: str, prefix: str) -> tuple[Tap, ...]:
+    """Position and attitude of PX4's VehicleOdometry, of today and before 1.14."""
+    world = {"frame": "world", "good": "quality"}
+    return (
+        _t(message, _vector("position"), f"{prefix}pos_w", "m", **world),
+        _t(message, "x y z", f"{prefix}pos_w", "m", **world),
+        _t(message, _vector("q", 4), f"{prefix}quat_wb", "1", "quaternion", **world),
     )
 
 
 ULOG = (
-    _t("vehicle_local_position", "x y z", "pos_w", "m"),
-    _t("vehicle_local_position", "vx vy vz", "vel_w", "m/s"),
-    _t("vehicle_attitude", "q[0] q[1] q[2] q[3]", "quat_wb", "1", kind="quaternion"),
-    _t("vehicle_angular_velocity", "xyz[0] xyz[1] xyz[2]", "rate_b", "rad/s"),
-    _t("sensor_combined", "gyro_rad[0] gyro_rad[1] gyro_rad[2]", "rate_b", "rad/s"),
+    _t("vehicle_local_position", "x y z", "pos_w", "m", good="xy_valid z_valid eph"),
+    _t("vehicle_local_position", "vx vy vz", "vel_w", "m/s", good="v_xy_valid v_z_valid"),
+    _t("vehicle_attitude", _vector("q", 4), "quat_wb", "1", "quaternion"),
+    _t("vehicle_angular_velocity", _vector("xyz"), "rate_b", "rad/s"),
+    _t("sensor_combined", _vector("gyro_rad"), "rate_b", "rad/s"),
+    _t("sensor_combined", _vector("accelerometer_m_s2"), "acc_b", "m/s^2", frame="body"),
+    *_odometry("vehicle_mocap_odometry", "mocap_"),
+    *_odometry("vehicle_visual_odometry", "mocap_"),
+    *_odometry("vehicle_odometry", "est_"),
+    _t("vehicle_local_position_groundtruth", "x y z", "truth_pos_w", "m", frame="world"),
+    _t("vehicle_local_position_groundtruth", "vx vy vz", "truth_vel_w", "m/s", frame="world"),
     _t(
-        "sensor_combined",
-        "accelerometer_m_s2[0] accelerometer_m_s2[1] accelerometer_m_s2[2]",
-        "acc_b",
-        "m/s^2",
-        frame="body",
-    ),
-    _t(
-        "vehicle_visual_odometry",
-        "position[0] position[1] position[2]",
-        "mocap_pos_w",
-        "m",
-        frame="world",
-    ),
-    _t(
-        "vehicle_visual_odometry",
-        "q[0] q[1] q[2] q[3]",
-        "mocap_quat_wb",
+        "vehicle_attitude_groundtruth",
+        _vector("q", 4),
+        "truth_quat_wb",
         "1",
-        kind="quaternion",
+        "quaternion",
         frame="world",
     ),
     _t("vehicle_rates_setpoint", "roll pitch yaw", "rate_setpoint_b", "rad/s", frame="body"),
     _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", scale=-1.0),
     _t("battery_status", "voltage_v", "battery_voltage", "V"),
     _t("battery_status", "current_a", "current", "A"),
-    _t("actuator_motors", "control[2] control[0] control[1] control[3]", "motor_command", "1"),
-    _t("actuator_outputs", "output[2] output[0] output[1] output[3]", "motor_output", "1"),
+    _t("actuator_motors", _motors("control[*]"), "motor_command", "1"),
+    _t("actuator_outputs", _motors("output[*]"), "motor_output", "1"),
+    _t("esc_status", _motors("esc[*].esc_rpm"), "motor_speed", "rpm"),
 )
-"""PX4's quad X: motors front right, rear left, front left, rear right."""
 
 DATAFLASH = (
-    _t("XKF1", "PN PE PD", "pos_w", "m"),
-    _t("NKF1", "PN PE PD", "pos_w", "m"),
-    _t("XKF1", "VN VE VD", "vel_w", "m/s"),
-    _t("NKF1", "VN VE VD", "vel_w", "m/s"),
-    _t("ATT", "Roll Pitch Yaw", "quat_wb", "deg", kind="euler"),
+    *(
+        tap
+        for core in ("XKF1", "NKF1", "EKF1")
+        for tap in (
+            _t(core, "PN PE PD", "pos_w", "m"),
+            _t(core, "VN VE VD", "vel_w", "m/s"),
+        )
+    ),
+    _t("ATT", "Roll Pitch Yaw", "quat_wb", "deg", "euler"),
     _t("IMU", "GyrX GyrY GyrZ", "rate_b", "rad/s"),
     _t("IMU", "AccX AccY AccZ", "acc_b", "m/s^2", frame="body"),
-    _t("VISP", "PX PY PZ", "mocap_pos_w", "m", frame="world"),
+    _t("VISP", "PX PY PZ", "mocap_pos_w", "m", frame="world", good="Ign Q"),
+    _t("VISP", "R P Y", "mocap_quat_wb", "deg", "euler", frame="world", good="Ign Q"),
+    _t("VISP", "Roll Pitch Yaw", "mocap_quat_wb", "deg", "euler", frame="world", good="Ign Q"),
+    _t("SIM2", "PN PE PD", "truth_pos_w", "m", frame="world"),
+    _t("SIM2", "VN VE VD", "truth_vel_w", "m/s", frame="world"),
+    _t("SIM", "Q1 Q2 Q3 Q4", "truth_quat_wb", "1", "quaternion", frame="world"),
     _t("RATE", "RDes PDes YDes", "rate_setpoint_b", "deg/s", frame="body"),
     _t("BAT", "Volt", "battery_voltage", "V"),
     _t("BAT", "Curr", "current", "A"),
-    _t("RCOU", "C3 C1 C2 C4", "motor_output", "1"),
+    _t("RCOU", _motors("C+*"), "motor_output", "1"),
+    _t("RCOU", _motors("Ch+*"), "motor_output", "1"),
+    _t("RCOU", _motors("Chan+*"), "motor_output", "1"),
+    _t("ESC", _motors("RPM[*]"), "motor_speed", "rpm"),
     _t("CTUN", "ThO", "throttle", "1"),
 )
-"""ArduPilot's quad X: motors front right, rear left, front left, rear right."""
 
+LOCAL = ("frame_id", 1.0, 1.0)  # MAV_FRAME_LOCAL_NED
+FRD, FLU = ("frame_id", 20.0, 20.0), ("frame_id", 21.0, 21.0)  # about a yaw of the sender's
+MOCAP = ("frame_id", 14.0, 14.0)  # MAV_FRAME_MOCAP_NED of before 2019
 TELEMETRY = (
     _t("LOCAL_POSITION_NED", "x y z", "pos_w", "m"),
     _t("LOCAL_POSITION_NED", "vx vy vz", "vel_w", "m/s"),
-    _t("ATTITUDE_QUATERNION", "q1 q2 q3 q4", "quat_wb", "1", kind="quaternion"),
-    _t("ATTITUDE", "roll pitch yaw", "quat_wb", "rad", kind="euler"),
+    *(
+        tap
+        for where, axes in ((LOCAL, NED), (FRD, NED), (MOCAP, NED), (FLU, "x,y,z"))
+        for tap in (
+            _t("ODOMETRY", "x y z", "pos_w", "m", good="quality", only=(where,), axes=axes),
+            _t("ODOMETRY", _vector("q", 4), "quat_wb", "1", "quaternion", only=(where,), axes=axes),
+        )
+    ),
+    _t("ATTITUDE_QUATERNION", "q1 q2 q3 q4", "quat_wb", "1", "quaternion"),
+    _t("ATTITUDE", "roll pitch yaw", "quat_wb", "rad", "euler"),
     _t("ATTITUDE", "rollspeed pitchspeed yawspeed", "rate_b", "rad/s"),
     _t("HIGHRES_IMU", "xacc yacc zacc", "acc_b", "m/s^2", frame="body"),
     _t("SCALED_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
     _t("RAW_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
     _t("VISION_POSITION_ESTIMATE", "x y z", "mocap_pos_w", "m", frame="world"),
     _t("ATT_POS_MOCAP", "x y z", "mocap_pos_w", "m", frame="world"),
+    _t("ATT_POS_MOCAP", _vector("q", 4), "mocap_quat_wb", "1", "quaternion", frame="world"),
     _t(
         "ATTITUDE_TARGET",
         "body_roll_rate body_pitch_rate body_yaw_rate",
@@ -108,8 +189,30 @@ TELEMETRY = (
     ),
     _t("ATTITUDE_TARGET", "thrust", "throttle", "1"),
     _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV"),
-    _t("SERVO_OUTPUT_RAW", "servo3_raw servo1_raw servo2_raw servo4_raw", "motor_output", "1"),
+    _t("SERVO_OUTPUT_RAW", _motors("servo+*_raw"), "motor_output", "1"),
+    _t("ESC_TELEMETRY_1_TO_4", _motors("rpm[*]"), "motor_speed", "rpm"),
+    _t("ESC_STATUS", _motors("rpm[*]"), "motor_speed", "rpm"),
 )
+
+FLYING: dict[str, tuple[tuple[str, str, float, float], ...]] = {
+    "ulog": (("vehicle_status", "arming_state", 2, 2), ("vehicle_land_detected", "landed", 0, 0)),
+    "dataflash": (("ARM", "ArmState", 1, 1), ("STAT", "isFlying", 1, 1)),
+    "telemetry": (
+        ("HEARTBEAT", "base_mode", 128, 255),
+        ("EXTENDED_SYS_STATE", "landed_state", 2, 4),
+    ),
+}
+"""Kind of log -> messages and fields that say whether it is armed and in the air: the least and the
+largest value that does.
+"""
+MOTORS_ALONE = ("actuator_motors", "esc_status", "ESC")
+"""Messages of motors that hold no other outputs, such as those of a gimbal."""
+RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "z", "vxy", "vz")) + (
+    "reset_counter",
+    "Rst",
+    "RstCnt",
+)
+"""Fields that count jumps of an estimate to another origin."""
 
 SWEEP, SWEEP_AXES = ("SIDS", "SIDD"), 7
 """Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it
@@ -130,35 +233,136 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
     Raises LogError: it cannot be read, or holds nothing of a vehicle's motion.
     """
     reader, taps = READERS[Path(path).suffix.lower()]
-    found = reader(path, {message for message, _ in taps} | set(SWEEP))
-    channels, notes = {}, {}
-    for message, entry in taps:
-        fields = found.first(message)
-        if (
-            fields is None
-            or entry.name in channels
-            or not all(column in fields for column in entry.columns)
-        ):
-            continue
-        with np.errstate(invalid="ignore"):  # damaged floats
-            values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
-        channels[entry.name], noted = make_channel(
-            np.asarray(fields["time"], float), values, entry, str(path)
-        )
-        notes[entry.name] = noted | {"clock": "autopilot", "message": message}
+    known = {tap.message for tap in taps}
+    asked = {message for states in FLYING.values() for message, *_ in states}
+    found = reader(path, known | asked | set(SWEEP))
+    vehicle = vehicle_of(found)
+    _join_escs(found)
+    channels: dict[str, Channel] = {}
+    notes: dict[str, dict] = {}
+    left_out = list(found.meta.pop("left_out", []))
+    for tap in taps:
+        if tap.entry.name not in channels:
+            made = _channel(tap, found, vehicle, str(path), left_out)
+            if made is not None:
+                channels[tap.entry.name], notes[tap.entry.name] = made
     _add_sweep(channels, notes, found)
+    if not channels:
+        raise LogError(
+            f"{path}: no message of a vehicle's motion in it; known: {', '.join(sorted(known))}"
+        )
+    if (flying := _flying(found)) is not None:
+        channels["flying"] = flying
     starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
-    if not starts:
-        known = ", ".join(sorted({message for message, _ in taps}))
-        raise LogError(f"{path}: no message of a vehicle's motion in it; known: {known}")
-    start = min(starts)  # time counts from the first sample
-    if not math.isfinite(start):
+    if not starts or not math.isfinite(min(starts)):
         raise LogError(f"{path}: stamps are not finite")
+    start = min(starts)  # time counts from the first sample
     channels = {
         name: replace(channel, time=channel.time - start) for name, channel in channels.items()
     }
     meta = {"source": str(path), "start": start, "kind": found.kind, "ingest": notes, **found.meta}
+    meta |= {"vehicle": vehicle.kind, "left_out": list(dict.fromkeys(left_out))}
     return FlightLog(channels, meta)
+
+
+def _channel(
+    tap: Tap, found: Messages, vehicle: Vehicle, source: str, left_out: list[str]
+) -> tuple[Channel, dict] | None:
+    """Channel of a tap and notes on it; None where the log has none of its fields."""
+    columns = tap.entry.columns
+    if "{0}" in "".join(columns):
+        if not vehicle.motors:
+            if found.first(tap.message) is not None:
+                left_out.append(
+                    f"{tap.message}: of a {vehicle.kind}, whose motors are not those of a"
+                    " quadrotor X"
+                )
+            return None
+        numbers = vehicle.outputs if "+" in columns[0] else vehicle.motors
+        first = 1 if "+" in columns[0] else 0
+        columns = tuple(
+            column.replace("+", "").format(*(n + first for n in numbers)) for column in columns
+        )
+    chosen = _moving(found.instances(tap.message), columns, tap)
+    if chosen is None:
+        return None
+    number, fields = chosen
+    if tap.message in MOTORS_ALONE:
+        count = _moving_motors(fields, tap.entry.columns[0])
+        if count > len(columns):
+            left_out.append(f"{tap.message}: {count} motors move, not the four of a quadrotor")
+            return None
+    entry = replace(tap.entry, columns=columns)
+    with np.errstate(invalid="ignore"):  # damaged floats
+        values = np.column_stack([fields[column] for column in columns]).astype(float)
+    bad = ~_within(fields, tap.good)
+    channel, notes = make_channel(np.asarray(fields["time"], float), values, entry, source, bad)
+    notes |= {"clock": "autopilot", "message": tap.message, "instance": number}
+    if np.any(bad):
+        notes["flagged"] = ", ".join(of[0] for of in tap.good if of[0] in fields)
+    resets = [int(np.sum(np.diff(fields[name]) != 0)) for name in RESETS if name in fields]
+    if sum(resets):
+        notes["resets"] = sum(resets)
+    return channel, notes
+
+
+def _within(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
+    """Whether each row has all of these fields, as far as it has them, in their range."""
+    good = np.ones(len(fields["time"]), bool)
+    for name, least, largest in ranges:
+        if name in fields:
+            value = np.asarray(fields[name], float)
+            good &= (value >= least) & (value <= largest)
+    return good
+
+
+def _moving(
+    instances: dict[int, Fields], columns: tuple[str, ...], tap: Tap
+) -> tuple[int, Fields] | None:
+    """Of the instances of a message with these columns the first that moves, else the first."""
+    found = []
+    for number, fields in instances.items():
+        if all(column in fields for column in columns):
+            rows = _within(fields, tap.only)
+            if np.any(rows):
+                found.append((number, {name: values[rows] for name, values in fields.items()}))
+    moving = [of for of in found if any(np.ptp(np.nan_to_num(of[1][c])) > 0.0 for c in columns)]
+    return next(iter([*moving, *found]), None)
+
+
+def _moving_motors(fields: Fields, pattern: str) -> int:
+    """How many of the motors of a message, named by a pattern such as ``control[{0}]``, move."""
+    names = [pattern.format(number) for number in range(16)]
+    return sum(np.ptp(np.nan_to_num(fields[name])) > 0.0 for name in names if name in fields)
+
+
+def _join_escs(found: Messages) -> None:
+    """Speeds of ArduPilot's ESC messages, one an instance, on the stamps of the first, in place."""
+    escs = {i: of for i, of in found.instances("ESC").items() if "RPM" in of}
+    if not escs:
+        return
+    time = next(iter(escs.values()))["time"]
+    speeds = {f"RPM[{i}]": np.interp(time, of["time"], of["RPM"]) for i, of in escs.items()}
+    found.fields["ESC", min(escs)] = {"time": time, **speeds}
+
+
+def _flying(found: Messages) -> Channel | None:
+    """Whether the vehicle is armed and in the air; None where the log does not say."""
+    signals = []
+    for message, field, least, largest in FLYING[found.kind]:
+        fields = found.first(message)
+        if fields is not None and field in fields:
+            order = np.argsort(fields["time"], kind="stable")
+            signals.append(
+                (fields["time"][order], _within(fields, ((field, least, largest),))[order])
+            )
+    if not signals:
+        return None
+    time = np.unique(np.concatenate([time for time, _ in signals]))
+    flying = np.ones(len(time), bool)
+    for at, good in signals:
+        flying &= good[np.maximum(np.searchsorted(at, time, side="right") - 1, 0)]
+    return Channel(time, flying, "bool", "none")
 
 
 def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:

@@ -10,6 +10,7 @@ Source: PX4 ULog file format; ArduPilot, AP_Logger/LogStructure.h; MAVLink's .tl
 microseconds before each message)."""
 
 import io
+import math
 import os
 import struct
 import tempfile
@@ -37,7 +38,7 @@ MOST_RETURNS = 8
 _HEAD = (  # of every DataFlash message; whatever begins otherwise would be searched byte by byte
     b"\xa3\x95"
 )
-_INSTANCE = ("I", "C")  # fields of DataFlash that number sensors and estimator cores
+_INSTANCE = ("I", "C", "Instance")  # fields of DataFlash that number sensors and estimator cores
 _STDERR = 2
 
 
@@ -49,11 +50,19 @@ class Messages:
     kind: str  # ulog, dataflash, telemetry
     fields: dict[tuple[str, int], Fields] = field(default_factory=dict)  # by message and instance
     meta: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, float] = field(default_factory=dict)  # of the autopilot
 
     def first(self, name: str) -> Fields | None:
         """Return the message of the lowest instance; None where there is none."""
-        numbers = sorted(instance for known, instance in self.fields if known == name)
-        return self.fields[name, numbers[0]] if numbers else None
+        return next(iter(self.instances(name).values()), None)
+
+    def instances(self, name: str) -> dict[int, Fields]:
+        """Return the message of each instance, the lowest first."""
+        return {
+            number: self.fields[known, number]
+            for known, number in sorted(self.fields)
+            if known == name
+        }
 
     @property
     def names(self) -> list[str]:
@@ -78,6 +87,7 @@ def read_ulog(path: str | Path, wanted: Collection[str]) -> Messages:
             found.fields[data.name, data.multi_id] = {**data.data, "time": time, "arrival": arrival}
     drops = [(drop.timestamp * 1e-6, drop.duration * 1e-3) for drop in log.dropouts]
     found.meta = {"dropouts": drops, "damaged": bool(log.file_corruption)}
+    found.parameters = {str(name): float(x) for name, x in log.initial_parameters.items()}
     return found
 
 
@@ -88,25 +98,30 @@ def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
     """
     from pymavlink.DFReader import DFReader_binary
 
-    columns = _Columns()
+    columns, firmware, nan = _Columns(), "", math.nan
     with _parsing(path, "an ArduPilot dataflash log (.BIN)") as complaints:
         with Path(path).open("rb") as file:
             head = file.read(2)
         if head != _HEAD:
             raise LogError(f"it begins with {head.hex(' ') or 'nothing'}, not a3 95")
         log = DFReader_binary(str(path))
-        known = {fmt.name for fmt in log.formats.values()} & set(wanted)
+        known = {fmt.name for fmt in log.formats.values()} & {*wanted, "MSG"}
         while known and (message := _next(log, list(known), columns)) is not None:
             row = message.to_dict()
             instance = next((row[name] for name in _INSTANCE if isinstance(row.get(name), int)), 0)
-            if "TimeUS" in row:
-                measured = row["CTimeMS"] * 1e-3 if "CTimeMS" in row else row["TimeUS"] * 1e-6
+            text = str(row.get("Message", ""))
+            if "ArduPilot" in text or text.startswith(("Ardu", "Rover", "Blimp")):
+                firmware = firmware or text
+            written = row["TimeUS"] * 1e-6 if "TimeUS" in row else row.get("TimeMS", nan) * 1e-3
+            if written == written:
+                measured = row["CTimeMS"] * 1e-3 if "CTimeMS" in row else written
                 columns.add(
-                    (message.get_type(), instance),
-                    row | {"time": measured, "arrival": row["TimeUS"] * 1e-6},
+                    (message.get_type(), instance), row | {"time": measured, "arrival": written}
                 )
+        parameters = {name: float(x) for name, x in log.params.items()}
         log.close()
-    return Messages(Path(path), "dataflash", columns.arrays(), {"damaged": bool(complaints)})
+    meta = {"damaged": bool(complaints), "firmware": firmware}
+    return Messages(Path(path), "dataflash", columns.arrays(), meta, parameters)
 
 
 def _next(log: Any, wanted: list[str], columns: "_Columns") -> Any:
@@ -120,26 +135,54 @@ def _next(log: Any, wanted: list[str], columns: "_Columns") -> Any:
 
 
 def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
-    """Read messages of a ``.tlog``, of the first sender of each; the time is the sender's stamp
-    where there is one.
+    """Read messages of a ``.tlog``, of the first sender of each, on one clock.
+
+    The time is the sender's stamp. Senders count from their boot or from 1970, and some messages
+    have no stamp: each message's stamps are moved onto the clock of those that count from boot, by
+    the least delay with which they arrived.
 
     Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
     columns, sender, used = _Columns(), {}, 0
+    others: Counter[str] = Counter()
     for arrival, message in telemetry(path):
         name = message.get_type()
         used += 8 + len(message.get_msgbuf())
+        if name not in wanted:
+            continue
         whose = (message.get_srcSystem(), message.get_srcComponent())
-        if name in wanted and sender.setdefault(name, whose) == whose:
-            row = message.to_dict()
-            boot, usec = row.get("time_boot_ms"), row.get("time_usec")
-            measured = (
-                boot * 1e-3 if boot is not None else usec * 1e-6 if usec is not None else arrival
-            )
-            columns.add((name, 0), row | {"time": measured, "arrival": arrival})
-    return Messages(
-        Path(path), "telemetry", columns.arrays(), {"damaged": used < Path(path).stat().st_size}
-    )
+        if sender.setdefault(name, whose) != whose:
+            others[f"{name} of system {whose[0]}, component {whose[1]}"] += 1
+            continue
+        row = message.to_dict()
+        boot = row.get("time_boot_ms")
+        usec = row.get("time_usec", row.get("usec"))
+        measured = boot * 1e-3 if boot is not None else usec * 1e-6 if usec else arrival
+        columns.add((name, 0), row | {"time": measured, "arrival": arrival})
+    fields = columns.arrays()
+    _share_clock(fields)
+    meta = {"damaged": used < Path(path).stat().st_size}
+    meta["left_out"] = [f"{count} {what}: of another sender" for what, count in others.items()]
+    return Messages(Path(path), "telemetry", fields, meta)
+
+
+OTHER_CLOCK = 1.0
+"""Difference of delays beyond which stamps are of another clock, and not late [s]."""
+
+
+def _share_clock(fields: dict[tuple[str, int], Fields]) -> None:
+    """Move stamps of messages onto one clock, in place: that of those that count from boot."""
+    delays = {key: float(np.min(of["arrival"] - of["time"])) for key, of in fields.items()}
+    booted = [delays[key] for key, of in fields.items() if "time_boot_ms" in of]
+    stamped = [
+        delay
+        for key, delay in delays.items()
+        if np.any(fields[key]["arrival"] != fields[key]["time"])
+    ]
+    reference = float(np.median(booted or stamped or [0.0]))
+    for key, of in fields.items():
+        if abs(delays[key] - reference) > OTHER_CLOCK:
+            of["time"] = of["time"] + delays[key] - reference
 
 
 def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:

@@ -256,18 +256,23 @@ def _log(
 
 
 def make_channel(
-    time: np.ndarray, values: np.ndarray, entry: ChannelMap, source: str
+    time: np.ndarray,
+    values: np.ndarray,
+    entry: ChannelMap,
+    source: str,
+    bad: np.ndarray | None = None,
 ) -> tuple[Channel, dict]:
     """Turn columns into a channel of ours.
 
     Rows without a stamp, of a stamp that was there before, or of an earlier one are left out and
-    counted: a clock must go on.
+    counted: a clock must go on. Where a single stamp is ahead of all that follow, that row is.
 
     Args:
         time: Stamps [s], shape (T,); NaN where there is none.
         values: The columns, shape (T, C).
         entry: Their mapping.
         source: What messages call the table.
+        bad: Rows that the source itself calls not valid, shape (T,); None: none.
 
     Returns:
         The channel, and how many rows were left out for which reason.
@@ -282,13 +287,16 @@ def make_channel(
         "repeated": int(np.sum(steps == 0.0)),
         "backwards": int(np.sum(steps < 0.0)),
     }
-    rows = rows[np.diff(np.maximum.accumulate(time[rows]), prepend=-np.inf) > 0.0]
+    rows = rows[_forward(time[rows])]
     blank = np.all(
         np.isnan(values[rows]), axis=1
     )  # a row of blanks is of another channel: no sample
     notes["blank"] = int(np.sum(blank))
     time, values = time[rows[~blank]], values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
+    if bad is not None:
+        valid &= ~bad[rows[~blank]]
+        notes["invalid by the source"] = int(np.sum(bad[rows[~blank]]))
     if entry.held and len(values):
         fresh = np.ones(len(values), dtype=bool)
         same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
@@ -311,6 +319,16 @@ def make_channel(
         return Channel(time, values, unit, frame, valid), notes
     except LogError as error:
         raise LogError(f"{source}: channel '{entry.name}': {error}") from error
+
+
+def _forward(time: np.ndarray) -> np.ndarray:
+    """Rows that leave a clock going on, bool, shape (T,): those later than all before, or those
+    earlier than all that follow, whichever are more.
+    """
+    later = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
+    follow = np.minimum.accumulate(time[::-1])[::-1]
+    earlier = np.append(time[:-1] < follow[1:], True) if len(time) else later
+    return earlier if np.sum(earlier) > np.sum(later) else later
 
 
 def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray:
