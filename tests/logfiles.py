@@ -16,6 +16,9 @@ DATAFLASH = {
     "B": "B",
     "b": "b",
     "h": "h",
+    "H": "H",
+    "N": "16s",
+    "Z": "64s",
 }
 SCALED = {"c": 100, "C": 100, "e": 100, "L": 10_000_000}
 FMT = 128
@@ -55,13 +58,22 @@ def _fmt(kind: int, name: str, kinds: str, columns: str, size: int) -> bytes:
 
 
 ULOG = {"uint64_t": "Q", "uint8_t": "B", "float": "f", "double": "d", "int8_t": "b"}
+ULOG |= {"int32_t": "i"}
 
 
-def write_ulg(path: Path, topics: dict[tuple[str, int], tuple[list[str], list[tuple]]]) -> None:
+def write_ulg(
+    path: Path,
+    topics: dict[tuple[str, int], tuple[list[str], list[tuple]]],
+    parameters: dict[str, float] | None = None,
+) -> None:
     """A ULog: topic and instance -> its fields ("float[3] position") and its rows, flat, the time
-    stamp first [us].
+    stamp first [us]; and the autopilot's parameters.
     """
     out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)]
+    for name, value in (parameters or {}).items():
+        key = f"{'int32_t' if isinstance(value, int) else 'float'} {name}".encode()
+        packed = struct.pack("<i" if isinstance(value, int) else "<f", value)
+        out.append(_message("P", bytes((len(key),)) + key + packed))
     names = {name: fields for (name, _), (fields, _) in topics.items()}
     for name, fields in names.items():
         out.append(_message("F", f"{name}:{''.join(field + ';' for field in fields)}".encode()))

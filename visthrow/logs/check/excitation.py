@@ -152,6 +152,7 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
         up &= log["flying"].hold(time)
         if not np.any(log["flying"].values):
             figures["grounded"] = figures["still"] = 1.0
+            figures["seconds_flown"] = 0.0
             return np.inf, -np.inf
     figures["seconds_flown"] = float(np.sum(up) * period)
     figures["height_range_m"] = float(np.ptp(pos[:, 2]))

@@ -246,6 +246,7 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
             made = _channel(tap, found, vehicle, str(path), left_out)
             if made is not None:
                 channels[tap.entry.name], notes[tap.entry.name] = made
+    left_out += _of_other_kinds(found, taps)
     _add_sweep(channels, notes, found)
     if not channels:
         raise LogError(
@@ -328,6 +329,20 @@ def _moving(
                 found.append((number, {name: values[rows] for name, values in fields.items()}))
     moving = [of for of in found if any(np.ptp(np.nan_to_num(of[1][c])) > 0.0 for c in columns)]
     return next(iter([*moving, *found]), None)
+
+
+def _of_other_kinds(found: Messages, taps: tuple[Tap, ...]) -> list[str]:
+    """Messages of which every row is of a kind that no tap takes."""
+    said = []
+    for message in dict.fromkeys(tap.message for tap in taps if tap.only):
+        ranges = {tap.only[0] for tap in taps if tap.message == message}
+        fields = found.first(message)
+        if fields is not None and not any(np.any(_within(fields, (of,))) for of in ranges):
+            name = next(iter(ranges))[0]
+            came = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
+            known = ", ".join(f"{least:g}" for _, least, _ in sorted(ranges))
+            said.append(f"{message}: its {name} is {came}; those that are read: {known}")
+    return said
 
 
 def _moving_motors(fields: Fields, pattern: str) -> int:

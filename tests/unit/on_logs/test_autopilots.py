@@ -1,0 +1,327 @@
+"""What an autopilot's log says of itself: validity, vehicle, motors, speeds, clocks, damage."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+from tests import logfiles
+from visthrow.logs import read
+from visthrow.logs.check.run import check, contradictions
+from visthrow.logs.flightlog import FlightLog
+
+LOCAL = ["uint64_t timestamp", *(f"float {x}" for x in ["x", "y", "z", "vx", "vy", "vz", "eph"])]
+LOCAL += [f"uint8_t {name}" for name in ["xy_valid", "z_valid", "v_xy_valid", "v_z_valid"]]
+LOCAL += ["uint8_t xy_reset_counter"]
+ROTOR_PLACES = {0: (1, 1), 1: (-1, -1), 2: (1, -1), 3: (-1, 1)}  # forward, right: PX4's X
+
+
+def swing(i):
+    return math.sin(0.1 * i)
+
+
+def ulog(path, *, flags=(1, 1, 1, 1), eph=0.3, resets=0, topics=None, parameters=None, count=300):
+    """A flight of 15 s along x, with flags of the estimate from the middle on."""
+    local, attitude = [], []
+    for i in range(count):
+        t, late = 1_000_000 + 50_000 * i, i >= count // 2
+        good = flags if late else (1, 1, 1, 1)
+        place = (swing(i), 0.0, -1.5, 2.0 * math.cos(0.1 * i), 0.0, 0.0)
+        local.append((t, *place, eph if late else 0.3, *good, resets if late else 0))
+        attitude.append((t, 1.0, 0.01 * swing(i), 0.0, 0.0))
+    found = {
+        ("vehicle_local_position", 0): (LOCAL, local),
+        ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"], attitude),
+    }
+    logfiles.write_ulg(path, found | (topics or {}), parameters)
+    return path
+
+
+def outputs(name, field, size, moving, count=300, first=0.5):
+    """A topic of so many outputs of which some move."""
+    rows = []
+    for i in range(count):
+        values = [first + 0.1 * swing(i + k) if k in moving else 0.0 for k in range(size)]
+        rows.append((1_000_000 + 50_000 * i, *values))
+    return ["uint64_t timestamp", f"float[{size}] {field}"], rows
+
+
+@pytest.mark.parametrize(
+    ("change", "channel", "word"),
+    [
+        ({"flags": (0, 1, 0, 1)}, "pos_w", "xy_valid"),
+        ({"flags": (1, 0, 1, 1)}, "pos_w", "z_valid"),
+        ({"flags": (1, 1, 1, 0)}, "vel_w", "v_z_valid"),
+        ({"eph": 40.0}, "pos_w", "eph"),
+    ],
+)
+def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, tmp_path):
+    log = read(ulog(tmp_path / "a.ulg", **change))[0]
+    valid = log[channel].valid
+    assert np.all(valid[:150])
+    assert not np.any(valid[150:])
+    rows = [row.text for row in check([log])[0].rows if row.channel == channel]
+    assert any("50 % of the samples are not valid by the autopilot's own word" in t for t in rows)
+    assert any(word in text for text in rows)
+
+
+def test_a_reset_of_the_estimate_is_told(tmp_path):
+    rows = check(read(ulog(tmp_path / "a.ulg", resets=1)))[0].rows
+    assert any("reset 1 times" in row.text for row in rows if row.channel == "pos_w")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "kind"),
+    [
+        ({"CA_ROTOR_COUNT": 6}, "hexarotor"),
+        ({"MAV_TYPE": 13}, "hexarotor"),
+        ({"SYS_AUTOSTART": 6001}, "hexarotor"),
+        ({"SYS_AUTOSTART": 8001}, "octorotor"),
+        ({"MAV_TYPE": 1}, "plane"),
+        ({"SYS_AUTOSTART": 2100}, "plane"),
+        ({"MAV_TYPE": 20}, "VTOL"),
+        ({"CA_AIRFRAME": 2}, "VTOL"),
+        ({"SYS_AUTOSTART": 50000}, "rover"),
+        ({"SYS_AUTOSTART": 5001}, "quadrotor that is no X"),
+    ],
+)
+def test_motors_of_another_vehicle_are_left_out_by_its_name(parameters, kind, tmp_path):
+    motors = {("actuator_motors", 0): outputs("", "control", 12, range(6))}
+    log = read(ulog(tmp_path / "a.ulg", topics=motors, parameters=parameters))[0]
+    assert log.meta["vehicle"] == kind
+    assert "motor_command" not in log
+    checked = check([log])[0]
+    assert any(f"of a {kind}" in row.text for row in checked.rows)
+    assert not [row for row in checked.rows if "motor" in row.channel]
+    if kind in ("plane", "VTOL", "rover"):
+        assert not [row for row in checked.rows if row.topic in ("answers", "thrust", "delay")]
+        assert any(kind in text for text in contradictions([checked]))
+
+
+def test_six_motors_that_move_are_no_quadrotor_even_where_no_parameter_says_so(tmp_path):
+    motors = {("actuator_motors", 0): outputs("", "control", 12, range(6))}
+    log = read(ulog(tmp_path / "a.ulg", topics=motors))[0]
+    assert "motor_command" not in log
+    assert log.meta["left_out"] == ["actuator_motors: 6 motors move, not the four of a quadrotor"]
+
+
+@pytest.mark.parametrize("shift", [0, 1, 3])
+def test_motors_are_ordered_by_where_they_sit(shift, tmp_path):
+    parameters: dict[str, float] = {"CA_ROTOR_COUNT": 4, "MAV_TYPE": 2}
+    for i in range(4):
+        ahead, right = ROTOR_PLACES[(i + shift) % 4]
+        parameters |= {f"CA_ROTOR{i}_PX": 0.2 * ahead, f"CA_ROTOR{i}_PY": 0.3 * right}
+    rows = [(1_000_000 + 50_000 * i, *(k + 0.1 * swing(i) for k in range(4))) for i in range(300)]
+    topic = {("actuator_motors", 0): (["uint64_t timestamp", "float[4] control"], rows)}
+    log = read(ulog(tmp_path / "a.ulg", topics=topic, parameters=parameters))[0]
+    expected = [(motor - shift) % 4 for motor in (2, 0, 1, 3)]  # FL FR RL RR
+    assert np.round(log["motor_command"].values[0]).tolist() == expected
+
+
+def test_the_instance_that_moves_is_taken(tmp_path):
+    topics = {
+        ("actuator_outputs", 0): outputs("", "output", 16, (), first=0.0),
+        ("actuator_outputs", 1): outputs("", "output", 16, range(4), first=1500.0),
+    }
+    log = read(ulog(tmp_path / "a.ulg", topics=topics))[0]
+    assert log["motor_output"].values.min() > 1400.0
+    assert log.meta["ingest"]["motor_output"]["instance"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arming", "landed", "flown"), [(2, 0, True), (1, 0, False), (2, 1, False), (1, 1, False)]
+)
+def test_a_vehicle_on_the_desk_has_not_flown(arming, landed, flown, tmp_path):
+    times = [1_000_000 + 500_000 * i for i in range(30)]
+    topics = {
+        ("vehicle_status", 0): (
+            ["uint64_t timestamp", "uint8_t arming_state"],
+            [(t, arming) for t in times],
+        ),
+        ("vehicle_land_detected", 0): (
+            ["uint64_t timestamp", "uint8_t landed"],
+            [(t, landed) for t in times],
+        ),
+    }
+    log = read(ulog(tmp_path / "a.ulg", topics=topics))[0]
+    assert bool(np.all(log["flying"].values)) == flown
+    words = " ".join(row.text for row in check([log])[0].rows)
+    assert ("never armed and in the air" in words) != flown
+    assert ("0 s flown" in words) != flown
+
+
+def test_rotor_speeds_of_three_autopilots_are_read(tmp_path):
+    fields = ["uint64_t timestamp", *(f"int32_t esc[{i}].esc_rpm" for i in range(4))]
+    rows = [(1_000_000 + 50_000 * i, *(6000 + 100 * k for k in range(4))) for i in range(300)]
+    log = read(ulog(tmp_path / "a.ulg", topics={("esc_status", 0): (fields, rows)}))[0]
+    assert log["motor_speed"].values[0] * 30 / np.pi == pytest.approx([6200, 6000, 6100, 6300])
+
+    path = tmp_path / "b.BIN"
+    formats = {"ATT": logfiles.ATT, "ESC": ("QBff", "TimeUS,Instance,RPM,Volt")}
+    messages = []
+    for i in range(100):
+        t = 1_000_000 + 20_000 * i
+        messages.append(("ATT", (t, 0, 1.0, 0, 0.0, 0, 0.0)))
+        messages += [("ESC", (t + k, k, 6000.0 + 100 * k, 15.0)) for k in range(4)]
+    logfiles.write_bin(path, formats, messages)
+    assert read(path)[0]["motor_speed"].values[0] * 30 / np.pi == pytest.approx(
+        [6200, 6000, 6100, 6300]
+    )
+
+    path = tmp_path / "c.tlog"
+    write_tlog(
+        path,
+        lambda mav, i: [
+            mav.esc_telemetry_1_to_4_encode(
+                [40] * 4, [1500] * 4, [100] * 4, [0] * 4, [6000, 6100, 6200, 6300], [i] * 4
+            )
+        ],
+    )
+    assert read(path)[0]["motor_speed"].values[0] * 30 / np.pi == pytest.approx(
+        [6200, 6000, 6100, 6300]
+    )
+
+
+def write_tlog(path, more, count=200):
+    """A .tlog of a vehicle that booted 100 s before; ``more`` makes messages of encoder and row."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    mav, out = dialect.MAVLink(None, 1, 1), []
+    for i in range(count):
+        s = 0.02 * i
+        messages = [
+            mav.heartbeat_encode(2, 3, 128, 0, 4),
+            mav.local_position_ned_encode(
+                int(1e3 * (100.0 + s)), swing(i), 0.0, -1.5, 5.0 * math.cos(0.1 * i), 0.0, 0.0
+            ),
+            *more(mav, i),
+        ]
+        stamp = struct.pack(">Q", int((1.7e9 + s) * 1e6))
+        out += [stamp + bytes(message.pack(mav)) for message in messages]
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def test_messages_without_a_stamp_or_with_another_clock_share_the_clock_of_the_file(tmp_path):
+    def more(mav, i):
+        boot, epoch = int((100.0 + 0.02 * i) * 1e6), int((1.7e9 + 0.02 * i - 0.005) * 1e6)
+        return [
+            mav.sys_status_encode(0, 0, 0, 0, 15000 + i, 0, 0, 0, 0, 0, 0, 0, 0),
+            mav.vision_position_estimate_encode(boot, swing(i), 0.0, -1.5, 0.0, 0.0, 0.0),
+            mav.att_pos_mocap_encode(epoch, [1, 0, 0, 0], swing(i), 0.0, -1.5),
+            mav.highres_imu_encode(boot, 0, 0, -9.8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0),
+        ]
+
+    log = read(write_tlog(tmp_path / "a.tlog", more))[0]
+    for name in ("battery_voltage", "mocap_pos_w", "mocap_quat_wb", "acc_b"):
+        assert log[name].time[0] == pytest.approx(0.0, abs=0.02), name
+    assert "never overlap" not in str(check([log])[0].rows)
+
+
+@pytest.mark.parametrize(
+    ("frame", "turned"), [(1, True), (14, True), (20, True), (21, False), (8, None)]
+)
+def test_odometry_is_read_in_the_frame_that_it_names(frame, turned, tmp_path):
+    nan = [math.nan] * 21
+
+    def more(mav, i):
+        quality = -1 if i >= 100 else 50
+        return [
+            mav.odometry_encode(
+                int((100.0 + 0.02 * i) * 1e6), frame, 12, swing(i), 0.3 * swing(i), -1.5,
+                [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, nan, nan, 0, 0, quality,
+            )
+        ]  # fmt: skip
+
+    path = tmp_path / "a.tlog"
+    write_tlog(path, more)
+    data = path.read_bytes()
+    assert data
+    log = read(path)[0]
+    odometry = [r for r in log.meta["ingest"].values() if r.get("message") == "ODOMETRY"]
+    assert bool(odometry) == (turned is not None)
+    if turned is None:
+        assert any("ODOMETRY" in part for part in log.meta["left_out"])
+
+
+def test_one_stamp_that_is_ahead_of_all_others_costs_its_row_alone(tmp_path):
+    rows = [("ATT", (1_000_000 + 20_000 * i, 0, swing(i), 0, 0.0, 0, 0.0)) for i in range(200)]
+    rows[100] = ("ATT", (4_000_000_000_000_000_000, 0, 1.0, 0, 0.0, 0, 0.0))
+    path = tmp_path / "a.BIN"
+    logfiles.write_bin(path, {"ATT": logfiles.ATT}, rows)
+    log = read(path)[0]
+    assert len(log["quat_wb"].time) == 199
+    assert log["quat_wb"].time[-1] == pytest.approx(3.98)
+
+
+def test_ardupilots_older_logs_count_in_milliseconds(tmp_path):
+    formats = {
+        "ATT": ("Icccccc", "TimeMS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+        "EKF1": ("IccCfffffff", "TimeMS,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD,GX"),
+    }
+    rows = []
+    for i in range(200):
+        rows.append(("ATT", (1000 + 20 * i, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0)))
+        rows.append(("EKF1", (1000 + 20 * i, 0.0, 0.0, 0.0, 1.0, 0, 0, swing(i), 0.0, -2.0, 0)))
+    path = tmp_path / "a.BIN"
+    logfiles.write_bin(path, formats, rows)
+    log = read(path)[0]
+    assert log["pos_w"].time[-1] == pytest.approx(3.98)
+    assert log["pos_w"].values[0, 2] == pytest.approx(2.0)
+    assert log["quat_wb"].values[0, 0] == pytest.approx(math.sin(math.radians(5.0)), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "firmware", "kind"),
+    [
+        ({"FRAME_CLASS": 2.0}, "ArduCopter V4.5.1", "hexarotor"),
+        ({}, "ArduPlane V4.5.1", "plane"),
+        ({"Q_ENABLE": 1.0}, "ArduPlane V4.5.1", "VTOL"),
+        ({"FRAME_CLASS": 1.0, "FRAME_TYPE": 0.0}, "ArduCopter V4.5.1", "quadrotor that is no X"),
+        ({"FRAME_CLASS": 1.0, "FRAME_TYPE": 12.0}, "ArduCopter V4.5.1", "quadrotor"),
+        (
+            {"FRAME_CLASS": 1.0, "FRAME_TYPE": 1.0, "SERVO9_FUNCTION": 33.0, "SERVO1_FUNCTION": 0},
+            "ArduCopter V4.5.1",
+            "quadrotor",
+        ),
+    ],
+)
+def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware, kind, tmp_path):
+    names = ",".join(f"C{i}" for i in range(1, 15))
+    formats = {
+        "PARM": ("QNf", "TimeUS,Name,Value"),
+        "MSG": ("QZ", "TimeUS,Message"),
+        "ATT": logfiles.ATT,
+        "RCOU": ("Q" + "H" * 14, f"TimeUS,{names}"),
+    }
+    rows = [("MSG", (1000, firmware.encode()))]
+    rows += [("PARM", (1000, name.encode(), float(x))) for name, x in parameters.items()]
+    for i in range(100):
+        t = 1_000_000 + 20_000 * i
+        rows.append(("ATT", (t, 0, 1.0, 0, 0.0, 0, 0.0)))
+        rows.append(("RCOU", (t, *(1000 + 10 * n + i % 3 for n in range(1, 15)))))
+    path = tmp_path / "a.BIN"
+    logfiles.write_bin(path, formats, rows)
+    log = read(path)[0]
+    assert log.meta["vehicle"] == kind
+    if kind != "quadrotor":
+        assert "motor_output" not in log
+        return
+    order = [4, 2, 3, 1] if parameters["FRAME_TYPE"] == 12.0 else [3, 9, 2, 4]
+    assert log["motor_output"].values[0].tolist() == [1000 + 10 * n for n in order]
+
+
+def test_external_odometry_and_ground_truth_are_channels_of_their_own(tmp_path):
+    odometry = ["uint64_t timestamp", "float[3] position", "float[4] q", "int8_t quality"]
+    truth = ["uint64_t timestamp", "float x", "float y", "float z"]
+    times = [1_000_000 + 50_000 * i for i in range(300)]
+    rows = [(t, 1.0, 2.0, -1.0, 1.0, 0, 0, 0, -1 if i > 99 else 90) for i, t in enumerate(times)]
+    topics = {
+        ("vehicle_mocap_odometry", 0): (odometry, rows),
+        ("vehicle_local_position_groundtruth", 0): (truth, [(t, 1.0, 2.0, -3.0) for t in times]),
+    }
+    log: FlightLog = read(ulog(tmp_path / "a.ulg", topics=topics))[0]
+    assert log["mocap_pos_w"].values[0].tolist() == [1.0, -2.0, 1.0]
+    assert np.sum(log["mocap_pos_w"].valid) == 100
+    assert log["truth_pos_w"].values[0].tolist() == [1.0, -2.0, 3.0]
