@@ -1,0 +1,80 @@
+"""The programs under examples/ run, in small."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from camera.fisheye import Fisheye
+from camera.params import CameraParams
+from tests.unit.on_view import test_camera_command as drawn
+from visthrow import config
+
+ROOT = Path(__file__).resolve().parents[2]
+BALLS = ROOT / "tests" / "data" / "real" / "jugglebot_throws" / "session7.csv.gz"
+LONGEST = 60
+"""Lines of a program."""
+
+RUNS = {
+    "train_mine": ("--minutes 0.02 --environments 8 --out mine", "throws landed"),
+    "fly_mine": ("state --target 1.5", "landed 0."),
+    "compare_plants": ("state --throws 1 --plants hybrid", "hybrid     state"),
+    "project_poses": ("--seconds 0.1 --port 14777", ""),
+    "diagnose_csv": (f"{BALLS} --tracks 1", "tracks, 1 used"),
+    "add_effect": ("--size 0.02", "the ball moves by"),
+    "add_source": ("--seconds 0.5", "the policy's command is"),
+    "step_simulator": ("--count 2 --seconds 0.1", "the first ball at"),
+}
+"""Program -> its arguments, and what it prints."""
+
+
+def run(name: str, words: str, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *words.split()])
+    runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_an_example_runs(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words, text = RUNS[name]
+    run(name, words, monkeypatch)
+    assert text in capsys.readouterr().out
+
+
+def test_poses_are_projected_as_a_picture_shows_them(tmp_path, monkeypatch, capsys):
+    """Its source is replaced by one whose vehicle sees the whole square of its goal."""
+    program = runpy.run_path(str(ROOT / "examples" / "add_source.py"))
+    still = program["Still"]()
+    monkeypatch.setattr("hil.poses.sources.opening.open_source", lambda *_: (still, None, False))
+    run("project_poses", "--config ros2 --seconds 0.05", monkeypatch)
+    assert "[True, True, True, True" in capsys.readouterr().out
+
+
+def test_a_camera_is_calibrated(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    board = drawn.BOARDS["chessboard"]
+    lens = Fisheye(drawn.LENS)
+    for i, picture in enumerate(drawn.pictures(board, lens)):
+        cv2.imwrite(f"{i}.png", picture)
+    words = (
+        f"{' '.join(map(str, sorted(tmp_path.glob('*.png'))))} --columns 7 --rows 5 --square 0.04"
+    )
+    run("calibrate_camera", words, monkeypatch)
+    made = config.load(CameraParams, tmp_path / "my_camera.toml").fisheye
+    assert made.fx == pytest.approx(drawn.LENS.fx, rel=0.01)
+
+
+def test_a_flight_is_exported(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run("fly_mine", "state --target 1.5", monkeypatch)
+    run("export_flight", "flight.npz --to flight.csv", monkeypatch)
+    assert "payload_pos_w" in (tmp_path / "flight.csv").read_text().splitlines()[0]
+
+
+def test_every_example_is_short_and_run():
+    programs = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
+    assert set(programs) == {*RUNS, "calibrate_camera", "export_flight"}
+    for path in programs.values():
+        assert len(path.read_text().splitlines()) <= LONGEST, path.name
