@@ -2,10 +2,13 @@
 beside it.
 
 A pilot holds it until stick frames come; then the override switch goes on (or, with all channels by
-MSP, the arming channel takes it). With the override the pilot's own sticks count again after 0.3 s
-of silence; with all channels by MSP 0.36 s idle the motors, 1.6 s disarm, and an arming channel
-that is high when the receiver comes back arms nothing before it was low. Pitch stick forward is
-nose down. Outputs of CHANNEL_FORWARDING are not in MSP_SERVO. It hears no poses."""
+MSP, the arming channel takes it). What silence does under the override follows the version: since
+2026.6 the pilot's own sticks count again, before that the last frame counts for ever. With all
+channels by MSP the motors idle, then it disarms, and an arming channel that is high when the
+receiver comes back arms nothing before it was low. Pitch stick forward is nose down. Outputs of
+CHANNEL_FORWARDING are not in MSP_SERVO. It hears no poses.
+
+Source: `hil.links.facts`, betaflight."""
 
 import struct
 from collections.abc import Callable
@@ -23,28 +26,24 @@ from hil.links.backends.betaflight import (
     SETTINGS,
     STICKS,
 )
-from hil.links.backends.rates import RATES_TYPES, RatesParams, Sticks
+from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
+from hil.links.facts import values
 from hil.rehearsal.fake import PortFake
 from tests.fakes.ports import ListeningPort
 
-IDLE_AFTER, DISARM_AFTER = (
-    0.36,
-    1.6,
-)  # silence after which the motors idle, and after which it disarms, with all channels by MSP [s]
-OVERRIDE_GONE = (
-    0.3  # silence after which the receiver's channels count again, under MSP OVERRIDE [s]
-)
-RECEIVER_LOST, LOW_FIRST, ARM_SWITCH = 1 << 2, 1 << 3, 1 << 29  # bits of the arming-disabled flags
+FACTS = values("betaflight")
+# silence after which the motors idle, with all channels by MSP [s]
+IDLE_AFTER = FACTS["receiver_hold"] + FACTS["receiver_recheck"]
+RECEIVER_LOST, LOW_FIRST = FACTS["block_receiver_lost"], FACTS["block_not_disarmed"]
+ARM_SWITCH, TILTED = FACTS["block_switch"], FACTS["block_angle"]
 REACTION = 0.5  # of the pilot, from the first stick frame to the override switch [s]
-BOXES = (
-    BOX_ARM,
-    1,
-    27,
-    BOX_OVERRIDE,
-)  # permanent ids in the order of the flags: arm, angle, failsafe, MSP override
-ORDER = (0, 1, 3, 2)  # rcmap AETR: where roll, pitch, yaw, throttle stand in a frame
-
-RELEASE_AUX, ARM_AUX, MINIMUM = 4, 1, 1050
+ANGLE, FAILSAFE = FACTS["box_angle"], FACTS["box_failsafe"]
+BOXES = (BOX_ARM, ANGLE, FAILSAFE, BOX_OVERRIDE)  # permanent ids in the order of the flags
+ORDER = tuple(FACTS["rcmap"])  # where roll, pitch, yaw, throttle stand in a frame
+MINIMUM = FACTS["min_check"]
+RELEASE_AUX, ARM_AUX, OVERRIDE_AUX = 4, 1, 3
+SWITCHED = 1700  # a switch above this is on [us]
+RANGE = (28, 48)  # steps of a switch's range, of 25 us from 900 us: 1600 to 2100 us
 
 SIZES = {
     msp.RC_TUNING: 24,
@@ -82,13 +81,14 @@ class FakeBetaflight(PortFake):
             "deadband": 0,
             "yaw_deadband": 0,
             "min_check": MINIMUM,
-            "mid_rc": 1500,
-            "failsafe_delay": 0.4,
+            "mid_rc": MIDDLE,
+            "failsafe_delay": FACTS["failsafe_delay"],
             "channel_forwarding": 0,
             **tuning,
             **self.options.parameters,
         }
         self._set_rates()
+        self.version = (2026, 6, 1)
         self.channels: list[int] = []
         self.override = False
         self._first: float | None = None
@@ -112,6 +112,7 @@ class FakeBetaflight(PortFake):
         answers: dict[int, Callable[[], bytes]] = {
             msp.API_VERSION: lambda: bytes([0, 1, 47]),
             msp.FC_VARIANT: lambda: b"BTFL",
+            msp.FC_VERSION: self._version,
             msp.STATUS: self._status,
             msp.RX_MAP: lambda: bytes([*ORDER, 4, 5, 6, 7]),
             msp.BOXIDS: lambda: bytes(BOXES),
@@ -144,6 +145,16 @@ class FakeBetaflight(PortFake):
         out = msp.pack(msp.Frame(frame.command, answer, direction))
         self.later(self.options.answer_delay, lambda: self.port.write(out))
 
+    def _version(self) -> bytes:
+        first, *rest = self.version
+        return bytes([first - FACTS["calendar_base"] if first > 2000 else first, *rest])
+
+    @property
+    def window(self) -> float:
+        """Silence after which the pilot's sticks count again under the override [s]."""
+        since = FACTS["calendar_base"] + FACTS["override_since"][0], FACTS["override_since"][1]
+        return FACTS["override_window"] if self.version[:2] >= since else np.inf
+
     def _settings(self, command: int) -> bytes:
         out = bytearray(SIZES[command])
         for name, told in SETTINGS.items():
@@ -156,7 +167,7 @@ class FakeBetaflight(PortFake):
     def _sticks_came(self, channels: list[int]) -> None:
         if len(channels) < STICKS:
             return
-        if any(not 885 <= c <= 2115 for c in channels):
+        if any(not FACTS["pulse_least"] <= c <= FACTS["pulse_most"] for c in channels):
             self.witness.command(self.plant.time, (float("nan"),) * 4)
             return
         roll, pitch, yaw, throttle = (channels[at] for at in ORDER)
@@ -165,10 +176,10 @@ class FakeBetaflight(PortFake):
         idle = throttle <= MINIMUM
         back = self.plant.time - self._heard > IDLE_AFTER
         self.channels, self._heard = channels, self.plant.time
-        self._low_first |= back and not self.armed and channels[STICKS + ARM_AUX - 1] > 1700
+        self._low_first |= back and not self.armed and channels[STICKS + ARM_AUX - 1] > SWITCHED
         self._first = self.plant.time if self._first is None else self._first
         if self.options.all_channels:
-            high = channels[STICKS + ARM_AUX - 1] > 1700
+            high = channels[STICKS + ARM_AUX - 1] > SWITCHED
             self._low_first &= high
             if high and not (self.armed or self._low_first) and idle and self.options.arming:
                 self.armed = self.override = True
@@ -177,16 +188,16 @@ class FakeBetaflight(PortFake):
         self.set_point((0.0 if idle else self.thrust_map.thrust(share), *rates), self.override)
         at = STICKS + RELEASE_AUX - 1
         opened = (
-            self.override and at < len(channels) and channels[at] > 1700
+            self.override and at < len(channels) and channels[at] > SWITCHED
         )  # while the channels are ours
         if self.output(opened, self.heard) and self.options.answer not in ("silent", "denied"):
             self.witness.answered()
 
     def _status(self) -> bytes:
         failsafe = self.plant.time - self._heard > IDLE_AFTER
-        on = {BOX_ARM: self.armed, BOX_OVERRIDE: self.override, 27: failsafe and self.armed}
+        on = {BOX_ARM: self.armed, BOX_OVERRIDE: self.override, FAILSAFE: failsafe and self.armed}
         flags = sum(1 << i for i, box in enumerate(BOXES) if on.get(box, False))
-        blocks = 0 if self.armed or self.options.arming else 1 << 8
+        blocks = 0 if self.armed or self.options.arming else TILTED
         if self.options.all_channels and not self.armed:
             blocks |= (
                 RECEIVER_LOST * (self.plant.time - self._heard > IDLE_AFTER)
@@ -196,7 +207,7 @@ class FakeBetaflight(PortFake):
 
     def _rc(self) -> bytes:
         throttle = round(MINIMUM + self.thrust_map.share(self.last_thrust) * (HIGH - MINIMUM))
-        channels = [1500, 1500, 1500, throttle, *([LOW] * 8)]  # the pilot's
+        channels = [MIDDLE, MIDDLE, MIDDLE, throttle, *([LOW] * 8)]  # the pilot's
         if self.override and self.channels:
             channels = [self.channels[at] for at in ORDER] + self.channels[STICKS:]
         if self.options.answer in (
@@ -207,12 +218,12 @@ class FakeBetaflight(PortFake):
         return struct.pack(f"<{len(channels)}H", *channels)
 
     def _servo(self) -> bytes:
-        shown = 1500 if self.parameters["channel_forwarding"] else HIGH if self.moved else LOW
-        return struct.pack("<8H", shown, *([1500] * 7))
+        shown = MIDDLE if self.parameters["channel_forwarding"] else HIGH if self.moved else LOW
+        return struct.pack("<8H", shown, *([MIDDLE] * 7))
 
     def _ranges(self) -> bytes:
-        arm = [BOX_ARM, ARM_AUX - 1, 28, 48]
-        switch = [] if self.options.all_channels else [BOX_OVERRIDE, 2, 28, 48]
+        arm = [BOX_ARM, ARM_AUX - 1, *RANGE]
+        switch = [] if self.options.all_channels else [BOX_OVERRIDE, OVERRIDE_AUX - 1, *RANGE]
         return bytes([*arm, *switch, 0, 0, 0, 0])
 
     def take(self) -> None:
@@ -237,14 +248,14 @@ class FakeBetaflight(PortFake):
             )
             return np.zeros(4) if gone else self.hold(self._place)
         if not self.options.all_channels:
-            if quiet <= OVERRIDE_GONE:
+            if quiet <= self.window:
                 self.stay()
                 return self._target
             self.happened("override: the pilot's sticks count again")
             return self.hold(self._place)
         if quiet > IDLE_AFTER:
             self.happened("failsafe: motors idle")
-        if quiet > DISARM_AFTER:
+        if quiet > self.parameters["failsafe_delay"] + FACTS["receiver_recheck"]:
             self.armed, self.override, self._disarmed = False, False, True
             self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target

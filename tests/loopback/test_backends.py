@@ -199,6 +199,41 @@ def test_betaflight_waits_for_the_pilots_switch_and_refuses_one_that_is_on_too_e
     assert not desk.status.connected
 
 
+def test_what_silence_does_under_the_override_follows_betaflights_version():
+    """Since 2026.6 the pilot's sticks count again; before, the last frame counts for ever, and the
+    audit says so before anything flies.
+    """
+    command, tables = (3.0, 1.0, 0.0, 0.0), []
+    for version, word, held in (((2026, 6, 1), "ok", False), ((4, 6, 0), "WARN", True)):
+        desk = Desk("betaflight", tell=tables.append)
+        desk.fake.version = version
+        desk.follow()
+        (row,) = [line for line in tables[-1].splitlines() if "fc_version" in line]
+        assert row.startswith(word)
+        assert "its last sticks count until the pilot switches MSP OVERRIDE off" in row
+        assert desk.status.fault is None
+        desk.turn(0.3, command)
+        desk.turn(2.0)
+        thrust, roll = desk.fake.plant.commands[-1][:2]
+        assert (roll == pytest.approx(1.0, abs=0.02)) == held
+        assert (thrust == pytest.approx(3.0, rel=0.01)) == held
+
+
+def test_betaflight_that_is_handed_back_is_level_with_the_pilots_throttle():
+    """Where the last sticks count for ever; where they expire the runner falls silent."""
+    for version, frames in (((4, 5, 2), True), ((2026, 6, 1), False)):
+        desk = Desk("betaflight")
+        desk.fake.version = version
+        desk.follow()
+        desk.turn(0.3, (5.0, 1.0, 0.0, 0.0))
+        came = desk.fake.witness.commands
+        for _ in range(50):
+            desk.turn(0.02)
+            desk.backend.hand_back(desk.now)
+        assert (desk.fake.witness.commands > came + 5) == frames
+        np.testing.assert_allclose(desk.fake.plant.commands[-1], HOVER, rtol=0.01, atol=0.05)
+
+
 def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_the_end():
     desk = Desk("betaflight", "betaflight.arm_channel=1", all_channels=True)
     desk.turn(0.5)

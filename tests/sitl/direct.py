@@ -95,6 +95,7 @@ def opened(
     plant: MotorPlant,
     mocap: MocapParams,
     seed: int,
+    bridge: type[BetaflightSitl] = BetaflightSitl,
 ) -> Iterator[tuple[Runner, Source, FlightClock, BetaflightSitl]]:
     """Runner, its source and clock, and the bridge, joined to a firmware that stands ready; all
     ended afterwards. See `throw`.
@@ -107,9 +108,7 @@ def opened(
         firmware.start()
         port = check_device(params.source.device or params.link.device).port
         link = Link(open_port(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
-        fake = BetaflightSitl(
-            plant, link, mocap, seed, Options(), params.betaflight, firmware.stands
-        )
+        fake = bridge(plant, link, mocap, seed, Options(), params.betaflight, firmware.stands)
         clock = FlightClock(fake)
         source, link, _ = open_source(params, folder / "run", clock)
         backend = make_backend(params, link, folder=folder / "run")

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from hil.links.backends.base import FOLLOW
-from hil.links.backends.betaflight import Betaflight
+from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight, version_text
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
@@ -29,6 +29,7 @@ from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, Options
 from hil.rehearsal.fake_mocap import MocapParams
 from tests.loopback import test_endings as endings
+from tests.sitl import override
 from tests.sitl.direct import opened, throw
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
@@ -295,6 +296,29 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
     ]
     assert (tmp_path / "first" / "run" / "throw-01.npz").exists()
     assert list((tmp_path / "first").glob("LOG*")), "the firmware wrote its blackbox"
+
+
+def test_a_pilot_hands_over_by_msp_override_and_a_throw_lands(tmp_path):
+    """A transmitter beside the runner, whose switch gives the sticks to the runner."""
+    found = override.fly(program(), tmp_path / "throw")
+    error = float(np.hypot(found["landing_w"][0] - 2.0, found["landing_w"][1]))
+    print(f"\nlanding error {error:.3f} m")
+    assert (found["releases"], found["release"]) == (1, "accepted")
+    assert error < MISS
+
+
+@pytest.mark.parametrize("state", endings.STATES)
+def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
+    """The runner killed in hover and in a throw: the last sticks expire, or count until the pilot
+    switches off, as the version's row of the table of facts says.
+    """
+    found = override.killed(program(), tmp_path, state)
+    told, expires = found["killed"], found["version"] >= EXPIRES - 1e-6
+    print(f"\n{version_text(found['version'])}, {state}: {told}")
+    assert (told["expired"] is not None) == expires
+    if expires:
+        assert told["expired"] == pytest.approx(FACTS["override_window"], abs=0.1)
+    assert told["back"] < 0.2, "the pilot's switch gives the sticks back"
 
 
 @pytest.mark.parametrize("state", endings.STATES)

@@ -26,6 +26,8 @@ class Rule:
         None  # what is written where the operator asked for it; None: nothing can be
     )
     optional: bool = False  # firmware without it is right as well
+    warns: bool = False  # a mismatch is told, and flown with
+    text: Callable[[float], str] = "{:g}".format  # a value in words
 
 
 def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
@@ -139,11 +141,14 @@ class Audit:
         ]
         if not missing or waited > GIVE_UP:
             self.done = True
-            found = {name: f" is {value:g}" for name, value in self.found.items()}
+            found = {
+                name: f" is {self.rules[name].text(value)}" for name, value in self.found.items()
+            }
             found |= {name: f": {why}" for name, why in self.refused.items() if name not in found}
             self.problems = [
                 f"{r.name}{found.get(r.name, ' was not told')}; expected {r.expected}"
                 for r in self._wrong()
+                if not r.warns
             ]
             if self._tell is not None:
                 self._tell(self.table())
@@ -165,7 +170,7 @@ class Audit:
         """Return what ends the run, in short; the table has it in full."""
         if not self.problems:
             return None
-        names = [rule.name for rule in self._wrong()]
+        names = [rule.name for rule in self._wrong() if not rule.warns]
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         return f"parameter audit: {', '.join(names[:MOST_NAMED])}{more} wrong, see the table"
 
@@ -174,18 +179,19 @@ class Audit:
         rows, wrong = [("", "parameter", "found", "expected", "why")], self._wrong()
         for name, rule in self.rules.items():
             shown = (
-                f"{self.found[name]:g}"
+                rule.text(self.found[name])
                 if name in self.found
                 else self.refused.get(name, "no answer")
             )
             shown += " (written)" if name in self.written else ""
-            rows.append(("WRONG" if rule in wrong else "ok", name, shown, rule.expected, rule.why))
+            judged = ("WARN" if rule.warns else "WRONG") if rule in wrong else "ok"
+            rows.append((judged, name, shown, rule.expected, rule.why))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         lines = [
             "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip()
             for row in rows
         ]
-        if wrong:
+        if self.problems:
             lines.append(
                 "The runner does not fly with these; set them, or let it write them with"
                 " --write-parameters."

@@ -3,17 +3,16 @@
 The flight controller has no hold of its own and hears no poses; the runner's hover controller flies
 before and after the throw. Two ways to be heard: MSP OVERRIDE (``arm_channel = 0``): a real
 receiver supplies all channels, and while the pilot holds a switch the four sticks and the release
-channel are ours; after 0.3 s of silence the pilot's own sticks count again. And RX_MSP
-(``arm_channel`` an AUX): all channels are ours, for benches and software only; after 0.36 s of
-silence the motors idle, disarming follows at 1.6 s.
+channel are ours. When the runner dies there, the last sticks count for ever, until the pilot
+switches off; since 2026.6 the receiver's channels count again soon. And RX_MSP (``arm_channel`` an
+AUX): all channels are ours, for benches and software only; silence idles the motors, then disarms.
 
 MSP_SERVO does not show what CHANNEL_FORWARDING puts out: then the release is read back from its
 channel alone. ARM that is raised while the receiver is in failsafe has to go low again before the
 firmware arms.
 
-Source: betaflight.com, Controlling Betaflight From a Companion Computer Over MSP;
-src/main/msp/msp.c (payloads), rx.c, rc.c, msp_box.c (permanent ids); src/main/fc/runtime_config.c
-(armingDisableFlagNames)."""
+Source: `hil.links.facts`, betaflight; betaflight.com, Controlling Betaflight From a Companion
+Computer Over MSP."""
 
 import struct
 from collections.abc import Callable
@@ -26,61 +25,33 @@ from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Rel
 from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.links.backends.thrust import ThrustParams
 from hil.links.device import Port, chunks
+from hil.links.facts import values
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
-BOX_ARM, BOX_OVERRIDE = 0, 50  # permanent ids of flight modes
-STICKS = 4  # channels before the first AUX
-LOW, HIGH = 1000, 2000  # ends of a channel [us]
-NEAR = 50  # a channel or output this near to its target has arrived [us]
-# between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
-KEEP_ALIVE = 0.02
-OPEN_TIME = (
-    2.0  # after which the mechanism closes again, so that the next payload can be hung on [s]
-)
-ARM_LOW = (
-    0.5  # for which nothing may speak against arming before ARM is raised, or raised again [s]
-)
-FORWARDING = 1 << 20  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
-
-BLOCKS = (
-    "no gyro",
-    "failsafe",
-    "receiver lost",
-    "the receiver is back: ARM must go low first",
-    "failsafe switch",
-    "runaway take-off",
-    "crash",
-    "throttle not low",
-    "tilted more than small_angle",
-    "just booted",
-    "prearm",
-    "processor load",
-    "calibrating",
-    "CLI is open",
-    "CMS menu",
-    "BST",
-    "MSP asked",
-    "paralyze",
-    "GPS rescue",
-    "rescue switch",
-    "RPM filter",
-    "reboot required",
-    "DSHOT bitbang",
-    "accelerometer not calibrated",
-    "motor protocol",
-    "crash flip",
-)
+FACTS = values("betaflight")
+BOX_ARM, BOX_OVERRIDE = FACTS["box_arm"], FACTS["box_override"]  # permanent ids of flight modes
+STICKS = FACTS["sticks"]  # channels before the first AUX
+LOW, HIGH = FACTS["low"], FACTS["high"]  # ends of a channel [us]
+FORWARDING = FACTS["forwarding"]  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
+BLOCKS = FACTS["blocks"]
 """Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM
 switch itself, which is raised while another one is set.
 """
 
-POLLS = {
-    msp.STATUS: 0.1,
-    msp.RC: 0.1,
-    msp.SERVO: 0.1,
-    msp.ANALOG: 1.0,
-}  # what is asked for all the time, and how often [s]
+EXPIRES = FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
+"""First version, as of :func:`version_text`, in which the sticks of MSP OVERRIDE expire."""
+
+NEAR = 50  # a channel or output this near to its target has arrived [us]
+# between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
+KEEP_ALIVE = 0.02
+# after which the mechanism closes again, so that the next payload can be hung on [s]
+OPEN_TIME = 2.0
+# for which nothing may speak against arming before ARM is raised, or raised again [s]
+ARM_LOW = 0.5
+
+# what is asked for all the time, and how often [s]
+POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}
 
 READ_BACK = 0.04
 """Between two questions for the release [s].
@@ -158,6 +129,7 @@ class Betaflight(OnPort):
             None  # since when nothing speaks against arming, with ARM low
         )
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
+        self._pilots_us = LOW  # throttle that the pilot flew with
         self._opened: float | None = None
         self.refused = 0
 
@@ -212,6 +184,7 @@ class Betaflight(OnPort):
                     lambda v: v > 0.0,
                 )
             )
+            rules.append(expiry())
         return rules
 
     def _hint(self) -> str:
@@ -336,6 +309,22 @@ class Betaflight(OnPort):
         ):
             self._frame(now)
 
+    @property
+    def _expires(self) -> bool:
+        """Whether the last sticks cease to count when nothing follows."""
+        return self.audit.found.get("fc_version", 0.0) >= EXPIRES - 1e-6
+
+    def hand_back(self, now: float) -> None:
+        """Give the vehicle to the pilot: fall silent where the receiver's channels then count
+        again; else hold level with the throttle that the pilot hovered with, until the switch.
+
+        With all channels by MSP silence leads to the failsafe.
+        """
+        if self.params.arm_channel or self._expires:
+            return
+        self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, self._pilots_us)
+        self._frame(now)
+
     def finish(self, now: float) -> None:
         """Disarm where the arming channel is ours."""
         self._over = True
@@ -389,6 +378,8 @@ class Betaflight(OnPort):
         p = self.params
         if len(channels) < STICKS:
             return
+        if not self._box(BOX_OVERRIDE):
+            self._pilots_us = channels[3]
         self.share = min(max((channels[3] - p.minimum_us) / (HIGH - p.minimum_us), 0.0), 1.0)
         at = STICKS + p.release_channel - 1
         if at < len(channels) and abs(channels[at] - HIGH) <= NEAR:
@@ -417,34 +408,33 @@ class Told:
 
 
 SETTINGS = {
-    "api_version": Told(msp.API_VERSION, 1),
-    "deadband": Told(msp.RC_DEADBAND, 0),
-    "yaw_deadband": Told(msp.RC_DEADBAND, 1),
-    "mid_rc": Told(msp.RX_CONFIG, 3, "<H"),
-    "min_check": Told(msp.RX_CONFIG, 5, "<H"),
-    "failsafe_delay": Told(msp.FAILSAFE_CONFIG, 0, "B", 0.1),
-    "channel_forwarding": Told(msp.FEATURE_CONFIG, 0, "<I"),
-    "arm_aux": Told(msp.MODE_RANGES, 0),
-    "override_aux": Told(msp.MODE_RANGES, 0),
-    **{
-        name: Told(msp.RC_TUNING, at)
-        for name, at in {
-            "roll_rc_rate": 0,
-            "roll_expo": 1,
-            "roll_rate": 2,
-            "pitch_rate": 3,
-            "yaw_rate": 4,
-            "throttle_expo": 7,
-            "yaw_expo": 10,
-            "yaw_rc_rate": 11,
-            "pitch_rc_rate": 12,
-            "pitch_expo": 13,
-            "throttle_limit_type": 14,
-            "rates_type": 22,
-        }.items()
-    },
+    name.removeprefix("tells_"): Told(FACTS[told[0]], *told[1:])
+    for name, told in FACTS.items()
+    if name.startswith("tells_")
 }
-"""Which answer tells which setting. Four hold more than a number: see :func:`settings`."""
+"""Which answer tells which setting. Some hold more than a number: see :func:`settings`."""
+
+
+def version_text(version: float) -> str:
+    """Return a version, 4.06 or 26.06, as people write it: 4.6, 2026.6."""
+    first = int(version)
+    base = FACTS["calendar_base"] if first >= FACTS["calendar"] else 0
+    return f"{base + first}.{round(100 * (version - first))}"
+
+
+def expiry() -> Rule:
+    """Return the rule of what becomes of the last sticks when the runner dies under MSP OVERRIDE,
+    which warns alone.
+    """
+    return Rule(
+        "fc_version",
+        f"{version_text(EXPIRES)} or newer",
+        f"there the pilot's sticks count {FACTS['override_window']:g} s after the runner dies;"
+        " before, its last sticks count until the pilot switches MSP OVERRIDE off",
+        lambda v: v >= EXPIRES - 1e-6,
+        warns=True,
+        text=version_text,
+    )
 
 
 def blocked(flags: int) -> str:
@@ -461,9 +451,9 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
         for name, told in mine.items()
         if (n := frame.number(told.code, told.at)) is not None
     }
-    if "api_version" in found:
-        minor = frame.number("B", 2)
-        found = {} if minor is None else {"api_version": found["api_version"] + 0.01 * minor}
+    for name in {"api_version", "fc_version"} & found.keys():
+        minor = frame.number("B", SETTINGS[name].at + 1)
+        found = {} if minor is None else {name: found[name] + 0.01 * minor}
     if "channel_forwarding" in found:
         found["channel_forwarding"] = float(bool(int(found["channel_forwarding"]) & FORWARDING))
     if frame.command == msp.MODE_RANGES:

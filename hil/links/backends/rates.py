@@ -1,22 +1,22 @@
 """Betaflight's rate curves and their inverse: which stick gives a body rate.
 
-Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates;
-RC_RATE_INCREMENTAL, SETPOINT_RATE_LIMIT."""
+Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates; `hil.links.facts`.
+"""
 
 import math
 from bisect import bisect_left
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from hil.links.facts import values
 from visthrow.config.bounds import Bound, Bounded
 
-RATES_TYPES = {
-    "betaflight": 0,
-    "actual": 3,
-}  # numbers of rates_type; Raceflight (1), KISS (2) and Quick (4) are not spoken here
-RATE_LIMIT = 1998.0  # largest rate of any set-point [deg/s]
-TRAVEL = 500  # from the middle of a stick to its end [us]
-MIDDLE = 1500  # middle of a stick [us]
+FACTS = values("betaflight")
+# numbers of rates_type; Raceflight, KISS and Quick are not spoken here
+RATES_TYPES = {"betaflight": FACTS["rates_betaflight"], "actual": FACTS["rates_actual"]}
+RATE_LIMIT = FACTS["rate_limit"]  # largest rate of any set-point [deg/s]
+TRAVEL = FACTS["travel"]  # from the middle of a stick to its end [us]
+MIDDLE = FACTS["middle"]  # middle of a stick [us]
 
 
 Steep, Byte, Percent = (
@@ -51,7 +51,7 @@ class RatesParams(Bounded):
         expo, gain = self.expo[axis] / 100.0, self.rc_rates[axis] / 100.0
         bent = size**4 * expo + size * (1.0 - expo)
         if gain > 2.0:
-            gain += 14.54 * (gain - 2.0)
+            gain += FACTS["rate_steep"] * (gain - 2.0)
         return 200.0 * gain * bent / min(max(1.0 - size * self.rates[axis] / 100.0, 0.01), 1.0)
 
     def _actual(self, axis: int, size: float) -> float:
@@ -67,7 +67,7 @@ class Sticks:
     forward pitches the nose down (+y), one to the right yaws right (-z). So pitch keeps its sign,
     unlike in forward, right, down axes."""
 
-    SIGNS = (1.0, 1.0, -1.0)
+    SIGNS = (FACTS["roll_sign"], FACTS["pitch_sign"], FACTS["yaw_sign"])
 
     def __init__(self, params: RatesParams) -> None:
         self._tables = [
