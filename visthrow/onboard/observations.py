@@ -78,10 +78,36 @@ class Layout:
         return VEHICLE + self.goal + self.payload
 
     @property
+    def groups(self) -> dict[str, int]:
+        """Widths of the parts of the actor's input, in their order."""
+        return {
+            "vehicle": VEHICLE,
+            "previous action": 5,
+            "goal": self.goal,
+            "payload": self.payload * (1 + self.history),
+            "attached": 1,
+            "validity": self.validity,
+            "located": self.located,
+            "goal velocity": self.motion,
+            "response": self.response * RESPONSE,
+            "setup": self.setup,
+        }
+
+    @property
     def dimension(self) -> int:
         """Width of the actor's input."""
-        beside = self.validity + self.motion + self.located + self.response * RESPONSE + self.setup
-        return VEHICLE + 5 + self.goal + self.payload * (1 + self.history) + 1 + beside
+        return sum(self.groups.values())
+
+    def columns(self, *names: str) -> list[int]:
+        """Columns of these groups in the actor's input."""
+        widths = list(self.groups.items())
+        starts = [sum(width for _, width in widths[:k]) for k in range(len(widths))]
+        return [
+            start + i
+            for (name, width), start in zip(widths, starts)
+            if name in names
+            for i in range(width)
+        ]
 
 
 def layout_of(params: Any) -> Layout:
