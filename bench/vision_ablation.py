@@ -29,7 +29,7 @@ MEMORY = (
     'algorithm="distillation"',
     "ppo.environments=2048",
     "distillation.iterations=1000",
-    *("distillation.layers=2", "distillation.hidden=512", "distillation.minibatches=8"),
+    *("distillation.inner=[256,256]", "distillation.hidden=512", "distillation.minibatches=8"),
     "distillation.memory=256",
 )
 TUNED = (

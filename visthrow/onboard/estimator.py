@@ -4,20 +4,22 @@ Onboard-safe.
 
 One step takes an observation o and the memory h of the steps before:
 
-    x = elu(W o' + b), o' normalised             encoder, of one layer or two
+    x = elu(W o' + b), o' normalised             encoder, of one layer or more
     h = GRU(x, h)                                Cho et al., EMNLP 2014, as in torch.nn.GRUCell
     s = o[kept] + C h + c                        estimate; 0 in place of o where nothing is kept
 
 so that what is measured directly passes, corrected, and what is not (a goal behind a turned lens, a
 pose of now rather than of 30 ms ago) is inferred from all that was seen."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from itertools import chain
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from visthrow.common.errors import PolicyError
+from visthrow.common.errors import PolicyError, suggest
 
 
 @dataclass(frozen=True)
@@ -38,16 +40,22 @@ class Estimator:
     output_weight: Tensor  # (S, H)
     output_bias: Tensor  # (S,)
     kept: Tensor  # (S,), entry of the observation that each estimate corrects, D for none; int64
-    inner_weight: Tensor | None = None  # (N, N), of the encoder's second layer, where it has one
-    inner_bias: Tensor | None = None  # (N,)
+    # weights (N', N) and biases (N',) of the encoder's further layers, the last of which the memory
+    # takes
+    inner: tuple[tuple[Tensor, Tensor], ...] = ()
 
     def __post_init__(self) -> None:
-        hidden, width = self.encoder_weight.shape[0], self.encoder_weight.shape[1]
+        width, hidden = self.encoder_weight.shape[1], len(self.encoder_bias)
         memory, count = self.output_weight.shape[1], self.output_weight.shape[0]
-        expected = {
+        expected: dict[str, tuple[int, ...]] = {
             "mean": (width,),
             "std": (width,),
-            "encoder_bias": (hidden,),
+            "encoder_weight": (hidden, width),
+        }
+        for i, (_, bias) in enumerate(self.inner):
+            expected |= {f"inner{i}_weight": (len(bias), hidden), f"inner{i}_bias": (len(bias),)}
+            hidden = len(bias)
+        expected |= {
             "input_weight": (3 * memory, hidden),
             "input_bias": (3 * memory,),
             "memory_weight": (3 * memory, memory),
@@ -55,11 +63,9 @@ class Estimator:
             "output_bias": (count,),
             "kept": (count,),
         }
-        if self.inner_weight is not None or self.inner_bias is not None:
-            expected |= {"inner_weight": (hidden, hidden), "inner_bias": (hidden,)}
         parts = self.parts()
         for name, shape in expected.items():
-            came = tuple(parts[name].shape) if name in parts else None
+            came = tuple(parts[name].shape)
             if came != shape:
                 raise PolicyError(f"estimator: {name} has shape {came}; expected {shape}")
         for name, part in parts.items():
@@ -73,9 +79,23 @@ class Estimator:
             )
 
     def parts(self) -> dict[str, Tensor]:
-        """Return the tensors that there are, by their fields' names."""
-        every = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: part for name, part in every.items() if part is not None}
+        """Return all tensors by name, those of further layers as ``inner0_weight`` and so on."""
+        named = {field.name: getattr(self, field.name) for field in fields(self)[:-1]}
+        for i, (weight, bias) in enumerate(self.inner):
+            named |= {f"inner{i}_weight": weight, f"inner{i}_bias": bias}
+        return named
+
+    @classmethod
+    def of_parts(cls, parts: Mapping[str, Tensor]) -> "Estimator":
+        """Build from what :meth:`parts` gave. Raises PolicyError: one is missing."""
+        own = [field.name for field in fields(cls)[:-1]]
+        count = sum(name.startswith("inner") and name.endswith("_weight") for name in parts)
+        pairs = [(f"inner{i}_weight", f"inner{i}_bias") for i in range(count)]
+        for name in (*own, *chain.from_iterable(pairs)):
+            if name not in parts:
+                raise PolicyError(f"estimator: no part '{name}'; {suggest(name, parts)}")
+        inner = tuple((parts[weight], parts[bias]) for weight, bias in pairs)
+        return cls(**{name: parts[name] for name in own}, inner=inner)
 
     @property
     def obs_dim(self) -> int:
@@ -92,8 +112,8 @@ class Estimator:
         and the memory.
         """
         x = F.elu(F.linear((obs - self.mean) / self.std, self.encoder_weight, self.encoder_bias))
-        if self.inner_weight is not None:
-            x = F.elu(F.linear(x, self.inner_weight, self.inner_bias))
+        for weight, bias in self.inner:
+            x = F.elu(F.linear(x, weight, bias))
         memory = torch.gru_cell(
             x, memory, self.input_weight, self.memory_weight, self.input_bias, self.memory_bias
         )
@@ -105,4 +125,4 @@ class Estimator:
 
     def to(self, device: str | torch.device) -> "Estimator":
         """The estimator with its tensors on another device."""
-        return Estimator(**{name: part.to(device) for name, part in self.parts().items()})
+        return Estimator.of_parts({name: part.to(device) for name, part in self.parts().items()})

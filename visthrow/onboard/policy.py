@@ -17,7 +17,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -278,11 +278,11 @@ class Policy:
         try:
             estimator = None
             if header["format_version"] == FORMAT_VERSIONS[1]:
-                estimator = Estimator(
-                    **{
-                        field.name: take(f"estimator_{field.name}")
-                        for field in fields(Estimator)
-                        if field.default is MISSING or f"estimator_{field.name}" in arrays
+                estimator = Estimator.of_parts(
+                    {
+                        name.removeprefix("estimator_"): take(name)
+                        for name in arrays
+                        if name.startswith("estimator_")
                     }
                 )
             return Policy(

@@ -296,8 +296,8 @@ class DistillationParams(Bounded):
     teacher: str = "state"  # state policy: a shipped name or a file
     iterations: Count = 500
     horizon: Count = 72  # of a throw [control steps]
-    hidden: Count = 256  # of the encoder
-    layers: Literal[1, 2] = 1  # of the encoder
+    hidden: Count = 256  # of the encoder's first layer
+    inner: Counts = ()  # of its further layers
     memory: Count = 128  # of the recurrent unit
     epochs: Count = 1
     minibatches: Count = 4

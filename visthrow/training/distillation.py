@@ -8,6 +8,7 @@ states that it meets (DAgger: Ross et al., AISTATS 2011), with backpropagation t
 throw. Throws that the exact observation flies would teach it to read the truth out of the action
 before."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import torch
@@ -21,7 +22,7 @@ from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import Policy, find_policy
-from visthrow.task import Experiment, contract_of
+from visthrow.task import DistillationParams, Experiment, contract_of
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import averaged, cosine_rate, normalizer_state
 from visthrow.training.ranks import Ranks
@@ -42,22 +43,17 @@ class Network(nn.Module):
     parts and shapes.
     """
 
-    def __init__(
-        self, kept: Tensor, learnt: Tensor, width: int, hidden: int, memory: int, layers: int = 1
-    ):
+    def __init__(self, kept: Tensor, learnt: Tensor, width: int, p: DistillationParams):
         """Begin with an estimate of what is kept: the entry of the observation that each estimate
         corrects, ``width`` for none, shape (S,).
 
-        ``learnt``: which estimates are learnt, bool, shape (S,). width: D. hidden: N. memory: H.
-        layers: of the encoder, 1 or 2.
+        ``learnt``: which estimates are learnt, bool, shape (S,). width: D. p: sizes.
         """
         super().__init__()
-        self.encoder, self.gru, self.output = (
-            nn.Linear(width, hidden),
-            nn.GRU(hidden, memory),
-            nn.Linear(memory, len(kept)),
-        )
-        self.inner = nn.Linear(hidden, hidden) if layers > 1 else None
+        widths = (p.hidden, *p.inner)
+        self.encoder = nn.Linear(width, p.hidden)
+        self.inner = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
+        self.gru, self.output = nn.GRU(widths[-1], p.memory), nn.Linear(p.memory, len(kept))
         with torch.no_grad():
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
@@ -71,13 +67,15 @@ class Network(nn.Module):
         parts = [seen.mean, seen.std + seen.eps, self.encoder.weight, self.encoder.bias]
         parts += [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0]
         parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
-        parts += [] if self.inner is None else [self.inner.weight, self.inner.bias]
-        return Estimator(*(part.detach() for part in parts))
+        inner = tuple((layer.weight.detach(), layer.bias.detach()) for layer in self.inner)
+        return Estimator(*(part.detach() for part in parts), inner)
 
     def forward(self, obs: Tensor) -> Tensor:
         """Estimates, shape (T, E, S), along throws, shape (T, E, D)."""
         x = F.elu(self.encoder(self.normalizer(obs)))
-        x, _ = self.gru(x if self.inner is None else F.elu(self.inner(x)))
+        for layer in self.inner:
+            x = F.elu(layer(x))
+        x, _ = self.gru(x)
         return F.pad(obs, (0, 1))[..., self.kept] + self.output(x) * self.learnt
 
 
@@ -116,8 +114,7 @@ class Distillation:
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
         kept, learnt = _passed(env.layout, self._layout)
-        sizes = (env.layout.dimension, self.p.hidden, self.p.memory, self.p.layers)
-        self.network = Network(kept, learnt, *sizes).to(device)
+        self.network = Network(kept, learnt, env.layout.dimension, self.p).to(device)
         ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
@@ -214,21 +211,24 @@ class Distillation:
         """Take the network's state into what flies, in place: a captured rollout reads these
         tensors.
         """
+        flying = self._flying.parts()
         for name, value in self.network.frozen().parts().items():
-            getattr(self._flying, name).copy_(value)
+            flying[name].copy_(value)
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         t = self.teacher.to("cpu")
         parts = self.average.module.frozen().parts()
-        estimator = Estimator(**{name: part.cpu().clone() for name, part in parts.items()})
+        estimator = Estimator.of_parts({name: part.cpu().clone() for name, part in parts.items()})
         return Policy(
             t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator
         )
 
     def take_up(self, policy: Policy) -> None:
         e, n = policy.estimator, self.network
-        deep = e is not None and e.inner_weight is not None
-        if e is None or e.input_weight.shape != n.gru.weight_ih_l0.shape or deep != bool(n.inner):
+        fits = e is not None and {k: v.shape for k, v in e.parts().items()} == {
+            k: v.shape for k, v in n.frozen().parts().items()
+        }
+        if not fits:
             raise ConfigError(
                 "--from: the policy has no estimator of this configuration's shape to start from"
             )
@@ -242,8 +242,8 @@ class Distillation:
             "output.weight": e.output_weight,
             "output.bias": e.output_bias,
         }
-        if deep:
-            parts |= {"inner.weight": e.inner_weight, "inner.bias": e.inner_bias}
+        for i, (weight, bias) in enumerate(e.inner):
+            parts |= {f"inner.{i}.weight": weight, f"inner.{i}.bias": bias}
         n.load_state_dict(n.state_dict() | parts)
         n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
         self.average.module.load_state_dict(n.state_dict())
