@@ -23,8 +23,8 @@ from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
+from visthrow.onboard.compiled import Compiled
 from visthrow.onboard.policy import Policy
-from visthrow.onboard.traced import Traced
 
 VIEWS = {
     "pos_w": 3,
@@ -147,8 +147,8 @@ class Pilot:
             np.zeros((count, sum(VIEWS.values())), dtype=np.float32),
             np.zeros(count, dtype=np.float32),
         )
-        self._observe, self._observe_given = Traced(self._observed), Traced(self._observed)
-        self._decide, self._later = Traced(self._decision), np.zeros(count, dtype=bool)
+        self._observe, self._observe_given = Compiled(self._observed), Compiled(self._observed)
+        self._decide, self._later = Compiled(self._decision), np.zeros(count, dtype=bool)
         self.spent = (0.0, 0.0)
         self._first = np.array(
             [act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=np.float32
