@@ -23,7 +23,6 @@ ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 KNOWN = {
     "long: hil.control.runner.__init__",
     "long: hil.flight.fly",
-    "long: hil.links.backends.px4._rules",
     "long: hil.params.__post_init__",
     "long: sim.effects.firmware.controller_of",
     "long: sim.hybrid.__init__",

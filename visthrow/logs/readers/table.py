@@ -288,9 +288,7 @@ def make_channel(
         "backwards": int(np.sum(steps < 0.0)),
     }
     rows = rows[_forward(time[rows])]
-    blank = np.all(
-        np.isnan(values[rows]), axis=1
-    )  # a row of blanks is of another channel: no sample
+    blank = np.all(np.isnan(values[rows]), axis=1)  # such a row is of another channel
     notes["blank"] = int(np.sum(blank))
     time, values = time[rows[~blank]], values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
@@ -298,9 +296,7 @@ def make_channel(
         valid &= ~bad[rows[~blank]]
         notes["invalid by the source"] = int(np.sum(bad[rows[~blank]]))
     if entry.held and len(values):
-        fresh = np.ones(len(values), dtype=bool)
-        same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
-        fresh[1:] = ~np.all(same, axis=1)
+        fresh = _changed(values)
         notes["held"] = int(np.sum(~fresh))
         time, values, valid = time[fresh], values[fresh], valid[fresh]
     values = _converted(np.where(valid[:, None], values, 0.0), entry, factor)
@@ -319,6 +315,12 @@ def make_channel(
         return Channel(time, values, unit, frame, valid), notes
     except LogError as error:
         raise LogError(f"{source}: channel '{entry.name}': {error}") from error
+
+
+def _changed(values: np.ndarray) -> np.ndarray:
+    """Tell the rows that differ from the row before, bool, shape (T,); the first one does."""
+    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+    return np.append(True, ~np.all(same, axis=1))
 
 
 def _forward(time: np.ndarray) -> np.ndarray:
