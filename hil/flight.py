@@ -122,7 +122,8 @@ def fly(args: argparse.Namespace) -> int:
     summary = loop.fly(args.seconds or float("inf"))
     summary["speed"] = args.speed
     summary["autopilot"] = autopilot_record(backend, link)
-    summary["links"] = [one.roster.summary() for one in source.links]
+    rosters = [*source.rosters, *filter(None, [getattr(backend, "roster", None)])]
+    summary["links"] = [roster.summary() for roster in rosters]
     for part in (eyes, solver, backend, source):
         if part is not None:
             part.close()

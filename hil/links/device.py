@@ -94,12 +94,22 @@ class Port(Protocol):
         """Give the port back."""
 
 
-def chunks(port: Port) -> Iterator[bytes]:
-    """Yield what has arrived at a port, at most `MOST_CHUNKS` chunks of it."""
-    for _ in range(MOST_CHUNKS):
+def chunks(
+    port: Port, refuse: Callable[[tuple[str, int] | None], None] = lambda sender: None
+) -> Iterator[bytes]:
+    """Yield what has arrived at a port from the peer that its device names, at most `MOST_CHUNKS`
+    chunks of it; ``refuse`` is called with the address of each other sender's datagram.
+    """
+    looked = shut_out = 0
+    while looked < MOST_CHUNKS and shut_out < MOST_SHUT_OUT:
         data = port.read()
         if data is None:
             return
+        if port.peer is not None and port.sender != port.peer:
+            shut_out += 1
+            refuse(port.sender)
+            continue
+        looked += 1
         yield data
 
 

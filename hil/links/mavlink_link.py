@@ -101,8 +101,11 @@ class Link:
 
     def _take(self, data: bytes, arrival: float) -> int:
         """Hand on the messages in a chunk that are of our parties; returns their number."""
-        count = 0
-        for message in self.parser.parse(data, self.port.whole):
+        count, errors = 0, self.parser.errors
+        messages = self.parser.parse(data, self.port.whole)
+        if self.parser.errors > errors and not self.parser.forged:
+            self.roster.drop(self.sender, "bytes", "no MAVLink message")
+        for message in messages:
             if not self.roster.admit(message, self.sender, arrival):
                 continue
             if self._tlog is not None:
@@ -187,7 +190,17 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
         vel = None
     rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))
     pos = (message.x, message.y, message.z)
-    return Pose(message.time_usec / 1e6, arrival, body, pos, quat, vel, rate, message.reset_counter)
+    return Pose(
+        message.time_usec / 1e6,
+        arrival,
+        body,
+        pos,
+        quat,
+        vel,
+        rate,
+        message.reset_counter,
+        valid=message.quality >= 0,  # negative: its estimator has failed
+    )
 
 
 def _known(vector: Vector) -> Vector | None:

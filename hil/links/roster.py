@@ -78,6 +78,8 @@ def shown(address: Address) -> str:
     """Return an address in words."""
     if address is None:
         return "the link's peer"
+    if not address[1]:
+        return address[0]
     return f"[{address[0]}]:{address[1]}" if ":" in address[0] else f"{address[0]}:{address[1]}"
 
 
@@ -141,6 +143,7 @@ class Roster:
         self.only: Address = None
         self.moved: list[Callable[[Party], None]] = []
         self._said: set[tuple] = set()
+        self._rivals: dict[str, tuple[Address, float]] = {}  # second sender, and when it spoke [s]
 
     def shuts_out(self, address: Address) -> bool:
         """Return whether a datagram is not even looked into: not from the device's peer, not on the
@@ -163,18 +166,18 @@ class Roster:
             self.refuse(Seen(address, None, None, "datagram", why))
         return why is not None
 
-    def refuse(self, seen: Seen) -> None:
+    def refuse(self, seen: Seen, count: int = 1) -> None:
         """Count what is not taken, and say who sent it."""
-        self.refused += 1
-        self._count(seen)
+        self.refused += count
+        self._count(seen, count)
         who = (seen.address, seen.system, seen.component, seen.why)
         if self.tell is not None and who not in self._said and len(self._said) < MOST_SAID:
             self._said.add(who)
             self.tell(f"refused: {seen.text()}")
 
-    def _count(self, seen: Seen) -> None:
+    def _count(self, seen: Seen, count: int = 1) -> None:
         seen = seen if seen in self.seen or len(self.seen) < MOST_KEPT else OTHERS
-        self.seen[seen] = self.seen.get(seen, 0) + 1
+        self.seen[seen] = self.seen.get(seen, 0) + count
 
     def admit(self, message: Any, address: Address, now: float) -> bool:
         """Return whether a message is one of a party's; binds the party to its sender's address at
@@ -247,16 +250,48 @@ class Roster:
             )
         if self.at.get(party.name, ...) == address:
             return None
-        if party.name in self.at:
-            if self.flying:
-                return (
-                    f"another sender while it flies; the {party.name} speaks from"
-                    f" {shown(self.at[party.name])}"
-                )
-            if now - self.heard[party.name] < SILENT:
-                return f"a second sender; the {party.name} speaks from {shown(self.at[party.name])}"
+        if (why := self._taken(party.name, address, now)) is not None:
+            return why
         first = "HEARTBEAT" if party.autopilot is not None else ", ".join(sorted(party.kinds))
         return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
+
+    def _taken(self, name: str, address: Address, now: float) -> str | None:
+        """Return why an address may not speak for a name that another one speaks for, or None."""
+        at = self.at.get(name, address)
+        if at == address:
+            return None
+        if self.flying:
+            return f"another sender while it flies; the {name} speaks from {shown(at)}"
+        if now - self.heard[name] < SILENT:
+            self._rivals[name] = (address, now)
+            return f"a second sender; the {name} speaks from {shown(at)}"
+        return None
+
+    def claim(self, name: str, address: Address, now: float) -> bool:
+        """Return whether an address may speak for a name at a time [s]; the first one that asks is
+        bound to it, under the rules of parties.
+        """
+        why = self._taken(name, address, now)
+        if why is not None:
+            self.refuse(Seen(address, None, None, name, why))
+            return False
+        self.at[name], self.heard[name] = address, now
+        return True
+
+    def drop(self, address: Address, kind: str, why: str, count: int = 1) -> None:
+        """Count what a source could not take from a sender, and say it once."""
+        self.refuse(Seen(address, None, None, kind, why), count)
+
+    def rivals(self, now: float) -> list[str]:
+        """Return which names two senders speak for at a time [s], in words: only one of them is
+        heard, and which one is chance.
+        """
+        return [
+            f"two senders speak as the {name}: {shown(self.at[name])}, which is heard, and"
+            f" {shown(address)}: end one, or name the right one in link.allow"
+            for name, (address, time) in self._rivals.items()
+            if now - time < SILENT
+        ]
 
     def expected(self) -> str:
         """Return the parties in words."""

@@ -22,7 +22,25 @@ from visthrow.config.bounds import Bounded, Positive
 
 OK, WARN, HOLD, ABORT = range(4)  # levels of staleness
 MOST_ACCELERATION = 40.0  # by which a body may have changed its velocity while nothing came [m/s^2]
+MOST_STAMP = 1e11  # stamps beyond it [s] cannot tell poses 20 us apart; the year 5138
 RARE = 3  # gaps longer than ``hold`` in a row that count as no poses at all
+
+
+REASONS = {
+    "invalid": "the source says that it does not see the body",
+    "finite": "NaN or infinite numbers",
+    "stamp": "stamps that are no time",
+    "quaternion": "attitudes that are no unit quaternions",
+    "old": "stamps not after the last one's: doubled, reordered, or not stamped",
+    "repeated": "the last pose again",
+    "swapped": "where the other body is expected",
+    "cable": "farther from the other body than the cable is long",
+    "jump": "jumps",
+    "speed": "faster than gate.max_speed",
+    "turn": "turns faster than gate.max_turn_rate",
+    "reset": "the source's reset counter has changed",
+}
+"""Why a pose is refused, in words."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +103,7 @@ class Gate:
         """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and
         the cable's other end, where one hangs.
 
-        Returns why it is refused, or None where it is accepted: "finite", "quaternion", "old"
-        (reordered or doubled), "repeated" (the content of the last one), "swapped", "cable",
-        "jump", "speed", "turn", "reset"."""
+        Returns why it is refused, or None where it is accepted; `REASONS` says what each means."""
         reason = self._reason(pose, velocity, tether)
         if reason is not None:
             self.refused[reason] = self.refused.get(reason, 0) + 1
@@ -132,6 +148,8 @@ class Gate:
     def _itself(self, pose: Pose) -> str | None:
         """Return what is wrong with a pose, whatever came before."""
         p = self.params
+        if not pose.valid:
+            return "invalid"
         numbers = (
             pose.stamp,
             pose.arrival,
@@ -142,6 +160,8 @@ class Gate:
         )
         if not all(map(math.isfinite, numbers)):
             return "finite"
+        if abs(pose.stamp) > MOST_STAMP:
+            return "stamp"
         if pose.quat is not None and abs(math.hypot(*pose.quat) - 1.0) > p.quat_tolerance:
             return "quaternion"
         if pose.vel is not None and math.hypot(*pose.vel) > p.max_speed:

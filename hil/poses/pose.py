@@ -3,6 +3,7 @@
 Plain floats, so that it is recorded exactly.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,15 @@ from visthrow.common.rotations import Vector as Vector
 Body = Literal["vehicle", "payload", "goal"]
 VEHICLE, PAYLOAD, GOAL = "vehicle", "payload", "goal"
 BODIES = (VEHICLE, PAYLOAD, GOAL)
+
+
+ZEROS = ([0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+"""Attitudes that captures write for a body that they do not see, sorted: zeros, or no turn."""
+
+
+def known(quat: Quaternion | None) -> bool:
+    """Return whether an attitude is told: single markers have NaN or zeros there."""
+    return quat is not None and not any(map(math.isnan, quat)) and any(quat)
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,16 @@ class Pose:
     rate: Vector | None = None  # [rad/s], body frame; None where the source gives none
     reset: int = 0  # counter of the source's estimator; a change says that it jumped
     measured: float | None = None  # on the runner's clock [s], where the source's clock is known
+    valid: bool = True  # False where the source itself says that it does not see the body
+
+    def lost(self) -> bool:
+        """Return whether a raw pose is that of a body which its source does not see: called so, or
+        written as zeros, which no measurement is.
+        """
+        return not self.valid or (
+            not any(self.pos)
+            and (self.quat is None or sorted(self.quat) in ZEROS or not known(self.quat))
+        )
 
     def transit(self, usual: float) -> float:
         """Return the time from measurement to arrival [s]: known, or what is usual."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
-from hil.poses.pose import Pose, Quaternion, Vector
+from hil.poses.pose import Pose, Quaternion, Vector, known
 from visthrow.common.rotations import multiply
 
 MOST_PREDICTION = (
@@ -67,8 +67,13 @@ class Track:
     def update(self, raw: Pose, tether: Tether | None = None) -> str | None:
         """Take a raw pose; why it was refused, or None.
 
-        ``tether``: the cable's other end, where one hangs.
+        ``tether``: the cable's other end, where one hangs. A body whose attitude nobody needs may
+        have none.
         """
+        if raw.lost():
+            raw = replace(raw, valid=False)
+        if not self._turns and raw.quat is not None and not known(raw.quat):
+            raw = replace(raw, quat=None)
         pose = self.frames.pose_from_source(raw)
         before, stepped = self.gate.last, self.gate.stepped(pose)
         reason = self.gate.check(pose, self._vel if self._pose is not None else None, tether)

@@ -121,6 +121,7 @@ class Recorder:
                     p.rate,
                     p.reset,
                     p.measured,
+                    p.valid,
                 ),
             )
         self._put(
@@ -169,9 +170,9 @@ def lines(path: Path) -> Iterator[Any]:
 
 def pose_of(row: list) -> tuple[int, Pose]:
     """Return the number of the tick and the raw pose of a line of :data:`POSES`."""
-    index, stamp, arrival, body, *vectors, reset, measured = row
-    pos, quat, vel, rate = (None if v is None else tuple(v) for v in vectors)
-    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, reset, measured)
+    index, stamp, arrival, body, *rest = row
+    pos, quat, vel, rate = (None if v is None else tuple(v) for v in rest[:4])
+    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, *rest[4:])
 
 
 def read_poses(folder: Path) -> dict[int, list[Pose]]:

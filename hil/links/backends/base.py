@@ -1,12 +1,14 @@
 """What the runner needs of a back-end, the one that sends nothing, and one whose commands wait."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 from hil.links.backends.audit import Audit
 from hil.links.device import Port
+from hil.links.roster import Address, Roster, shown
 
 IDLE, PENDING, ACCEPTED, FAILED = (
     "idle",
@@ -251,13 +253,18 @@ class OnPort(Autopilot):
     and given up by silence.
 
     Where the runner falls silent its own failsafe or watchdog acts; so an abort has nothing to ask
-    for. ``dropped`` counts packets that could not be sent."""
+    for. ``dropped`` counts packets that could not be sent, ``roster`` what came and was refused."""
 
     protocol = ""
 
-    def __init__(self, port: Port, silence: float) -> None:
-        """Take an open port; after a silence [s] the controller counts as lost."""
+    def __init__(
+        self, port: Port, silence: float, tell: Callable[[str], None] | None = None
+    ) -> None:
+        """Take an open port; after a silence [s] the controller counts as lost. ``tell`` is handed
+        who is refused.
+        """
         super().__init__()
+        self.roster = Roster(tell=tell)
         self._port, self._silence, self._heard, self.dropped = port, silence, -1e9, 0
         self._taken = self._raised = self._over = False  # asked for; has followed; over
 
@@ -280,6 +287,10 @@ class OnPort(Autopilot):
 
     def close(self) -> None:
         self._port.close()
+
+    def _stranger(self, sender: Address) -> None:
+        """Count a datagram of another sender than the one that the device names."""
+        self.roster.drop(sender, "datagram", f"the device is {shown(self._port.peer)}")
 
     def _put(self, data: bytes) -> bool:
         taken = self._port.write(data)

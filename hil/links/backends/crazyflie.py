@@ -76,8 +76,8 @@ class Crazyflie(OnPort):
     def __init__(
         self, port: Port, params: CrazyflieParams, tell: Callable[[str], None] | None = None
     ) -> None:
-        """Speak CRTP on an open port; ``tell`` is handed the table of settings."""
-        super().__init__(port, params.silence)
+        """Speak CRTP on an open port; ``tell`` is handed the table of settings and who is refused."""
+        super().__init__(port, params.silence, tell)
         self.params = params
         self.release_record = Release(params.release_timeout)
         self.poses = 0
@@ -168,8 +168,11 @@ class Crazyflie(OnPort):
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
     def service(self, now: float) -> None:
-        for data in chunks(self._port):
-            if (packet := crtp.unpack(data)) is not None:
+        for data in chunks(self._port, self._stranger):
+            packet = crtp.unpack(data)
+            if packet is None:
+                self.roster.drop(self._port.sender, "datagram", "no CRTP packet")
+            else:
                 self._hear(packet, now)
         if now - self._asked >= ASK:
             self._asked = now

@@ -8,11 +8,15 @@ from collections.abc import Callable, Iterable
 from hil.errors import SourceError
 from hil.links.clock import Clock
 from hil.links.mavlink_link import Link
+from hil.links.roster import Roster
 from hil.poses.pose import Pose
 
 
 class Source:
-    """Where poses come from; polling never waits and never raises."""
+    """Where poses come from; polling never waits and never raises.
+
+    ``rosters`` say who was heard, and count what was refused.
+    """
 
     ended: bool = False  # nothing will come any more
 
@@ -21,6 +25,7 @@ class Source:
     ) -> None:
         """Serve links while it is polled; ``clock`` gives the arrivals [s]."""
         self.links, self._clock = links, clock
+        self.rosters = [link.roster for link in links]
 
     def poll(self, now: float) -> list[Pose]:
         """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of
@@ -48,8 +53,8 @@ class Source:
         """Say whether the vehicle is ours in flight: then nobody's address on the links
         may change.
         """
-        for link in self.links:
-            link.roster.flying = flying
+        for roster in self.rosters:
+            roster.flying = flying
 
     def close(self) -> None:
         """Give ports and files back."""
@@ -60,15 +65,23 @@ class Source:
 class Recorded(Source):
     """Recorded poses, each handed on when the runner's clock has reached its arrival."""
 
-    def __init__(self, poses: Iterable[Pose]) -> None:
-        """Sort by arrival; poses that arrived together keep their order.
+    def __init__(self, poses: Iterable[Pose], roster: Roster | None = None) -> None:
+        """Sort by arrival; poses that arrived together keep their order. ``roster`` counts what of
+        the recording is no pose.
 
-        Raises `SourceError` where there is none.
+        Raises `SourceError` where there is none, or one without an arrival.
         """
         super().__init__()
+        self.rosters += [] if roster is None else [roster]
         self.poses = sorted(poses, key=lambda pose: pose.arrival)
         if not self.poses:
-            raise SourceError("the recording holds no pose of a body that the config names")
+            why = (
+                "; ".join(f"{n} {seen.text()}" for seen, n in roster.seen.items()) if roster else ""
+            )
+            raise SourceError(
+                "the recording holds no pose of a body that the config names"
+                + (f": {why}" if why else "")
+            )
         self._next = 0
 
     @property

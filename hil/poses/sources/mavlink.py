@@ -8,14 +8,24 @@ from itertools import combinations
 from typing import Annotated, Any, Literal
 
 from hil.errors import SourceError
-from hil.links.mavlink_link import Link, pose_from_message
-from hil.links.roster import MavlinkId
+from hil.links.mavlink_link import (
+    LOCAL_FRAMES,
+    Link,
+    pose_from_message,
+    quaternion_from_euler,
+)
+from hil.links.pymav import mav
+from hil.links.roster import Address, MavlinkId, Seen
 from hil.poses.pose import Body, Pose
 from hil.poses.sources.base import Source
 from visthrow.config.bounds import Bound, Bounded
 
-COMPANIONS = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")}
+ATTITUDES = ("ATTITUDE_QUATERNION", "ATTITUDE")
+COMPANIONS = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", *ATTITUDES)}
 """Messages that make up a pose, where it is more than one."""
+
+Drop = Callable[[Any, str], None]
+"""Takes a message of a body that is no pose, and why."""
 
 # an attitude older than this against the position that it is to be paired with is none [s]
 PAIR_AGE = 0.05
@@ -26,7 +36,7 @@ class BodyIds(Bounded):
     """Which sender speaks of which body, and in which message."""
 
     body: Body
-    # LOCAL_POSITION_NED is paired with ATTITUDE_QUATERNION.
+    # LOCAL_POSITION_NED is paired with ATTITUDE_QUATERNION or ATTITUDE.
     message: Literal["ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY", "LOCAL_POSITION_NED"]
     system: MavlinkId
     component: Annotated[int, Bound(0, 255)]  # 0 for any
@@ -35,9 +45,9 @@ class BodyIds(Bounded):
 class MavlinkDecoder:
     """Messages to poses; bodies told apart by their senders."""
 
-    def __init__(self, bodies: tuple[BodyIds, ...]) -> None:
+    def __init__(self, bodies: tuple[BodyIds, ...], drop: Drop = lambda message, why: None) -> None:
         """Take the senders; raises `SourceError` for none, or the same sender and message for two
-        bodies.
+        bodies. ``drop`` is called for what is a body's and no pose.
         """
         keys = [(ids.message, ids.system, ids.component) for ids in bodies]
         if not bodies or any(
@@ -47,24 +57,34 @@ class MavlinkDecoder:
                 f"senders {keys}; expected at least one, and no two bodies with the same message,"
                 " system and component"
             )
-        self._bodies = bodies
+        self._bodies, self._drop = bodies, drop
         self._attitudes: dict[tuple[int, int], Any] = {}
 
     def feed(self, message: Any, arrival: float) -> Pose | None:
         """Return the pose in a message, if it is one of ours."""
         kind, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
-        if kind == "ATTITUDE_QUATERNION":
+        if kind in ATTITUDES:
             self._attitudes[sender] = message
             return None
         for ids in self._bodies:
             if ids.message == kind and ids.system == sender[0] and ids.component in (0, sender[1]):
                 paired = kind == "LOCAL_POSITION_NED"
-                return (
+                pose = (
                     self._paired(message, sender, ids.body, arrival)
                     if paired
                     else pose_from_message(message, ids.body, arrival)
                 )
+                if pose is None:
+                    self._drop(message, self._objection(message, paired))
+                return pose
         return None
+
+    def _objection(self, message: Any, paired: bool) -> str:
+        """Return why a message of a body is no pose."""
+        if paired:
+            return f"no {' or '.join(ATTITUDES)} within {1e3 * PAIR_AGE:g} ms of it"
+        wanted = " or ".join(map(frame_name, LOCAL_FRAMES))
+        return f"frame {frame_name(message.frame_id)} is not taken; expected {wanted}"
 
     def _paired(
         self, message: Any, sender: tuple[int, int], body: str, arrival: float
@@ -72,15 +92,31 @@ class MavlinkDecoder:
         attitude = self._attitudes.get(sender)
         if attitude is None or abs(message.time_boot_ms - attitude.time_boot_ms) > 1e3 * PAIR_AGE:
             return None
+        if attitude.get_type() == "ATTITUDE":
+            quat = quaternion_from_euler(attitude.roll, attitude.pitch, attitude.yaw)
+        else:
+            quat = (attitude.q1, attitude.q2, attitude.q3, attitude.q4)
         return Pose(
             message.time_boot_ms / 1e3,
             arrival,
             body,
             (message.x, message.y, message.z),
-            (attitude.q1, attitude.q2, attitude.q3, attitude.q4),
+            quat,
             (message.vx, message.vy, message.vz),
             (attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed),
         )
+
+
+def frame_name(number: int) -> str:
+    """Return the name of a MAV_FRAME."""
+    entry = mav.enums["MAV_FRAME"].get(number)
+    return str(number) if entry is None else entry.name.removeprefix("MAV_FRAME_")
+
+
+def seen_of(message: Any, address: Address, why: str) -> Seen:
+    """Return how a message that is not taken is counted."""
+    ids = message.get_srcSystem(), message.get_srcComponent()
+    return Seen(address, *ids, message.get_type(), why)
 
 
 class MavlinkSource(Source):
@@ -99,7 +135,7 @@ class MavlinkSource(Source):
     ) -> None:
         """Listen to a link; ``clock`` gives the arrivals. ``beside`` is another link to serve."""
         super().__init__((link,) if beside is None else (link, beside), clock)
-        self._link, self._decoder = link, MavlinkDecoder(bodies)
+        self._link, self._decoder = link, MavlinkDecoder(bodies, self._drop)
         self._waiting: list[Pose] = []
         link.listen(self._hear)
 
@@ -110,6 +146,9 @@ class MavlinkSource(Source):
             self._waiting.append(
                 pose if sync is None else sync.dated(pose, message.get_srcSystem())
             )
+
+    def _drop(self, message: Any, why: str) -> None:
+        self._link.roster.refuse(seen_of(message, self._link.sender, why))
 
     def poll(self, now: float) -> list[Pose]:
         self.pump()

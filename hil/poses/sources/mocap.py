@@ -3,13 +3,20 @@
 ``motioncapture`` (Vicon, OptiTrack, Qualisys, VRPN, ...) and ``natnet`` (Motive).
 
 Both packages wait for frames, so each is listened to in a thread of its own, which notes the
-arrival and hands the poses over; polling never waits. Axes are those of the system: Vicon and
-Qualisys z up, OptiTrack y up; quaternions are xyzw."""
+arrival and hands the poses over; polling never waits. What cannot be read is dropped, counted and
+said once with its sender; no datagram and no frame ends a thread. Axes are those of the system:
+Vicon and Qualisys z up, OptiTrack y up; quaternions are xyzw."""
 
+import functools
+import importlib.util
 import json
+import socket
+import struct
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,18 +24,20 @@ from typing import Any, Literal
 
 from hil.errors import SourceError
 from hil.links.mavlink_link import Link
+from hil.links.roster import Roster
 from hil.poses.pose import BODIES, Body, Pose
+from hil.poses.sources import capture
 from hil.poses.sources.base import Source
+from hil.poses.sources.capture import PAUSE, listen
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.extras import load_extra
 
 MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
-PROBE = (
-    "import json, os, sys, motioncapture; motioncapture.connect(sys.argv[1],"
-    " json.loads(sys.argv[2])); os._exit(0)"
-)
-"""Connects once, in a process of its own."""
+HEADER = struct.Struct("<HH")  # of NatNet's datagrams: message and length of what follows
+SERVER_INFO, FRAME, OTHERS = 1, 7, (1, 3, 5, 8, 100)  # messages; those that are passed over
+AGAIN = 1.0  # after which a capture that has ended is started again, on the ground [s]
+ENDING = 2.0  # that threads and processes are given to end [s]
 
 
 @dataclass(frozen=True)
@@ -83,13 +92,21 @@ class MocapSource(Source):
     """Poses that a thread hands over, with the autopilot's link served where there is one.
 
     ``failure`` is what ended the thread, or None; the bodies go stale then, which the runner acts
-    on.
+    on. ``roster`` counts what came and is no pose.
     """
 
-    def __init__(self, clock: Callable[[], float], link: Link | None = None) -> None:
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        link: Link | None = None,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
         super().__init__(() if link is None else (link,), clock)
         self._waiting: deque[Pose] = deque(maxlen=MOST_WAITING)
+        self._tell = tell or (lambda text: print(text, file=sys.stderr, flush=True))
         self.failure: str | None = None
+        self.roster = Roster(tell=tell)
+        self.rosters.append(self.roster)
 
     def hand_over(self, pose: Pose) -> None:
         """Take a pose; from any thread."""
@@ -101,65 +118,10 @@ class MocapSource(Source):
 
 
 class MotionCaptureSource(MocapSource):
-    """Rigid bodies of the package motioncapture, by name. It tells no time: stamps are arrivals."""
+    """Rigid bodies of the package motioncapture, by name. It tells no time: stamps are arrivals.
 
-    def __init__(
-        self,
-        params: MocapParams,
-        bodies: tuple[RigidBody, ...],
-        clock: Callable[[], float],
-        link: Link | None = None,
-        module: Any = None,
-    ) -> None:
-        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``module`` stands for the
-        package. Raises `SourceError` where that is missing, no body is named, or the system does
-        not answer.
-        """
-        super().__init__(clock, link)
-        self._names = body_names(bodies)
-        if module is None:
-            module = load_extra("motioncapture", "motioncapture", "this source", SourceError)
-            _probe(params)
-        self._stop, self._ready = threading.Event(), threading.Event()
-        # A daemon: waiting for a frame of a system that has gone silent cannot be called off.
-        threading.Thread(
-            target=self._listen, args=(module.connect, params), name="motioncapture", daemon=True
-        ).start()
-        if not self._ready.wait(params.timeout) or self.failure is not None:
-            self._stop.set()
-            raise _no_answer(params, self.failure)
-
-    def _listen(self, connect: Callable[[str, dict[str, str]], Any], params: MocapParams) -> None:
-        try:
-            system = connect(params.system, params.options)
-            self._ready.set()
-            while not self._stop.is_set():
-                system.waitForNextFrame()
-                arrival = self._clock()
-                for name, found in system.rigidBodies.items():
-                    if name in self._names:
-                        q = found.rotation
-                        position = tuple(float(x) for x in found.position)
-                        self.hand_over(
-                            Pose(
-                                arrival, arrival, self._names[name], position, (q.x, q.y, q.z, q.w)
-                            )
-                        )
-        except Exception as error:  # whatever the package raises, the runner sees poses that stop
-            self.failure = f"{type(error).__name__}: {error}"
-            print(f"motion capture stopped: {self.failure}", file=sys.stderr, flush=True)
-            self._ready.set()
-
-    def close(self) -> None:
-        self._stop.set()
-        super().close()
-
-
-class NatNetSource(MocapSource):
-    """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's.
-
-    ``untracked`` counts poses that Motive itself calls not tracked, which it sends on with the last
-    position; they are dropped.
+    The package runs in a process of its own (`hil.poses.sources.capture`). Where that ends, the
+    source says why, and starts it again on the ground.
     """
 
     def __init__(
@@ -169,23 +131,140 @@ class NatNetSource(MocapSource):
         clock: Callable[[], float],
         link: Link | None = None,
         module: Any = None,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
+        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``tell`` is handed what is
+        dropped, ``module`` stands for the package, in this process. Raises `SourceError` where that
+        is missing, no body is named, or the system does not answer.
+        """
+        super().__init__(clock, link, tell)
+        self._params, self._names, self._module = params, body_names(bodies), module
+        if module is None and importlib.util.find_spec("motioncapture") is None:
+            load_extra("motioncapture", "motioncapture", "this source", SourceError)
+        self._stop, self._ready = threading.Event(), threading.Event()
+        self._process: subprocess.Popen | None = None
+        self._thread = threading.Thread(
+            target=self._keep_listening, name="motioncapture", daemon=True
+        )
+        self._thread.start()
+        answered = self._ready.wait(params.timeout)
+        why = self.failure if answered else f"no answer within {params.timeout:g} s"
+        if why is not None:
+            self._end()
+            raise SourceError(
+                f"{params.system} at {params.host}: {why}; expected a motion-capture system that"
+                " streams"
+            )
+
+    def _keep_listening(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._listen() if self._module is None else self._listen_here()
+            except Exception as error:  # whatever the package raises, the run goes on
+                self.failure = f"{type(error).__name__}: {error}"
+            first, stopping = not self._ready.is_set(), self._stop.is_set()
+            self._ready.set()
+            if first or stopping:
+                return
+            self._tell(f"motion capture stopped: {self.failure}; it is started again on the ground")
+            self._stop.wait(AGAIN)
+            while self.roster.flying and not self._stop.wait(0.1):
+                pass
+
+    def _listen_here(self) -> None:
+        p, stopped = self._params, self._stop.is_set
+        listen(
+            self._module.connect,
+            p.system,
+            p.options,
+            [*self._names],
+            self._take,
+            lambda: not stopped(),
+        )
+
+    def _listen(self) -> None:
+        """Read what the process writes until it ends; raises `SourceError` with its last words."""
+        p = self._params
+        settings = [p.system, json.dumps(p.options), json.dumps([*self._names])]
+        with (
+            tempfile.TemporaryFile("w+") as words,
+            subprocess.Popen(
+                [sys.executable, "-P", capture.__file__, *settings],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=words,
+                text=True,
+            ) as process,
+        ):
+            self._process = process
+            for line in process.stdout:
+                self._take(json.loads(line))
+            status = process.wait()
+            words.seek(0)
+            said = words.read().strip().splitlines()
+        raise SourceError(said[-1] if said and status > 0 else f"its process ended with {status}")
+
+    def _take(self, value: Any) -> None:
+        """Take what `hil.poses.sources.capture.listen` puts."""
+        arrival, host = self._clock(), (self._params.host, 0)
+        if value is None:
+            if self._ready.is_set():
+                self._tell("motion capture is connected again")
+            self.failure = None
+            self._ready.set()
+        elif isinstance(value, str):
+            self.roster.drop(host, *value.split(": ", 1))
+        elif isinstance(value, int):
+            self.roster.drop(("others", 0), "datagram", f"source.mocap.host is {host[0]}", value)
+        else:
+            for name, (*pos, x, y, z, w) in value.items():
+                self.hand_over(Pose(arrival, arrival, self._names[name], tuple(pos), (x, y, z, w)))
+
+    def _end(self) -> None:
+        self._stop.set()
+        if self._process is not None:
+            self._process.kill()
+            self._thread.join(ENDING)
+
+    def close(self) -> None:
+        self._end()
+        super().close()
+
+
+class NatNetSource(MocapSource):
+    """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's.
+
+    The package's threads end with the first datagram that they cannot read, and take anybody's. So
+    each is looked at before them: only frames of the host's that parse get through.
+    """
+
+    def __init__(
+        self,
+        params: MocapParams,
+        bodies: tuple[RigidBody, ...],
+        clock: Callable[[], float],
+        link: Link | None = None,
+        module: Any = None,
+        tell: Callable[[str], None] | None = None,
     ) -> None:
         """Connect; arguments and errors as `MotionCaptureSource`, and a name that is no number."""
-        super().__init__(clock, link)
+        super().__init__(clock, link, tell)
         wrong = [body.name for body in bodies if not body.name.isdecimal()]
         if wrong:
             raise SourceError(
                 f"natnet bodies {', '.join(wrong)}; expected streaming ids, which are numbers"
             )
+        self._params = params
         self._names = {int(name): body for name, body in body_names(bodies).items()}
-        self.untracked = 0
-        module = module or load_extra("natnet", "natnet", "this source", SourceError)
-        self._client = module.NatNetClient(
+        self._module = module or load_extra("natnet", "natnet", "this source", SourceError)
+        self._client = self._module.NatNetClient(
             server_ip_address=params.host,
             local_ip_address=params.local,
             use_multicast=params.multicast,
         )
         self._client.on_data_frame_received_event.handlers.append(self._frame)
+        # The package has no seam for it: its own method reads the socket and forgets the sender.
+        self._client._NatNetClient__process_socket = self._receive
         try:
             self._client.connect(timeout=params.timeout)
             self._client.run_async()
@@ -200,24 +279,71 @@ class NatNetSource(MocapSource):
             )
             raise SourceError(text) from error
 
+    def _receive(
+        self, sock: socket.socket, recv_buffer_size: int = 65536, send_keep_alive: bool = False
+    ) -> bool:
+        """Take one datagram of a socket of the client; whether there was one."""
+        try:
+            if send_keep_alive:
+                self._client.send_request(self._client.NAT_KEEPALIVE)
+            data, sender = sock.recvfrom(recv_buffer_size)
+        except TimeoutError:
+            return False
+        except OSError:  # none is there; or the host's port is closed, or the network is gone
+            time.sleep(PAUSE)
+            return False
+        self.take(data, sender)
+        return True
+
+    def take(self, data: bytes, sender: tuple[str, int]) -> None:
+        """Take a datagram: an answer of the host before it is known, then its frames; what is
+        neither is dropped and counted.
+        """
+        if sender[0] != self._params.host:
+            self.roster.drop(sender, "datagram", f"source.mocap.host is {self._params.host}")
+            return
+        kind, size = HEADER.unpack_from(data) if len(data) >= HEADER.size else (None, 0)
+        wanted = FRAME if self._client.server_info is not None else SERVER_INFO
+        if kind != wanted and kind in OTHERS and len(data) >= HEADER.size + size:
+            return
+        if kind != wanted or len(data) < HEADER.size + size:
+            self.roster.drop(sender, "datagram", "no NatNet message, or cut short")
+            return
+        if kind == FRAME and not self.roster.claim("Motive", sender, self._clock()):
+            return
+        try:
+            self._client._NatNetClient__process_message(
+                bounded_buffer(self._module)(data[: HEADER.size + size])
+            )
+        except Exception as error:  # of the package, at whatever the datagram holds
+            self.roster.drop(sender, "datagram", f"does not parse ({type(error).__name__})")
+
     def _frame(self, frame: Any) -> None:
         arrival = self._clock()
         for found in frame.rigid_bodies:
             body = self._names.get(found.id_num)
-            if body is None:
-                continue
-            if found.tracking_valid is False:  # None before NatNet 2.6, which does not say
-                self.untracked += 1
-                continue
-            self.hand_over(
-                Pose(
-                    float(frame.suffix.timestamp), arrival, body, tuple(found.pos), tuple(found.rot)
-                )
-            )
+            if body is not None:
+                stamp, pos, rot = float(frame.suffix.timestamp), tuple(found.pos), tuple(found.rot)
+                # None before NatNet 2.6, which does not say. Motive sends the last position on.
+                valid = found.tracking_valid is not False
+                self.hand_over(Pose(stamp, arrival, body, pos, rot, valid=valid))
 
     def close(self) -> None:
         self._client.shutdown()
         super().close()
+
+
+@functools.cache
+def bounded_buffer(module: Any) -> Any:
+    """Return the package's buffer, which believes no count that is larger than the datagram."""
+
+    class Bounded(module.packet_buffer.PacketBuffer):
+        def read_float32_array(self, count: int) -> tuple[float, ...]:
+            if 4 * count > len(self.data) - self.pointer:
+                raise ValueError(f"{count} numbers in {len(self.data)} bytes")
+            return super().read_float32_array(count)
+
+    return Bounded
 
 
 def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
@@ -229,27 +355,3 @@ def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:
             f" name of its own. {suggest('', BODIES)}"
         )
     return names
-
-
-def _no_answer(params: MocapParams, why: str | None) -> SourceError:
-    why = why or f"no answer within {params.timeout:g} s"
-    return SourceError(
-        f"{params.system} at {params.host}: {why}; expected a motion-capture system that streams"
-    )
-
-
-def _probe(params: MocapParams) -> None:
-    """Try whether the system answers: the package's connect holds the interpreter until it does,
-    and would hold the run as well.
-    """
-    command = [sys.executable, "-c", PROBE, params.system, json.dumps(params.options)]
-    try:
-        tried = subprocess.run(
-            command, timeout=params.timeout, capture_output=True, text=True, check=False
-        )
-    except subprocess.TimeoutExpired:
-        raise _no_answer(params, None) from None
-    if tried.returncode:
-        raise _no_answer(
-            params, (tried.stderr.strip().splitlines() or [f"status {tried.returncode}"])[-1]
-        )

@@ -31,13 +31,13 @@ from visthrow.logs.check import physics
 from visthrow.logs.flightlog import Channel, FlightLog
 
 
-def read_poses(params: HilParams) -> list[Pose]:
+def read_poses(params: HilParams, roster: Roster | None = None) -> list[Pose]:
     """Return all raw poses of the recording that a config names; raises `SourceError` where the
-    file cannot be read.
+    file cannot be read. ``roster`` counts what is no pose.
     """
     source = params.source
     if source.kind == "tlog":
-        return read_tlog(source.file, source.senders)
+        return read_tlog(source.file, source.senders, roster)
     if source.kind in ("bin", "ulg"):
         return read_autopilot(source.file, source.logs, source.kind)
     return read_table(source.file, source.mapping)
@@ -79,13 +79,14 @@ def open_source(
     """
     source = params.source
     if source.kind not in LIVE:
-        poses = read_poses(params)
+        roster = Roster(tell=tell)
+        poses = read_poses(params, roster)
         problems = unit_problems(poses, params.frames) if source.check_units else []
         if problems:
             raise SourceError(
                 f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)"
             )
-        return Recorded(poses), None, True
+        return Recorded(poses, roster), None, True
     own = source.kind == "mavlink" and source.device is not None
 
     def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
@@ -111,7 +112,7 @@ def open_source(
         )
     if source.kind == "mocap":
         return (
-            open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link),
+            open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link, tell),
             link,
             False,
         )
@@ -127,13 +128,14 @@ def open_mocap(
     clock: Callable[[], float],
     remote: bool,
     link: Link | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> MocapSource:
     """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this
     machine without the config's leave.
     """
     check_device(f"tcp:{params.host}:1", remote=remote)
     return {"natnet": NatNetSource, "ros2": Ros2Source}.get(params.system, MotionCaptureSource)(
-        params, bodies, clock, link
+        params, bodies, clock, link, tell=tell
     )
 
 

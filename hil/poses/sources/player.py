@@ -28,8 +28,9 @@ from typing import Annotated
 import numpy as np
 
 from hil.errors import SourceError
+from hil.links.roster import Roster
 from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Body, Pose
-from hil.poses.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder
+from hil.poses.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder, seen_of
 from visthrow.common.errors import LogError, suggest
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs import read
@@ -170,12 +171,17 @@ def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
 
 
 @_as_source()
-def read_tlog(path: str | Path, bodies: tuple[BodyIds, ...]) -> list[Pose]:
-    """Return poses of a .tlog; arrivals are seconds from its first message.
+def read_tlog(
+    path: str | Path, bodies: tuple[BodyIds, ...], roster: Roster | None = None
+) -> list[Pose]:
+    """Return poses of a .tlog; arrivals are seconds from its first message. ``roster`` counts what
+    is a body's and no pose.
 
     Raises `SourceError` where nothing in it is a message.
     """
-    decoder, poses, first = MavlinkDecoder(bodies), [], None
+    roster = roster or Roster()
+    decoder = MavlinkDecoder(bodies, lambda m, why: roster.refuse(seen_of(m, None, why)))
+    poses, first = [], None
     for arrival, message in messages.telemetry(path):
         first = arrival if first is None else first
         pose = decoder.feed(message, arrival - first)

@@ -157,11 +157,12 @@ class Ros2Source(MocapSource):
         bodies: tuple[RigidBody, ...],
         clock: Callable[[], float],
         link: Link | None = None,
+        tell: Callable[[str], None] | None = None,
     ) -> None:
         """Subscribe; arguments and errors as `hil.poses.sources.mocap.MotionCaptureSource`, and a
         name that is no ``TYPE:TOPIC``.
         """
-        super().__init__(clock, link)
+        super().__init__(clock, link, tell)
         wanted = [(*_topic(name), body) for name, body in body_names(bodies).items()]
         types, self._domain = message_types(), domain(params)
         core, sub, topic = (
@@ -177,25 +178,43 @@ class Ros2Source(MocapSource):
                     self._domain[1],
                     described,
                     qos=quality,
-                    listener=self._listener(core, kind, body, frames),
+                    listener=self._listener(core, kind, place, body, frames),
                 )
             )
 
-    def _listener(self, core: Any, kind: str, body: str, frames: str) -> Any:
+    def _listener(self, core: Any, kind: str, place: str, body: str, frames: str) -> Any:
         source = self
 
         class Listener(core.Listener):
             def on_data_available(self, reader: Any) -> None:
-                arrival = source._clock()
-                for message in reader.take(MOST_TAKEN):
-                    for stamp, pos, quat in (
-                        placed(kind, message, frames)
-                        if hasattr(message, "__dataclass_fields__")
-                        else ()
-                    ):
-                        source.hand_over(Pose(stamp, arrival, body, pos, quat))
+                try:
+                    messages = reader.take(MOST_TAKEN)
+                except Exception as error:  # of the package: a sample that it cannot read
+                    source.drop(place, f"does not parse ({type(error).__name__})")
+                    return
+                for message in messages:
+                    source.take(message, kind, place, body, frames)
 
         return Listener()
+
+    def drop(self, place: str, why: str) -> None:
+        """Count what came on a topic and is no pose."""
+        self.roster.drop((place, 0), "message", why)
+
+    def take(self, message: Any, kind: str, place: str, body: str, frames: str) -> None:
+        """Take a message of a topic; the first publisher of a body's poses is heard, no other."""
+        arrival = self._clock()
+        if not hasattr(message, "__dataclass_fields__"):  # a publisher has come or gone
+            return
+        try:
+            poses = list(placed(kind, message, frames))
+        except Exception as error:  # whatever the package made of what came
+            self.drop(place, f"does not parse ({type(error).__name__})")
+            return
+        writer = f"publisher {message.sample_info.publication_handle} of {place}"
+        if poses and self.roster.claim(body, (writer, 0), arrival):
+            for stamp, pos, quat in poses:
+                self.hand_over(Pose(stamp, arrival, body, pos, quat))
 
     def close(self) -> None:
         for reader in self._readers:

@@ -3,7 +3,7 @@ packages where they are.
 """
 
 import dataclasses
-import sys
+import importlib
 import threading
 import time
 from types import SimpleNamespace
@@ -63,10 +63,83 @@ def test_rigid_bodies_by_name_from_a_thread_of_their_own():
     assert (first.body, first.pos, first.quat) == ("vehicle", (1.0, 0.0, 1.0), (0.1, 0.2, 0.3, 0.9))
     assert first.stamp == first.arrival == 5.0
     assert [(pose.body, pose.arrival) for pose in second] == [("payload", 6.0), ("vehicle", 6.0)]
-    system.next.release()  # the third frame does not exist: the package raises
-    eventually(lambda: source.failure)
-    assert "StopIteration" in source.failure
-    assert source.poll(0.0) == []
+    source.close()
+
+
+def test_a_frame_that_raises_is_dropped_and_counted():
+    """A body that is occluded, as libmotioncapture's Vicon raises it (its issue 9), and a position
+    of two numbers: the other body goes on.
+    """
+
+    class Occluded:
+        @property
+        def position(self):
+            raise RuntimeError("occluded")
+
+    short = SimpleNamespace(position=[1.0, 2.0], rotation=body(0.0).rotation)
+    frames = [{"quad": Occluded(), "ball": body(1.0)}, {"quad": short, "ball": body(2.0)}]
+    system, said = System(frames), []
+    module = SimpleNamespace(connect=lambda *args: system)
+    source = MotionCaptureSource(PARAMS, BODIES, lambda: 1.0, module=module, tell=said.append)
+    for _ in range(5):  # two frames, and three that the package does not have: it raises
+        system.next.release()
+    eventually(lambda: source.roster.refused == 5)
+    assert [(p.body, p.pos[0]) for p in source.poll(0.0)] == [("payload", 1.0), ("payload", 2.0)]
+    assert source.failure is None
+    assert len(said) == 3, "each kind once"
+    assert "body quad from 127.0.0.1: RuntimeError: occluded" in said[0]
+    assert "frame from 127.0.0.1: StopIteration" in said[2]
+    source.close()
+
+
+CRASHES = """
+import os, time
+from types import SimpleNamespace as N
+class System:
+    n = 0
+    def waitForNextFrame(self):
+        time.sleep(0.005)
+        self.n += 1
+        if self.n == 20:
+            os.abort()  # as a parser in C++ that reads beyond the end of a datagram
+    @property
+    def rigidBodies(self):
+        turn = N(x=0.0, y=0.0, z=0.0, w=1.0)
+        return {"quad": N(position=[0.01 * self.n, 0.0, 1.0], rotation=turn)}
+def connect(*args):
+    print("what the package prints")
+    return System()
+"""
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Writes a stand-in of motioncapture for other processes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    importlib.invalidate_caches()
+    return (tmp_path / "motioncapture.py").write_text
+
+
+def test_a_package_that_crashes_is_started_again_on_the_ground_alone(package, monkeypatch):
+    package(CRASHES)
+    monkeypatch.setattr("hil.poses.sources.mocap.AGAIN", 0.05)
+    said = []
+    patient = dataclasses.replace(PARAMS, timeout=30.0)
+    source = MotionCaptureSource(patient, BODIES, time.monotonic, tell=said.append)
+    source.hold(True)
+    eventually(lambda: source.failure is not None)
+    assert len(source.poll(0.0)) == 19
+    assert said == [
+        "motion capture stopped: SourceError: its process ended with -6; it is started again on the"
+        " ground"
+    ]
+    time.sleep(0.5)
+    assert source.poll(0.0) == [], "not in flight"
+    source.hold(False)
+    eventually(lambda: source.failure is None)
+    eventually(lambda: source.poll(0.0))
+    assert said[1] == "motion capture is connected again"
     source.close()
 
 
@@ -91,21 +164,15 @@ def connect(kind, options):
 """
 
 
-def test_a_package_that_holds_the_interpreter_holds_nothing_up(tmp_path, monkeypatch):
-    (tmp_path / "motioncapture.py").write_text(BLOCKS)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.delitem(sys.modules, "motioncapture", raising=False)
+def test_a_package_that_holds_the_interpreter_holds_nothing_up(package):
+    package(BLOCKS)
     begin = time.monotonic()
     with pytest.raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 1 s"):
         MotionCaptureSource(PARAMS, BODIES, time.monotonic)
     assert time.monotonic() - begin < 30.0
-    (tmp_path / "motioncapture.py").write_text(
-        "def connect(*args):\n    raise RuntimeError('no such host')\n"
-    )
+    package("def connect(*args):\n    raise RuntimeError('no such host')\n")
     with pytest.raises(SourceError, match="RuntimeError: no such host"):
         MotionCaptureSource(dataclasses.replace(PARAMS, timeout=60.0), BODIES, time.monotonic)
-    sys.modules.pop("motioncapture", None)
 
 
 class Client:
@@ -142,7 +209,7 @@ def frame(*rows, stamp=3.5):
 IDS = (RigidBody("vehicle", "7"), RigidBody("payload", "8"))
 
 
-def test_natnet_by_streaming_id_drops_what_motive_does_not_track():
+def test_natnet_by_streaming_id_calls_invalid_what_motive_does_not_track():
     clients = []
     module = SimpleNamespace(
         NatNetClient=lambda **kwargs: clients.append(Client(**kwargs)) or clients[-1]
@@ -156,11 +223,11 @@ def test_natnet_by_streaming_id_drops_what_motive_does_not_track():
     (hear,) = client.on_data_frame_received_event.handlers
     hear(frame((7, 0.5, True), (8, 0.7, False), (9, 3.0, True)))
     hear(frame((8, 0.8, None)))
-    assert [(p.body, p.pos, p.stamp, p.arrival) for p in source.poll(0.0)] == [
-        ("vehicle", (0.5, 1.0, 0.0), 3.5, 9.0),
-        ("payload", (0.8, 1.0, 0.0), 3.5, 9.0),
+    assert [(p.body, p.pos, p.stamp, p.arrival, p.valid) for p in source.poll(0.0)] == [
+        ("vehicle", (0.5, 1.0, 0.0), 3.5, 9.0, True),
+        ("payload", (0.7, 1.0, 0.0), 3.5, 9.0, False),
+        ("payload", (0.8, 1.0, 0.0), 3.5, 9.0, True),
     ]
-    assert source.untracked == 1
     source.close()
     assert not client.running
 

@@ -1,0 +1,75 @@
+"""Sources of poses against what comes at their ports: cut, random and forged datagrams and frames
+end no thread, change no throw, and are counted.
+"""
+
+import socket
+import threading
+import time
+
+import pytest
+
+from hil.poses.sources.mocap import MocapParams, NatNetSource, RigidBody
+from tests.motive import Motive, frame
+
+IDS = (RigidBody("vehicle", "7"), RigidBody("payload", "8"))
+LEVEL, UNKNOWN = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0)
+
+
+def eventually(condition):
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def motive():
+    server = Motive()
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def natnet(motive):
+    pytest.importorskip("natnet", reason="extra natnet")
+    said = []
+    params = MocapParams("natnet", "127.0.0.1", multicast=False, timeout=10.0)
+    source = NatNetSource(params, IDS, time.monotonic, tell=said.append)
+    yield source, said
+    source.close()
+
+
+def test_bad_datagrams_end_no_thread_of_natnet(motive, natnet):
+    source, said = natnet
+    threads = [thread for thread in threading.enumerate() if "socket_thread" in thread.name]
+    assert len(threads) == 2
+    good = frame(1.0, (7, (0.5, 1.0, 0.0), LEVEL, True), (8, (0.5, 0.4, 0.0), UNKNOWN, False))
+    counts = frame(1.5)
+    bomb = counts[:28] + b"\1\0\0\0" + b"\0\0\0\0" + b"\1\0\0\0" + b"\xff\xff\xff\x3f" + counts[44:]
+    for data in (good[:-1], b"\7", b"\7\0\4\0\1\0\0\0", b"\7\0\0\0", b"noise", b"", bomb):
+        motive.send(data)
+    stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    stranger.bind(("127.0.0.9", 0))
+    stranger.sendto(frame(2.0, (7, (9.0, 9.0, 9.0), LEVEL, True)), motive.client)
+    eventually(lambda: source.roster.refused == 8)
+    motive.send(good)
+    second = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    second.bind(("127.0.0.1", 0))
+    eventually(lambda: len(source._waiting) == 2)
+    second.sendto(frame(3.0, (7, (9.0, 9.0, 9.0), LEVEL, True)), motive.client)
+    eventually(lambda: source.roster.refused == 9)
+    vehicle, payload = source.poll(0.0)
+    assert (vehicle.body, vehicle.pos, vehicle.stamp, vehicle.valid) == (
+        "vehicle",
+        (0.5, 1.0, 0.0),
+        1.0,
+        True,
+    )
+    assert not payload.valid
+    assert all(thread.is_alive() for thread in threads)
+    assert source.failure is None
+    assert sum("does not parse" in text for text in said) >= 1
+    assert any("source.mocap.host is 127.0.0.1" in text and "127.0.0.9" in text for text in said)
+    assert any("a second sender; the Motive speaks from 127.0.0.1:1510" in text for text in said)
+    stranger.close()
+    second.close()
