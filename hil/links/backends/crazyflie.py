@@ -76,7 +76,7 @@ class Crazyflie(OnPort):
     def __init__(
         self, port: Port, params: CrazyflieParams, tell: Callable[[str], None] | None = None
     ) -> None:
-        """Speak CRTP on an open port; ``tell`` is handed the table of settings and who is refused."""
+        """Speak CRTP on an open port; ``tell`` is handed the settings and who is refused."""
         super().__init__(port, params.silence, tell)
         self.params = params
         self.release_record = Release(params.release_timeout)

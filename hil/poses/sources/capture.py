@@ -24,7 +24,7 @@ LOOK = 0.5  # between two looks for sockets that the package has opened [s]
 
 PR_SET_PDEATHSIG, SO_ATTACH_FILTER, SO_MEMINFO, DROPS = 1, 26, 55, 8
 PROGRAM = struct.Struct("HBBI")  # of one instruction of a filter: code, jump if true, if false, k
-SENDER = 0xFFFFF000 + 12  # SKF_NET_OFF and the place of the sender's address in IPv4's header
+SENDER = 0xFFF00000 + 12  # SKF_NET_OFF and the place of the sender's address in IPv4's header
 LOAD, EQUAL, RETURN = 0x20, 0x15, 0x06
 
 Put = Callable[[Any], None]

@@ -126,6 +126,29 @@ def test_a_marker_has_no_attitude():
     assert gate.check(pose(0.01, 0.01, None)) is None
 
 
+@pytest.mark.parametrize("quat", [(math.nan,) * 4, (0.0,) * 4, (0.0, math.nan, 0.0, 1.0)])
+def test_a_single_marker_is_a_position(quat):
+    """The vehicle's attitude is needed, a ball's is not. A body that is not seen is neither."""
+    frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
+    for turns, reason in ((True, "quaternion"), (False, None)):
+        track = Track(frames, PARAMS, EstimateParams(0.055, 2), turns)
+        refused = track.update(pose(0.0, 0.1, quat))
+        assert refused == ("finite" if turns and math.isnan(sum(quat)) else reason)
+        zeros = Pose(1.0, 1.0, "payload", (0.0, 0.0, 0.0), quat)
+        assert track.update(zeros) == "invalid"
+        assert track.update(pose(0.01, 0.1, valid=False)) == "invalid"
+        assert track.gate.refused["invalid"] == 2
+
+
+def test_a_stamp_that_is_no_time_spoils_no_velocity():
+    frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
+    track = Track(frames, PARAMS, EstimateParams(0.055, 2))
+    assert track.update(Pose(1e300, 0.0, "vehicle", (0.0, 0.0, 1.0), LEVEL)) == "stamp"
+    for i in range(1, 8):
+        assert track.update(pose(0.01 * i, 0.01 * i)) is None
+    assert track.state(0.07).vel == pytest.approx((1.0, 0.0, 0.0))
+
+
 def test_wrong_limits():
     with pytest.raises(ConfigError, match="ascending"):
         GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.1, 0.04, 0.25)

@@ -4,12 +4,15 @@ packages where they are.
 
 import dataclasses
 import importlib
+import socket
+import sys
 import threading
 import time
 from types import SimpleNamespace
 
 import pytest
 
+from bench.processes import free_port
 from hil.errors import LinkError, SourceError
 from hil.params import HilParams
 from hil.poses.sources.mocap import MocapParams, MotionCaptureSource, NatNetSource, RigidBody
@@ -140,6 +143,48 @@ def test_a_package_that_crashes_is_started_again_on_the_ground_alone(package, mo
     eventually(lambda: source.failure is None)
     eventually(lambda: source.poll(0.0))
     assert said[1] == "motion capture is connected again"
+    source.close()
+
+
+HEARS_ANYBODY = """
+import socket
+from types import SimpleNamespace as N
+class System:
+    def __init__(self, options):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", int(options["port"])))
+        self.rigidBodies = {}
+    def waitForNextFrame(self):
+        x = float(self.socket.recv(100))
+        turn = N(x=0.0, y=0.0, z=0.0, w=1.0)
+        self.rigidBodies = {"quad": N(position=[x, 0.0, 1.0], rotation=turn)}
+def connect(kind, options):
+    return System(options)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the filter is Linux's")
+def test_the_package_hears_the_host_alone(package):
+    """Whatever sockets it opens, other senders' datagrams do not get to them, and are counted."""
+    package(HEARS_ANYBODY)
+    port, said = free_port(), []
+    params = dataclasses.replace(PARAMS, timeout=30.0, settings={"port": str(port)})
+    source = MotionCaptureSource(params, BODIES, time.monotonic, tell=said.append)
+    senders = {}
+    for host in ("127.0.0.1", "127.0.0.2"):
+        senders[host] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        senders[host].bind((host, 0))
+    taken, deadline = [], time.monotonic() + 30.0
+    while len(taken) < 20 or not source.roster.refused:
+        assert time.monotonic() < deadline
+        senders["127.0.0.2"].sendto(b"9.0", ("127.0.0.1", port))
+        senders["127.0.0.1"].sendto(b"1.0", ("127.0.0.1", port))
+        time.sleep(0.05)
+        taken += [pose.pos[0] for pose in source.poll(0.0)]
+    assert set(taken[1:]) == {1.0}, "the first may come before the filter"
+    assert "datagram from others: source.mocap.host is 127.0.0.1" in said[0]
+    for one in senders.values():
+        one.close()
     source.close()
 
 

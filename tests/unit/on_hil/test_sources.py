@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 from hil.errors import SourceError
+from hil.links.mavlink_link import Link
 from hil.links.pymav import Parser, mav
+from hil.links.roster import Party, Roster
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.poses.pose import Pose
 from hil.poses.sources.base import Recorded
-from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder
+from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.poses.sources.player import read_table, read_tlog
+from tests.loopback.wire import pipe
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -35,24 +38,10 @@ def mocap(time_us=1_000_000, x=1.0):
     return mav.MAVLink_att_pos_mocap_message(time_us, [1.0, 0.0, 0.0, 0.0], x, 2.0, 3.0)
 
 
-def odometry():
-    return mav.MAVLink_odometry_message(
-        7,
-        20,
-        12,
-        1.0,
-        2.0,
-        3.0,
-        [1.0, 0.0, 0.0, 0.0],
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        [0.0] * 21,
-        [0.0] * 21,
-    )
+def odometry(frame=mav.MAV_FRAME_LOCAL_FRD, quality=0):
+    quat, none = [1.0, 0.0, 0.0, 0.0], [0.0] * 21
+    rest = (*[0.0] * 6, none, none, 0, 0, quality)
+    return mav.MAVLink_odometry_message(7, frame, 12, 1.0, 2.0, 3.0, quat, *rest)
 
 
 def test_bodies_are_told_apart_by_their_senders():
@@ -84,6 +73,59 @@ def test_a_local_position_takes_the_attitude_of_its_sender():
     )
     late = wired(mav.MAVLink_local_position_ned_message(1100, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
     assert decoder.feed(late, 0.0) is None, "too old an attitude"
+
+
+def test_a_local_position_takes_angles_as_well():
+    """ArduPilot streams ATTITUDE, and ATTITUDE_QUATERNION only where it is asked to."""
+    decoder = MavlinkDecoder((BodyIds("vehicle", "LOCAL_POSITION_NED", 1, 1),))
+    decoder.feed(
+        wired(mav.MAVLink_attitude_message(990, 0.0, 0.0, math.pi / 2, 0.1, 0.2, 0.3)), 0.0
+    )
+    local = mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    pose = decoder.feed(wired(local), 0.5)
+    assert pose.quat == pytest.approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
+    assert pose.rate == pytest.approx((0.1, 0.2, 0.3))
+
+
+def test_an_estimate_that_failed_is_no_pose():
+    decoder = MavlinkDecoder((BodyIds("vehicle", "ODOMETRY", 1, 1),))
+    valid = [decoder.feed(wired(odometry(quality=q)), 0.0).valid for q in (-1, 0, 1, 100)]
+    assert valid == [False, True, True, True]
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
+    """In a recording and on a link: an ODOMETRY in other frames, a position without an attitude."""
+    senders = (
+        BodyIds("vehicle", "ODOMETRY", 1, 1),
+        BodyIds("payload", "LOCAL_POSITION_NED", 1, 25),
+    )
+    packed = [
+        (odometry(mav.MAV_FRAME_LOCAL_FLU), 1),
+        (mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 25),
+    ]
+    if live:
+        here, there = pipe()
+        parties = [Party(b.body, b.system, b.component, frozenset({b.message})) for b in senders]
+        source = MavlinkSource(Link(here, roster=Roster(parties)), senders, lambda: 1.0)
+        for message, component in packed:
+            there.write(message.pack(mav.MAVLink(None, 1, component)))
+        assert source.poll(1.0) == []
+        (roster,) = source.rosters
+    else:
+        roster = Roster()
+        writer = TlogWriter(tmp_path / "x.tlog")
+        for message, component in packed:
+            writer.write(wired(message, 1, component))
+        writer.close()
+        assert read_tlog(tmp_path / "x.tlog", senders, roster) == []
+    reasons = {seen.why: count for seen, count in roster.seen.items() if seen.why}
+    assert reasons == {
+        "frame LOCAL_FLU is not taken; expected LOCAL_NED or LOCAL_FRD": 1,
+        "no ATTITUDE_QUATERNION or ATTITUDE within 50 ms of it": 1,
+    }
+    with pytest.raises(SourceError, match=r"1 ODOMETRY of system 1.*frame LOCAL_FLU is not taken"):
+        Recorded([], roster)
 
 
 def test_senders_that_clash_are_refused():
