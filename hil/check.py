@@ -33,6 +33,7 @@ from visthrow.onboard.policy import Policy, find_policy
 CALM = 0.15  # speed below which a hover counts as steady [m/s]
 LIFTED = 0.3  # height above which a vehicle counts as flying [m]
 SETTLING = 50  # ticks at the beginning of a hover that are left out: a second
+FOR_EVER = 1e9  # [s]
 LISTEN, CARRY = (
     5.0,
     180.0,
@@ -83,37 +84,70 @@ def _hand_carry(args: argparse.Namespace) -> int:
 
 
 def _listen(args: argparse.Namespace) -> int:
-    """Look at poses and autopilot for a while, and command nothing."""
+    """Look at poses and autopilot for a while, and command nothing.
+
+    The runner that would fly looks on, and stays before its take-over.
+    """
     params = params_of(args)
+    waiting = dataclasses.replace(params.states, idle=FOR_EVER, check=FOR_EVER, check_hold=FOR_EVER)
     with _opened(params, args) as (source, link, clock, _):
-        runner = Runner(params, Policy.load(find_policy(params.policy)), DryRun())
+        runner = Runner(
+            dataclasses.replace(params, states=waiting),
+            Policy.load(find_policy(params.policy)),
+            DryRun(),
+        )
         autopilot = AutopilotCheck(params, make_backend(params, link))
         begin, seconds, poses = clock.now(), args.seconds or LISTEN, []
+        last: list[str] = []
         while clock.now() - begin < seconds and not source.ended:
             now = clock.now()
             came = source.poll(now)
             poses += came
+            runner.hear(source.rivals(now))
             runner.tick(now, came, runner.backend.status(now), OperatorInput())
+            last = runner.problems() or last
             autopilot.tick(now, runner)
             clock.sleep_until(now + runner.pilot.period)
         now = clock.now()
         found = autopilot.results(now, runner.mass)
         autopilot.backend.close()
+    rosters = [*source.rosters, *filter(None, [getattr(autopilot.backend, "roster", None)])]
     for name, track in runner.tracks.items():
-        print(_body_line(name, track, now, now - begin))
-    for one in source.links:
-        print("\n".join(_link_lines(one.roster, params, now - begin)))
+        print(_body_line(name, track, now, now - begin, source.stamped))
+    for roster in rosters:
+        print("".join(f"{line}\n" for line in _link_lines(roster, params, now - begin)), end="")
     problems = (
         runner.problems()
+        + _not_taken(rosters, now - begin)
         + unit_problems(poses, params.frames)
         + [text for good, text in found if not good]
     )
+    held, wanted = runner.machine.held(now), params.states.check_hold
+    if not problems and held < wanted:
+        problems = [
+            f"all was well for the last {held:.1f} s; expected {wanted:g} s:"
+            f" {'; '.join(last) or 'look longer, with --seconds'}"
+        ]
     print("".join(f"{text}\n" for good, text in found if good), end="")
-    print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks")
+    print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks: a run would hover")
     return 1 if problems else 0
 
 
-def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
+def _not_taken(rosters: list[Roster], seconds: float) -> list[str]:
+    """Return which messages of those that are heard are no poses, and why; a few are none of note,
+    as of a position before the first attitude.
+    """
+    return [
+        f"{count} {seen.text()}"
+        for roster in rosters
+        for seen, count in roster.seen.items()
+        if seen.why and seen.system is not None and seen.address in (None, *roster.at.values())
+        if count > seconds
+    ]
+
+
+def _body_line(name: str, track: Track, now: float, seconds: float, stamped: bool) -> str:
+    flow = track.stream.flow(now)
     state, refused = (
         track.state(now),
         (json.dumps(track.gate.refused) if track.gate.refused else "none"),
@@ -125,6 +159,8 @@ def _body_line(name: str, track: Track, now: float, seconds: float) -> str:
         f"{name}: {track.accepted / seconds:.0f} poses/s, age {1e3 * state.age:.0f} ms, at"
         f" ({x:+.3f}, {y:+.3f}, {z:+.3f}) m, refused: {refused}, velocity late by"
         f" {max(0.0, 1e3 * track.filter.lag):.0f} ms"
+        + ("" if flow is None else f"\n  {flow.text()}")
+        + (" (stamps are arrivals: the source tells no time)" if not stamped else "")
     )
 
 

@@ -138,6 +138,7 @@ class Loop:
         if over:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
+        runner.hear(source.rivals(now))
         asked = time.perf_counter()
         if self.eyes is not None:
             self.eyes.hint = runner.hint(now)

@@ -93,6 +93,7 @@ class Runner:
         mount_b: where the rope hangs on the vehicle [m]. seen_goal_w: target as of the last tick
             [m].
         spent: time that parts of the last tick took [s]; those that it did not do are missing.
+        inputs: what the last tick knew; None before it.
         watcher: called with each pose's body and track once it was taken; None for nobody.
     """
 
@@ -161,6 +162,8 @@ class Runner:
             Calibrating(params.calibration, lambda: self.seen_goal_w) if wants else None
         )
         self._calibration: Calibration | str | None = None
+        self._rivals: list[str] = []
+        self.inputs: Inputs | None = None
 
     def tick(
         self,
@@ -229,6 +232,10 @@ class Runner:
                 pos - [0.0, 0.0, self.hang],
                 goal_w,
             )
+
+    def hear(self, rivals: list[str]) -> None:
+        """Take in, before a tick, for whom two senders speak; see `hil.links.roster.Roster`."""
+        self._rivals = rivals
 
     def look(self, detections: list[Detection]) -> None:
         """Take in what a camera saw since the last tick; of several frames the newest counts."""
@@ -310,7 +317,7 @@ class Runner:
         self, now: float, seen: Seen, status: Status, words: OperatorInput, recording: bool
     ) -> tuple[Decision, State]:
         """Move the state machine on, and do what a change of state brings with it."""
-        inputs = self._inputs(now, seen, status, words, recording)
+        self.inputs = inputs = self._inputs(now, seen, status, words, recording)
         state = self.machine.step(now, inputs)
         # The last tick may itself have ended in another state than it acted in: a command refused,
         # an exception.
@@ -321,6 +328,7 @@ class Runner:
             self.backend.stop_release()
             self._stop_at = math.inf
         decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
+        decision.rivals = self._rivals or None
         detection, self._detection = self._detection, None
         if self.detections is not None and detection is not None:
             decision.seen = detection.values()
@@ -521,7 +529,18 @@ class Runner:
             status.mode == FOLLOW,
             status.note,
             words.why,
+            tuple(self._streams(now)) if state in (State.IDLE, State.CHECK) else (),
         )
+
+    def _streams(self, now: float) -> list[str]:
+        """Return what is wrong with how the poses come."""
+        judged = [
+            f"{name}: {text}"
+            for name, track in self.tracks.items()
+            if name != GOAL
+            for text in track.stream.problems(now)
+        ]
+        return judged + self._rivals
 
     def _thrust_off(self) -> list[str]:
         """Return whether hovering takes another thrust than the weight: then the calibration is
@@ -628,16 +647,13 @@ class Runner:
         return out
 
     def problems(self) -> list[str]:
-        """Return what speaks against a throw as of the last poses."""
-        bodies = {name: track.state(0.0) for name, track in self.tracks.items()}
-        goal_w = self._goal(bodies)
-        missing = [f"no good pose of the {name}" for name, state in bodies.items() if state is None]
-        if missing:
-            return missing
-        p = self.params
-        return failed_checks(
-            p.check, p.fence, bodies[VEHICLE], bodies[PAYLOAD], goal_w, p.home_w, self.hang
-        )
+        """Return what speaks against taking the vehicle over, as of the last tick."""
+        seen = self.inputs
+        if seen is None:
+            return ["nothing was looked at"]
+        missing = [f"no good pose of the {n}" for n, t in self.tracks.items() if not t.accepted]
+        checks = seen.failed_checks if not missing else ()
+        return [*(missing or seen.missing()), *seen.streams, *checks]
 
     def summary(self) -> dict[str, Any]:
         """Return counts of the run so far."""

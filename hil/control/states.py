@@ -78,6 +78,7 @@ class Inputs:
     following: bool = True  # the autopilot follows commands
     note: str = ""  # of the autopilot: what is wrong, or what it waits for
     why: str = ""  # of the abort, where it was no word
+    streams: tuple[str, ...] = ()  # what is wrong with how the poses come, before the take-over
 
     def missing(self) -> list[str]:
         """Return what has to be there before anything is checked, and is not."""
@@ -174,7 +175,8 @@ class Machine:
         """Return why it does not go on, in words; empty where nothing is in the way but time."""
         texts: list[str] = []
         if self.state in (State.IDLE, State.CHECK, State.READY, State.ARMED):
-            texts = seen.missing() if self.state in (State.IDLE, State.CHECK) else []
+            if self.state in (State.IDLE, State.CHECK):
+                texts = [*seen.missing(), *seen.streams]
             texts += seen.failed_checks if self.state is not State.IDLE else ()
         if self.state in (State.READY, State.ARMED):
             texts += [] if seen.payload < HOLD else ["no fresh pose of the payload"]
@@ -198,6 +200,10 @@ class Machine:
             self._held = now
         return now - self._held >= time - 1e-9
 
+    def held(self, now: float) -> float:
+        """Return for how long what must last has lasted [s]."""
+        return 0.0 if self._held is None else now - self._held
+
     def _late(self, now: float) -> bool:
         return now - self.since > getattr(self.params, self.state.value)
 
@@ -208,7 +214,7 @@ class Machine:
             self._go(now, State.ABORT, f"{', '.join(seen.missing())}, for {self.params.idle:g} s")
 
     def _check(self, now: float, seen: Inputs) -> None:
-        good = not seen.failed_checks and max(seen.vehicle, seen.payload) < HOLD and seen.connected
+        good = not (seen.missing() or seen.failed_checks or seen.streams)
         if self._lasted(now, good, self.params.check_hold):
             self._go(now, State.READY, "checks passed")
         elif self._late(now) and not self.patient:
@@ -326,6 +332,7 @@ class Decision:
     seen: list | None = (
         None  # of a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
     )
+    rivals: list[str] | None = None  # for whom two senders speak, in words
     calibration: dict | str | None = (
         None  # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
     )

@@ -31,8 +31,8 @@ REASONS = {
     "finite": "NaN or infinite numbers",
     "stamp": "stamps that are no time",
     "quaternion": "attitudes that are no unit quaternions",
-    "old": "stamps not after the last one's: doubled, reordered, or not stamped",
-    "repeated": "the last pose again",
+    "old": "stamps not after the last one's: reordered, or not stamped",
+    "repeated": "the last pose again, or a datagram that came twice",
     "swapped": "where the other body is expected",
     "cable": "farther from the other body than the cable is long",
     "jump": "jumps",
@@ -133,10 +133,11 @@ class Gate:
             self.jumped = True
             return "reset"
         stepped = self.stepped(pose)
+        same = pose.pos == last.pos and pose.quat == last.quat
         if pose.stamp <= last.stamp and not stepped:
-            return "old"
+            return "repeated" if same and pose.stamp == last.stamp else "old"
         came, self._came = self._came or last, pose
-        if pose.pos == last.pos and pose.quat == last.quat:
+        if same:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
         age, gap = (

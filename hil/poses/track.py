@@ -8,6 +8,7 @@ from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector, known
+from hil.poses.stream import Stream
 from visthrow.common.rotations import multiply
 
 MOST_PREDICTION = (
@@ -39,7 +40,7 @@ class BodyState:
 
 class Track:
     """Follows one body with a ``gate``, which counts what was refused, and a ``filter``;
-    ``accepted`` counts poses taken.
+    ``accepted`` counts poses taken, ``stream`` judges how they come.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class Track:
         without.
         """
         self._turns = turns
+        self.stream = Stream(gate, estimate)
         self.frames, self.gate, self.filter = Frames(frames), Gate(gate), SlopeFilter(estimate)
         self.accepted = 0
         self._pose: Pose | None = None
@@ -70,6 +72,11 @@ class Track:
         ``tether``: the cable's other end, where one hangs. A body whose attitude nobody needs may
         have none.
         """
+        reason = self._taken(raw, tether)
+        self.stream.note(raw, reason)
+        return reason
+
+    def _taken(self, raw: Pose, tether: Tether | None) -> str | None:
         if raw.lost():
             raw = replace(raw, valid=False)
         if not self._turns and raw.quat is not None and not known(raw.quat):

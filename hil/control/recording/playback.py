@@ -65,6 +65,7 @@ class Playback:
             runner.look([Detection.of(line["seen"])])
         if (found := line.get("calibration")) is not None:
             runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
+        runner.hear(line.get("rivals") or [])
         decision = runner.tick(
             now, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
         )

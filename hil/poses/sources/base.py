@@ -19,6 +19,7 @@ class Source:
     """
 
     ended: bool = False  # nothing will come any more
+    stamped: bool = True  # whether stamps are the source's; else they are arrivals
 
     def __init__(
         self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0
@@ -48,6 +49,10 @@ class Source:
         were read.
         """
         return sum([link.pump(self._clock) for link in self.links])
+
+    def rivals(self, now: float) -> list[str]:
+        """Return for whom two senders speak at a time [s], in words."""
+        return [text for roster in self.rosters for text in roster.rivals(now)]
 
     def hold(self, flying: bool) -> None:
         """Say whether the vehicle is ours in flight: then nobody's address on the links

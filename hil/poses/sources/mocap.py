@@ -124,6 +124,8 @@ class MotionCaptureSource(MocapSource):
     source says why, and starts it again on the ground.
     """
 
+    stamped = False
+
     def __init__(
         self,
         params: MocapParams,

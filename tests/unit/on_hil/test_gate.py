@@ -180,7 +180,7 @@ def test_reordered_and_doubled_poses_are_dropped():
     body = track()
     order = [0, 1, 2, 4, 3, 5, 5, 6]
     reasons = [body.update(pose(0.01 * i, 0.01 * i, arrival=0.01 * n)) for n, i in enumerate(order)]
-    assert reasons == [None, None, None, None, "old", None, "old", None]
+    assert reasons == [None, None, None, None, "old", None, "repeated", None]
 
 
 def test_a_state_is_carried_forward():

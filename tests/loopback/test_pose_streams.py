@@ -1,0 +1,53 @@
+"""The same streams of poses to ``hil check`` and to a run: the check fails the bad ones for the
+reason that is true, and a run hovers on those alone that the check passes.
+"""
+
+import pytest
+
+from hil.control.loop import Loop
+from hil.control.runner import Runner
+from hil.control.states import OperatorInput
+from hil.links.backends.base import DryRun
+from hil.links.clock import ManualClock
+from hil.params import HilParams
+from tests.hil_flight import simple_policy
+from tests.pose_streams import SECONDS, STREAMS, Sent
+from visthrow import config
+from visthrow.cli import main
+
+SETTINGS = [
+    "policy=state",
+    "observe=false",
+    'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
+    '{ body = "payload", message = "ODOMETRY", system = 1, component = 25 }]',
+]
+
+
+class Nobody:
+    def words(self, state):
+        return OperatorInput()
+
+
+def loaded() -> HilParams:
+    return config.load(HilParams, config.find("hil", "dry_run"), SETTINGS)
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
+    stream, params = STREAMS[name], loaded()
+    sent = Sent(params, stream)
+    monkeypatch.setattr("hil.check.open_source", lambda *args: (sent, None, True))
+    words = [word for setting in SETTINGS for word in ("--set", setting)]
+    status = main(["hil", "check", "--seconds", f"{SECONDS - 0.1}", *words])
+    out = capsys.readouterr().out
+    fails = [line for line in out.splitlines() if line.startswith("FAIL")]
+    assert status == bool(stream.says), out
+    assert any(stream.says in line for line in fails) if stream.says else not fails, out
+
+    states, runner = [], Runner(params, simple_policy(), DryRun())
+    source, clock = Sent(params, stream), ManualClock(0.0)
+    loop = Loop(runner, source, clock, Nobody(), tell=lambda d: states.append((d.state, d.waits)))
+    loop.fly(SECONDS)
+    hovers = "ready" in [state for state, _ in states]
+    assert hovers == (not stream.says), states
+    assert not stream.says or any(waits for _, waits in states), "a run that waits says for what"
