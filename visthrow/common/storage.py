@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import StorageError
+from visthrow.common.unpacking import require_room
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
@@ -97,8 +98,8 @@ def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
 def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.ndarray]:
     """Read all arrays of an ``.npz`` without pickle.
 
-    Raises Exception: of class ``error``: no such file, cut short, damaged, or not what it should
-    be."""
+    Raises Exception: of class ``error``: no such file, cut short, damaged, not what it should be,
+    or more of it than its size lets expect."""
     path = Path(path)
     if not path.is_file():
         near = (
@@ -112,7 +113,10 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.n
         )
     try:
         with np.load(path, allow_pickle=False) as archive:
+            require_room(path, sum(part.file_size for part in archive.zip.infolist()), error)
             return {name: archive[name] for name in archive.files}
+    except error:
+        raise
     except Exception as cause:  # zipfile, zlib, numpy and the OS each have their own way to say it
         size = path.stat().st_size
         # For what is no archive at all numpy recommends to unpickle it.

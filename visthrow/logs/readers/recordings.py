@@ -11,6 +11,7 @@ and h5py read the others."""
 
 import io
 import json
+import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
+from visthrow.common.unpacking import require_room
 from visthrow.logs.readers.table import Table
 
 # a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal
@@ -120,9 +122,10 @@ def _word(data: bytes, at: int) -> tuple[str, int]:
 
 
 def _matlab(path: Path) -> Table:
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
 
     try:
+        require_room(path, sum(8 * math.prod(shape) for _, shape, _ in whosmat(path)), LogError)
         return _flat(loadmat(path, simplify_cells=True))
     except NotImplementedError:  # version 7.3 is HDF5
         return _hdf5(path)
@@ -131,13 +134,15 @@ def _matlab(path: Path) -> Table:
 def _hdf5(path: Path) -> Table:
     h5py = load_extra("h5py", "recordings", f"{path}: an HDF5 file", LogError)
     found: dict[str, Any] = {}
+
+    def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = item
+
     with h5py.File(path) as file:
-        file.visititems(
-            lambda name, item: (
-                found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None
-            )
-        )
-    return _flat(found)
+        file.visititems(note)
+        require_room(path, sum(item.nbytes for item in found.values()), LogError)
+        return _flat({name: item[()] for name, item in found.items()})
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
@@ -197,10 +202,13 @@ def _bag(path: Path) -> Table:
 def _mcap(path: Path) -> Table:
     """Channels of an MCAP file: JSON as it is, ROS messages as of a bag."""
     reading = load_extra("mcap.reader", "recordings", f"{path}: an MCAP file", LogError)
-    data = path.read_bytes()
+    reader = reading.make_reader(io.BytesIO(path.read_bytes()))
+    summary = reader.get_summary()
+    chunks = summary.chunk_indexes if summary is not None else []
+    require_room(path, sum(chunk.uncompressed_size for chunk in chunks), LogError)
 
     def messages() -> Iterator[tuple[str, float, Any]]:
-        for _, channel, message in reading.make_reader(io.BytesIO(data)).iter_messages():
+        for _, channel, message in reader.iter_messages():
             if channel.message_encoding == "json":
                 yield channel.topic.strip("/"), message.log_time * 1e-9, json.loads(message.data)
 

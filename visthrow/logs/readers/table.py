@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
+from visthrow.common.unpacking import counted, require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
@@ -35,7 +36,7 @@ _COMMA = re.compile(r"\d,\d")
 _WORDS = {"True": 1.0, "False": 0.0}
 _LIST = re.compile(r"[\[(].*[\])]")
 _PARTS = re.compile(r"[,;\s]+")
-_OPENERS = {".gz": gzip.decompress, ".xz": lzma.decompress}
+_OPENERS = {".gz": gzip.open, ".xz": lzma.open}
 
 
 def read_table(path: str | Path) -> Table:
@@ -51,11 +52,11 @@ def read_table(path: str | Path) -> Table:
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
         if path.suffix == ".parquet":
-            return _parquet(data, path)
-        text = _OPENERS.get(path.suffix, bytes)(data).decode("utf-8-sig")
-        comma, rows = _rows(text)
+            return _parquet(path)
+        packed = _OPENERS.get(path.suffix)
+        data = unpack(path, packed, LogError) if packed else path.read_bytes()
+        comma, rows = _rows(data.decode("utf-8-sig"), str(path))
     except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
         raise LogError(
             f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
@@ -84,7 +85,7 @@ def read_table(path: str | Path) -> Table:
     return table
 
 
-def _rows(text: str) -> tuple[bool, list[tuple[int, list[str]]]]:
+def _rows(text: str, name: str) -> tuple[bool, list[tuple[int, list[str]]]]:
     """Return whether decimals have a comma, and each line that is not empty with its number."""
     head = [line for line in text[:_SNIFFED].splitlines()[:20] if line.strip()] or [""]
     mark = next((m for m in ";\t," if m in head[0]), " ")
@@ -93,7 +94,8 @@ def _rows(text: str) -> tuple[bool, list[tuple[int, list[str]]]]:
         and any(map(_COMMA.search, head[1:]))
         and not any("." in line for line in head[1:])
     )
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, skipinitialspace=mark == " ")
+    lines = counted(io.StringIO(text, newline=""), len(text), name)
+    reader = csv.reader(lines, delimiter=mark, skipinitialspace=mark == " ")
     return comma, [(reader.line_num, row) for row in reader if row]
 
 
@@ -134,12 +136,14 @@ def _column(cells: tuple[str, ...], comma: bool = False) -> np.ndarray:
         return np.array(cells)
 
 
-def _parquet(data: bytes, path: Path) -> Table:
+def _parquet(path: Path) -> Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(io.BytesIO(data))
+        shape = pq.read_metadata(path)
+        require_room(path, 8 * shape.num_rows * shape.num_columns, LogError)
+        table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
         raise LogError(f"{path}: cannot be read: {error}; expected a parquet table") from error
     columns = {}
