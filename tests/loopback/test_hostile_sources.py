@@ -8,7 +8,9 @@ import time
 
 import pytest
 
+from bench.hostile import READERS, judge
 from hil.poses.sources.mocap import MocapParams, NatNetSource, RigidBody
+from tests.fuzz import EACH, SEEDS
 from tests.motive import Motive, frame
 
 IDS = (RigidBody("vehicle", "7"), RigidBody("payload", "8"))
@@ -73,3 +75,17 @@ def test_bad_datagrams_end_no_thread_of_natnet(motive, natnet):
     assert any("a second sender; the Motive speaks from 127.0.0.1:1510" in text for text in said)
     stranger.close()
     second.close()
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_hostile_items_change_no_throw(kind):
+    if kind == "natnet":
+        pytest.importorskip("natnet", reason="extra natnet")
+    assert judge(kind, 0, 3000) == 3000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", READERS)
+def test_a_million_hostile_items_change_no_throw(kind, seed):
+    judge(kind, seed, EACH)
