@@ -62,6 +62,8 @@ class PoseMessage:
     vel: Names = ()
     rate: Names = ()
     resets: tuple[str, ...] = ()  # counters; their sum is the pose's
+    # what says that the body is not seen where it is below a number
+    valid: tuple[tuple[str, float], ...] = ()
     attitude: str = ""  # message of its attitude, of the same vehicle
     rates: str = ""  # likewise of its rates
 
@@ -78,10 +80,13 @@ ODOMETRY = PoseMessage(
     vel=(_index("velocity"), ("vx", "vy", "vz")),
     rate=(_index("angular_velocity"), ("rollspeed", "pitchspeed", "yawspeed")),
     resets=("reset_counter",),
+    valid=(("quality", 0.0),),
 )
 LOCAL_RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "vxy", "z", "vz", "heading"))
 DATAFLASH = {
-    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt")),
+    "VISP": PoseMessage(
+        (("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt"), valid=(("Q", 0.0),)
+    ),
     "XKF1": EKF,
     "NKF1": EKF,
     "POS": PoseMessage((("N", "E", "D"),), attitude="ATT"),
@@ -91,6 +96,7 @@ ULOG = {
         (("x", "y", "z"),),
         vel=(("vx", "vy", "vz"),),
         resets=LOCAL_RESETS,
+        valid=(("xy_valid", 1.0), ("z_valid", 1.0)),
         attitude="vehicle_attitude",
         rates="vehicle_angular_velocity",
     ),
@@ -255,6 +261,9 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
     vel = _in_world(vel, quat, data.get("velocity_frame"))
     counters = [data[name].astype(int) for name in kind.resets if name in data]
     resets = sum(counters) if counters else np.zeros(count, int)
+    valid = np.ones(count, bool)
+    for name, least in kind.valid:
+        valid &= data[name] >= least if name in data else True
     return [
         Pose(
             float(stamps[i]),
@@ -265,6 +274,7 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
             _known(vel, i),
             _known(rate, i),
             int(resets[i]),
+            valid=bool(valid[i]),
         )
         for i in range(count)
         if not kind.attitude or _known(quat, i) is not None

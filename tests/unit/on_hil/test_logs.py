@@ -35,7 +35,7 @@ YAWED = (QUARTER, 0.0, 0.0, QUARTER)
 """A quarter turn about down, wxyz."""
 
 
-def vision(i, reset=0):
+def vision(i, reset=0, quality=100):
     return (
         "VISP",
         (
@@ -52,7 +52,7 @@ def vision(i, reset=0):
             0,
             reset,
             0,
-            100,
+            quality,
         ),
     )
 
@@ -154,6 +154,12 @@ def test_damage_in_a_bin_costs_a_few_messages(tmp_path):
     assert 40 <= len(read_bin(path, VEHICLE)) < 50
 
 
+def test_a_vision_pose_of_negative_quality_is_none(tmp_path):
+    path = tmp_path / "a.BIN"
+    files.write_bin(path, {"VISP": files.VISP}, [vision(0, quality=-1), vision(1, quality=0)])
+    assert [pose.valid for pose in read_bin(path, VEHICLE)] == [False, True]
+
+
 def test_loggers_of_two_bodies_are_joined_by_a_stated_offset(tmp_path):
     one, two = tmp_path / "a.BIN", tmp_path / "b.BIN"
     for path in (one, two):
@@ -224,9 +230,12 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
         "float vz",
         "uint8_t xy_reset_counter",
         "uint8_t z_reset_counter",
+        "uint8_t xy_valid",
+        "uint8_t z_valid",
     ]
     places = [
-        (1_000_000 + 20_000 * i, 0.1 * i, 2.0, -1.0, 5.0, 0.0, 0.0, 1, i // 2) for i in range(4)
+        (1_000_000 + 20_000 * i, 0.1 * i, 2.0, -1.0, 5.0, 0.0, 0.0, 1, i // 2, i != 2, i != 3)
+        for i in range(4)
     ]
     turns = [(990_000, *YAWED), (1_018_000, 1.0, 0.0, 0.0, 0.0)]
     rates = [(1_015_000, 0.1, 0.2, 0.3)]
@@ -240,6 +249,7 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     assert [pose.quat[0] for pose in poses] == pytest.approx([QUARTER, 1.0, 1.0, 1.0])
     assert [pose.rate is None for pose in poses] == [True, False, False, False]
     assert [pose.reset for pose in poses] == [1, 1, 2, 2]
+    assert [pose.valid for pose in poses] == [True, True, False, False]
     with pytest.raises(
         SourceError, match=r"no vehicle_odometry in this log.*vehicle_local_position"
     ):

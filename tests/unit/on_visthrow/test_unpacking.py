@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
 
-from visthrow.common import unpacking
+from visthrow.common import storage
 from visthrow.common.errors import LogError
 from visthrow.common.storage import savez
 from visthrow.logs import read
@@ -44,11 +44,11 @@ def test_what_unpacks_to_too_much_is_not_read(name, tmp_path, monkeypatch):
     path = tmp_path / name
     WRITERS[name](path)
     reader = READERS.get(path.suffix, read_table)
-    monkeypatch.setattr(unpacking, "MOST", 1 << 20)
-    monkeypatch.setattr(unpacking, "MOST_TIMES", 1)
+    monkeypatch.setattr(storage, "MOST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(storage, "MOST_TIMES", 1)
     with pytest.raises(LogError, match=r"MB that unpack to at least [1-5] MB; expected 1 MB at"):
         reader(path)
-    monkeypatch.setattr(unpacking, "MOST", 1 << 24)
+    monkeypatch.setattr(storage, "MOST_UNPACKED", 1 << 24)
     if name == "x.npz":
         with pytest.raises(LogError, match="no entry 'header'"):
             reader(path)
@@ -57,7 +57,7 @@ def test_what_unpacks_to_too_much_is_not_read(name, tmp_path, monkeypatch):
 
 
 def test_a_long_read_says_how_far_it_is(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(unpacking, "SAY_EVERY", -1.0)
+    monkeypatch.setattr(storage, "SAY_EVERY", -1.0)
     path = tmp_path / "x.csv"
     path.write_text("a,b\n" + "1,2\n" * 3)
     read_table(path)

@@ -22,7 +22,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
-from visthrow.common.unpacking import require_room
+from visthrow.common.storage import require_room
 from visthrow.logs.readers.table import Table
 
 # a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal

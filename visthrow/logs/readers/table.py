@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
-from visthrow.common.unpacking import counted, require_room, unpack
+from visthrow.common.storage import counted, require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
