@@ -1,5 +1,5 @@
-"""Writing of results: whole files or none; and bounds on what a file may unpack to, looked at before
-it is read. Onboard-safe: standard library and numpy only.
+"""Writing of results: whole files or none; and bounds on what a file may unpack to, looked at
+before it is read. Onboard-safe: standard library and numpy only.
 """
 
 import io
@@ -16,7 +16,6 @@ from typing import IO, Any
 import numpy as np
 
 from visthrow.common.errors import StorageError
-
 
 MOST_UNPACKED = 256 << 20  # bytes that any file may unpack to
 MOST_TIMES = 50  # times its own size that a larger one may; logs of numbers take 2 to 20
