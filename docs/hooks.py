@@ -27,8 +27,9 @@ def on_page_markdown(markdown: str, **_) -> str:
 
 
 def on_page_content(html: str, **_) -> str:
-    """Leave out the roles of docstrings, which another tool reads."""
-    return re.sub(r":(?:class|func|meth|mod|data|attr|exc):(?=<code>|`|<a)", "", html)
+    """Remove the roles of docstrings, and point a notebook's links at pages of the site."""
+    html = re.sub(r":(?:class|func|meth|mod|data|attr|exc):(?=<code>|`|<a)", "", html)
+    return re.sub(r'href="([^":]+)\.md(#[^"]*)?"', r'href="\1.html\2"', html)
 
 
 def on_post_page(output: str, page, **_) -> str:
