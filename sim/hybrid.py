@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from sim import solvers
 from sim.cores import cores, in_pieces
 from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
+from sim.kernels.exchange import build_exchange
 from sim.kernels.laws import check_laws, structure
 from sim.kernels.quadrotor.queue import queue_depth
 from sim.kernels.randomize import build_reset
@@ -209,7 +211,33 @@ class HybridSim:
         )
         self._release: Any = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
+        self._exchange = self._exchanged(ropes_on(vehicles, ropes))
         self.place(pos_w=np.zeros((count, 3)))
+
+    def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
+        """The solver of the plant's bodies with what it exchanges; None for the fused kernel."""
+        params = self.params
+        if params.sim.solver == "chain":
+            solvers.check_fused(params)
+            return None
+        solvers.refuse(self.extensions, params)
+        kernels = build_exchange(self.types, params, self._step, self.extensions)
+        world = {
+            "params": params,
+            "count": self.count,
+            "device": self.device,
+            "types": self.types,
+            "vehicles": self.vehicles,
+            "ropes": ropes,
+            "packed": (self._vehicles, self._ropes),
+            "gravity": self.gravity,
+        }
+        return solvers.Exchange(kernels, world)
+
+    @property
+    def capturable(self) -> bool:
+        """Whether steps can be captured in a CUDA graph."""
+        return self._exchange is None or self._exchange.solver.capturable
 
     def _allocate(self, depth: int) -> None:
         """Make the arrays of state and output, with a command queue so deep."""
@@ -239,8 +267,11 @@ class HybridSim:
         ``mask``, shape (E,), where it is not 0.
         """
         s, parts = self.params.sim, [self._vehicles, self._ropes, self._release, self._airs]
-        numerics = [s.control_period, s.substep, s.gamma, s.max_turn, self.gravity]
         mask = self._all if mask is None else mask
+        if self._exchange is not None:
+            self._exchange.step(self._launch, self, parts, mask)
+            return
+        numerics = [s.control_period, s.substep, s.gamma, s.max_turn, self.gravity]
         self._launch(
             self._step.step,
             [*parts, *numerics, self.state, self.command, self.release, mask, self.out],
@@ -285,7 +316,7 @@ class HybridSim:
             self.goal_w,
         ]
         self._launch(self._reset.randomize, inputs)
-        self._update_payload()
+        self.adopt(mask)
 
     def place(
         self,
@@ -323,10 +354,16 @@ class HybridSim:
         self._used.fill_(battery_used)
         inputs = [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used]
         wp.launch(self._reset.place, self.count, inputs, device=self.device)
-        self._update_payload()
+        self.adopt()
 
-    def _update_payload(self) -> None:
-        self._launch(self._step.payload, [self._ropes, self.state, self.out], work=LOOK)
+    def adopt(self, mask: "wp.array[Any] | None" = None) -> None:
+        """Take over bodies and ropes as they were written into ``state``, where ``mask`` is not 0:
+        the payload follows from them.
+        """
+        if self._exchange is None:
+            self._launch(self._step.payload, [self._ropes, self.state, self.out], work=LOOK)
+        else:
+            self._exchange.place(self._launch, self, self._all if mask is None else mask)
 
     def _launch(
         self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0

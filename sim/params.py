@@ -414,6 +414,8 @@ class SimParams:
     gamma: float  # of the ROS2 W-method [-]
     max_turn: float  # a segment that turns more in one substep falls back to the first stage [rad]
     precision: Literal["float32", "float64"] = "float32"
+    # engine of the bodies: the fused kernel, or one of sim.solvers.SOLVERS
+    solver: Literal["chain", "exchanged_chain", "physx", "mujoco_warp"] = "chain"
 
     def __post_init__(self) -> None:
         require("sim", self, positive="control_period substep gamma max_turn")

@@ -73,7 +73,7 @@ PLANT: dict[str, dict[Dimension, str]] = {
         (-1, -1, 3): "lag_tension",
         SPEED: "kick_w kick_along",
     },
-    "SimParams": {TIME: "control_period substep", NONE: "gamma max_turn precision"},
+    "SimParams": {TIME: "control_period substep", NONE: "gamma max_turn precision solver"},
     "AirParams": {SPEED: "wind_w", NONE: "ground_effect"},
     "PlantParams": {},
 }

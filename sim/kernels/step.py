@@ -6,6 +6,7 @@ environment, no atomics, nothing else is launched; the same kernel runs on the C
 some from ``first`` on, and on CUDA."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -30,35 +31,25 @@ class StepKernels:
     foresee: wp.Kernel
     State: type
     Output: type
+    parts: SimpleNamespace
 
 
-def build_step(
+def build_parts(
     t: Types,
     params: PlantParams,
     direct: bool = False,
     extensions: frozenset[str] = frozenset(),
     motors: bool = False,
-) -> StepKernels:
-    """Compose the kernel for the kinds and the number of segments of ``params``.
+) -> SimpleNamespace:
+    """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
-    Args:
-        t: types of the wanted precision.
-        params: kinds and segment count are read here; all numbers are read by the kernel at run
-            time.
-        direct: by-pass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
-        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost
-            nothing.
-        motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
-    """
-    real, vec3, vec4 = t.real, t.vec3, t.vec4
+    Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
+    ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
+    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``rope_in_rotor``;
+    ``depart``, which writes what follows when the payload separates with a stated velocity."""
+    real, vec3 = t.real, t.vec3
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = params.rope.segments
-    nonfinite, fallback, collision, in_rotor = (
-        st.NONFINITE,
-        st.FALLBACK,
-        st.COLLISION,
-        st.ROPE_IN_ROTOR,
-    )
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
     flow, rate, motor_advance = build_flow(t, params.vehicle, extensions, motors)
@@ -74,15 +65,14 @@ def build_step(
     ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
     leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
-    limit = real(st.SPEED_LIMIT)
 
     @wp.func
-    def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
-        """Finite and below the speed limit; a comparison with NaN is false."""
-        total = st.size(s)
+    def rope_size(u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
+        """Sum of the sizes of the rope's state."""
+        total = real(0.0)
         for i in range(L):
             total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
-        return total < limit
+        return total
 
     @wp.func
     def load_rope(
@@ -113,6 +103,92 @@ def build_step(
         return hit
 
     @wp.func
+    def depart(
+        rope: Rope,
+        r: Release,
+        air: Air,
+        s: QuadState,
+        pos: vec3,
+        vel: vec3,
+        along: vec3,
+        gravity: real,
+        out: Output,
+        env: int,
+        elapsed: real,
+    ):
+        """Write what follows from the payload's state at separation, before the mechanism's kick."""
+        vel = leaving.kick(r, vel, along)
+        time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
+        out.payload_pos_w[env] = pos
+        out.payload_vel_w[env] = vel
+        out.separated[env] = 1
+        out.landing_w[env] = ballistic.after(rope, air, pos, vel, gravity, time)
+        out.time_to_impact[env] = time
+        out.clearance[env] = ballistic.clearance(
+            rope, air, pos, vel, gravity, time, s.pos_w, r.clearance_samples
+        )
+        out.separation_time[env] = elapsed
+        out.release_pos_w[env] = s.pos_w
+
+    return SimpleNamespace(
+        State=State,
+        Output=Output,
+        flow=flow,
+        rate=rate,
+        motor_advance=motor_advance,
+        chain=chain,
+        payload=payload,
+        coupled=coupled,
+        laws=laws,
+        leaving=leaving,
+        load=load,
+        store=store,
+        load_rope=load_rope,
+        rope_size=rope_size,
+        rope_in_rotor=rope_in_rotor,
+        depart=depart,
+    )
+
+
+def build_step(
+    t: Types,
+    params: PlantParams,
+    direct: bool = False,
+    extensions: frozenset[str] = frozenset(),
+    motors: bool = False,
+) -> StepKernels:
+    """Compose the kernel for the kinds and the number of segments of ``params``.
+
+    Args:
+        t: types of the wanted precision.
+        params: kinds and segment count are read here; all numbers are read by the kernel at run
+            time.
+        direct: by-pass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost
+            nothing.
+        motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
+    """
+    real, vec3, vec4 = t.real, t.vec3, t.vec4
+    Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
+    L = params.rope.segments
+    nonfinite, fallback, collision, in_rotor = (
+        st.NONFINITE,
+        st.FALLBACK,
+        st.COLLISION,
+        st.ROPE_IN_ROTOR,
+    )
+    parts = build_parts(t, params, direct, extensions, motors)
+    State, Output, chain, coupled = parts.State, parts.Output, parts.chain, parts.coupled
+    laws, leaving, load, store = parts.laws, parts.leaving, parts.load, parts.store
+    load_rope, rope_size, rope_in_rotor = parts.load_rope, parts.rope_size, parts.rope_in_rotor
+    depart, limit = parts.depart, real(st.SPEED_LIMIT)
+
+    @wp.func
+    def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
+        """Finite and below the speed limit; a comparison with NaN is false."""
+        return st.size(s) + rope_size(u, n) < limit
+
+    @wp.func
     def separate(
         p: Vehicle,
         rope: Rope,
@@ -130,20 +206,8 @@ def build_step(
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
         mount_vel = coupled.mount_velocity(rope, s)
         pos, vel = chain.payload(rope, mount, mount_vel, n, u)
-        vel = leaving.kick(
-            r, leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u)), n[L - 1]
-        )
-        time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
-        out.payload_pos_w[env] = pos
-        out.payload_vel_w[env] = vel
-        out.separated[env] = 1
-        out.landing_w[env] = ballistic.after(rope, air, pos, vel, gravity, time)
-        out.time_to_impact[env] = time
-        out.clearance[env] = ballistic.clearance(
-            rope, air, pos, vel, gravity, time, s.pos_w, r.clearance_samples
-        )
-        out.separation_time[env] = elapsed
-        out.release_pos_w[env] = s.pos_w
+        vel = leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u))
+        depart(rope, r, air, s, pos, vel, n[L - 1], gravity, out, env, elapsed)
 
     @wp.kernel(module="unique", enable_backward=False)
     def step_kernel(
@@ -307,4 +371,4 @@ def build_step(
             real(0.0),
         )
 
-    return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output)
+    return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output, parts)

@@ -1,0 +1,294 @@
+"""The step in parts, for bodies that a solver outside holds: what happens between two exchanges.
+
+The paper's simulator (Sec. III-B): the quadrotor's blocks give one wrench a substep, a solver
+advances the bodies, and the blocks see the root's kinematics then. Substeps are equal here: a
+command acts from the substep whose middle it reaches, and a separation within a substep is
+interpolated between its ends. A wrench is that of the substep's middle, to second order. After the
+release the vehicle flies on by itself, without the solver."""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from sim.kernels import state as st
+from sim.kernels.quadrotor.queue import held, push, split_delay
+from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration
+from sim.kernels.rope.payload import LOADS
+from sim.kernels.step import StepKernels
+from sim.kernels.structs import Types
+from sim.params import PlantParams
+
+WRENCH_FIELDS = {"force_b": "vec3", "torque_b": "vec3", "load_w": "vec3"}
+"""What a solver is given, held over a substep: force [N] and torque [N m] of the vehicle's blocks
+about its centre of mass, body frame, without gravity; force of the air on the payload [N]."""
+
+BODY_FIELDS = {
+    "pos_w": ("vec3", False),
+    "quat_wb": ("quat", False),
+    "vel_w": ("vec3", False),
+    "rate_b": ("vec3", False),
+    "cable_dir_w": ("vec3", True),
+    "cable_vel_w": ("vec3", True),
+    "payload_pos_w": ("vec3", False),
+    "payload_vel_w": ("vec3", False),
+}
+"""What a solver shows of its bodies: the root, the rope's segments, the payload's centre."""
+
+
+@dataclass(frozen=True)
+class ExchangeKernels:
+    """Kernels of one build and the structs that they take."""
+
+    begin: wp.Kernel
+    wrench: wp.Kernel
+    take: wp.Kernel
+    end: wp.Kernel
+    payload: wp.Kernel
+    State: type
+    Wrench: type
+    Bodies: type
+
+
+def build_exchange(
+    t: Types, params: PlantParams, step: StepKernels, extensions: frozenset[str]
+) -> ExchangeKernels:
+    """Build the kernels from the parts of a fused step of the same plant and ``extensions``."""
+    real, vec3, vec4 = t.real, t.vec3, t.vec4
+    Vehicle, Rope, Release, Air = t.Vehicle, t.Rope, t.Release, t.Air
+    L, loaded = params.rope.segments, bool(extensions & LOADS)
+    parts, State, Output = step.parts, step.State, step.Output
+    load, store, load_rope = parts.load, parts.store, parts.load_rope
+    flow, rate, motor_advance, laws = parts.flow, parts.rate, parts.motor_advance, parts.laws
+    coupled, depart, hanging = parts.coupled, parts.depart, parts.payload.hanging
+    rope_size, rope_in_rotor, limit = parts.rope_size, parts.rope_in_rotor, real(st.SPEED_LIMIT)
+    nonfinite, collision, in_rotor = st.NONFINITE, st.COLLISION, st.ROPE_IN_ROTOR
+    Wrench = st.array_struct(t, "Wrench", {k: (v, False) for k, v in WRENCH_FIELDS.items()})
+    Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
+    tiny = real(1.0e-6)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin_kernel(
+        # Params:
+        first: int,
+        releases: wp.array(dtype=Release),
+        # State in:
+        state: State,
+        # In:
+        command: wp.array(dtype=vec4),
+        release: wp.array(dtype=wp.int32),
+        mask: wp.array(dtype=wp.int32),
+        # Out:
+        moves: wp.array(dtype=wp.int32),
+        again: wp.array(dtype=wp.int32),
+        out: Output,
+    ):
+        """Take the command, trip the latch; ``again``: the solver's bodies are to be put back."""
+        env = wp.tid() + first
+        moves[env] = mask[env]
+        again[env] = 0
+        if mask[env] == 0:
+            again[env] = state.attached[env]
+            return
+        state.status[env] = 0
+        if not push(state.queue, env, command[env]):
+            state.status[env] = nonfinite
+        out.separated[env] = 0
+        if release[env] != 0 and state.release_timer[env] < real(0.0) and state.attached[env] != 0:
+            state.release_timer[env] = releases[env % releases.shape[0]].lag
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def wrench_kernel(
+        # Params:
+        first: int,
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        airs: wp.array(dtype=Air),
+        period: real,
+        time: real,
+        h: real,
+        gravity: real,
+        # State in:
+        state: State,
+        moves: wp.array(dtype=wp.int32),
+        # In:
+        out: Output,
+        # Out:
+        wrench: Wrench,
+    ):
+        """Advance what is the blocks' own from ``time`` on and fill in the wrench of the middle."""
+        env = wp.tid() + first
+        wrench.force_b[env] = vec3()
+        wrench.torque_b[env] = vec3()
+        wrench.load_w[env] = vec3()
+        if moves[env] == 0:
+            return
+        p = vehicle[env % vehicle.shape[0]]
+        rope = ropes[env % ropes.shape[0]]
+        air = airs[env % airs.shape[0]]
+        p.body.mass = p.body.mass * state.mass_scale[env]
+        half = real(0.5) * h
+        g = vec3(real(0.0), real(0.0), -gravity)
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        stiffness = wp.zeros(shape=(L,), dtype=real)
+        load_rope(state, env, n, u, stiffness)
+        whole, switch = split_delay(p, period)
+        active, _until = held(state.queue, env, whole, switch, time + half, period)
+        s = load(state, env)
+        now = laws.on(p, rope, air, s, n, u, stiffness, active, state.attached[env])
+        if state.attached[env] == 0:
+            s = coupled.step_alone(p, now, s, active, g, h)
+            if st.size(s) < limit:
+                store(state, env, s)
+            else:
+                state.status[env] = state.status[env] | nonfinite
+                moves[env] = 0
+            return
+        f = flow(p, now, s, active)
+        acc = wp.quat_rotate(s.quat_wb, f.force_b) / p.body.mass + g
+        middle = advance(
+            s, rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b)), half
+        )
+        middle.motor_speed = motor_advance(middle.motor_speed, f.motor_speed)
+        f = flow(p, now, middle, active)
+        wrench.force_b[env] = f.force_b
+        wrench.torque_b[env] = f.torque_b
+        if wp.static(loaded):
+            jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
+            wrench.load_w[env] = hanging(rope, now, out.payload_vel_w[env], n[L - 1], jet)
+        after = advance(s, rate(p, middle, f, vec3(), vec3()), h)
+        state.motor_speed[env] = motor_advance(after.motor_speed, f.motor_speed)
+        state.integral[env] = after.integral
+        state.setpoint[env] = after.setpoint
+        state.gyro[env] = after.gyro
+        state.charge_used[env] = after.charge_used
+        state.voltage[env] = after.voltage
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def take_kernel(
+        # Params:
+        first: int,
+        ropes: wp.array(dtype=Rope),
+        releases: wp.array(dtype=Release),
+        airs: wp.array(dtype=Air),
+        time: real,
+        h: real,
+        gravity: real,
+        # State in:
+        state: State,
+        moves: wp.array(dtype=wp.int32),
+        again: wp.array(dtype=wp.int32),
+        # In:
+        bodies: Bodies,
+        # Out:
+        out: Output,
+    ):
+        """Take over where the solver brought the bodies by ``time``, h seconds on; let go."""
+        env = wp.tid() + first
+        if moves[env] == 0 or state.attached[env] == 0:
+            return
+        s = load(state, env)
+        s.pos_w = bodies.pos_w[env]
+        s.quat_wb = bodies.quat_wb[env]
+        s.vel_w = bodies.vel_w[env]
+        s.rate_b = bodies.rate_b[env]
+        pos = bodies.payload_pos_w[env]
+        vel = bodies.payload_vel_w[env]
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        for i in range(L):
+            n[i] = bodies.cable_dir_w[i, env]
+            u[i] = bodies.cable_vel_w[i, env]
+        size = st.size(s) + rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
+        if not size < limit:
+            state.status[env] = state.status[env] | nonfinite
+            moves[env] = 0
+            again[env] = 1
+            return
+        store(state, env, s)
+        for i in range(L):
+            state.cable_dir_w[i, env] = n[i]
+            state.cable_vel_w[i, env] = u[i]
+        timer = state.release_timer[env]
+        if timer >= real(0.0) and time > timer - tiny:
+            one = real(1.0)
+            part = wp.clamp((timer - (time - h)) / h, real(0.0), one)
+            before = out.payload_vel_w[env]
+            # backwards from the end with the acceleration between the ends
+            back = (one - part) * h
+            acc = (vel - before) / h
+            depart(
+                ropes[env % ropes.shape[0]],
+                releases[env % releases.shape[0]],
+                airs[env % airs.shape[0]],
+                s,
+                pos - back * vel + (real(0.5) * back * back) * acc,
+                vel - back * acc,
+                n[L - 1],
+                gravity,
+                out,
+                env,
+                wp.max(timer, real(0.0)),
+            )
+            state.attached[env] = 0
+        else:
+            out.payload_pos_w[env] = pos
+            out.payload_vel_w[env] = vel
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def end_kernel(
+        # Params:
+        first: int,
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        period: real,
+        # State in:
+        state: State,
+        # In:
+        mask: wp.array(dtype=wp.int32),
+        out: Output,
+    ):
+        env = wp.tid() + first
+        if mask[env] == 0:
+            return
+        p = vehicle[env % vehicle.shape[0]]
+        rope = ropes[env % ropes.shape[0]]
+        if state.release_timer[env] >= real(0.0):
+            state.release_timer[env] = wp.max(state.release_timer[env] - period, real(0.0))
+        if state.attached[env] != 0:
+            s = load(state, env)
+            n = wp.zeros(shape=(L,), dtype=vec3)
+            for i in range(L):
+                n[i] = state.cable_dir_w[i, env]
+            reach = rope.payload_radius + p.collision_radius
+            if wp.length(out.payload_pos_w[env] - s.pos_w) < reach:
+                state.status[env] = state.status[env] | collision
+            if rope_in_rotor(p, rope, s, n):
+                state.status[env] = state.status[env] | in_rotor
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def payload_kernel(
+        # Params:
+        first: int,
+        # State in:
+        state: State,
+        # In:
+        bodies: Bodies,
+        # Out:
+        out: Output,
+    ):
+        env = wp.tid() + first
+        if state.attached[env] != 0:
+            out.payload_pos_w[env] = bodies.payload_pos_w[env]
+            out.payload_vel_w[env] = bodies.payload_vel_w[env]
+
+    return ExchangeKernels(
+        begin=begin_kernel,
+        wrench=wrench_kernel,
+        take=take_kernel,
+        end=end_kernel,
+        payload=payload_kernel,
+        State=State,
+        Wrench=Wrench,
+        Bodies=Bodies,
+    )

@@ -1,0 +1,154 @@
+"""Solvers that hold the bodies of the hybrid simulator: vehicle, rope and payload.
+
+The fused kernel of :mod:`sim.kernels.step` needs none. Any other engine is a :class:`Solver`; what
+it exchanges with the quadrotor's blocks in every substep is a wrench and the root's kinematics."""
+
+import importlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from sim.kernels import state as st
+from sim.kernels.exchange import BODY_FIELDS, WRENCH_FIELDS, ExchangeKernels
+from sim.kernels.structs import Types
+from sim.params import PlantParams, RopeParams, VehicleParams
+
+SOLVERS = {
+    "exchanged_chain": "sim.solvers.chain:ChainSolver",
+    "physx": "sim.solvers.physx:PhysxSolver",
+    "mujoco_warp": "sim.solvers.mujoco:MujocoSolver",
+}
+"""Name in ``sim.solver`` -> class; ``chain`` is the fused kernel."""
+
+UNKNOWN = frozenset({"compliance", "lag_tension", "rope_tail"})
+"""Extensions that no solver behind the exchange knows."""
+
+
+class Solver(Protocol):
+    """An engine that advances the bodies of E vehicles on the device.
+
+    Attributes:
+        capturable: whether its work may be captured in a CUDA graph.
+    """
+
+    capturable: bool
+
+    def __init__(self, world: "World") -> None:
+        """Build the bodies.
+
+        Raises ValueError: something that the engine cannot hold; ModuleNotFoundError: it is not
+        installed.
+        """
+
+    def place(self, state: Any, mask: "wp.array[Any]") -> None:
+        """Put the bodies to a struct of state arrays where ``mask``, shape (E,), int, is not 0, and
+        show all of them.
+        """
+
+    def advance(self, duration: float) -> None:
+        """Advance all bodies under ``world.wrench`` [s], and show them in ``world.bodies``."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What a solver is built for, and the arrays that it shares with the exchange."""
+
+    params: PlantParams
+    count: int  # E
+    device: str
+    types: Types
+    vehicles: Sequence[VehicleParams]  # of environment e: e % len(vehicles)
+    ropes: Sequence[RopeParams]  # likewise; mounts are stated from the centre of mass
+    packed: tuple[Any, Any]  # the same on the device: arrays of types.Vehicle and types.Rope
+    gravity: float  # [m/s^2]
+    kernels: ExchangeKernels  # whose structs the arrays are in
+    wrench: Any  # of sim.kernels.exchange.WRENCH_FIELDS
+    bodies: Any  # of sim.kernels.exchange.BODY_FIELDS
+
+    def models(self) -> tuple[list[tuple[VehicleParams, RopeParams]], np.ndarray]:
+        """Different pairs of vehicle and rope, and which of them each environment has, shape (E,)."""
+        period = math.lcm(len(self.vehicles), len(self.ropes))
+        rows = range(min(period, self.count))
+        pairs = [
+            (self.vehicles[e % len(self.vehicles)], self.ropes[e % len(self.ropes)]) for e in rows
+        ]
+        bodies = [(vehicle.body, rope) for vehicle, rope in pairs]
+        different = list(dict.fromkeys(bodies))
+        of = np.array([different.index(pair) for pair in bodies])
+        return [pairs[int(np.argmax(of == k))] for k in range(len(different))], of[
+            np.arange(self.count) % len(rows)
+        ]
+
+
+class Exchange:
+    """Steps of a simulator whose bodies are a solver's.
+
+    Raises ValueError: a plant that has something which cannot be exchanged.
+    """
+
+    def __init__(self, kernels: ExchangeKernels, world: dict[str, Any]) -> None:
+        """Build the solver of the plant; ``world``: what :class:`World` is made of, without the
+        shared arrays.
+        """
+        t, params, count, device = (world[k] for k in ("types", "params", "count", "device"))
+        rows = dict.fromkeys(("cable_dir_w", "cable_vel_w"), params.rope.segments)
+        wrench = {k: (v, False) for k, v in WRENCH_FIELDS.items()}
+        self.world = World(
+            **world,
+            kernels=kernels,
+            wrench=st.allocate(t, kernels.Wrench, wrench, count, {}, device),
+            bodies=st.allocate(t, kernels.Bodies, BODY_FIELDS, count, rows, device),
+        )
+        module, _, name = SOLVERS[params.sim.solver].partition(":")
+        self.solver: Solver = getattr(importlib.import_module(module), name)(self.world)
+        self.kernels = kernels
+        self._moves, self._again = (wp.zeros(count, dtype=wp.int32, device=device) for _ in "ma")
+
+    def step(
+        self, launch: Callable[..., None], sim: Any, parts: Sequence[Any], mask: "wp.array[Any]"
+    ) -> None:
+        """Advance by one control period; ``parts``: vehicles, ropes, releases and airs on the
+        device.
+        """
+        vehicles, ropes, releases, airs = parts
+        period, gravity = sim.params.sim.control_period, sim.gravity
+        substeps = math.ceil(period / sim.params.sim.substep - 1e-3)
+        h, k = period / substeps, self.kernels
+        flags = [self._moves, self._again]
+        launch(k.begin, [releases, sim.state, sim.command, sim.release, mask, *flags, sim.out])
+        for i in range(substeps):
+            time = [period, i * h, h, gravity]
+            wrench = [sim.state, self._moves, sim.out, self.world.wrench]
+            launch(k.wrench, [vehicles, ropes, airs, *time, *wrench])
+            self.solver.advance(h)
+            taken = [(i + 1) * h, h, gravity, sim.state, *flags, self.world.bodies, sim.out]
+            launch(k.take, [ropes, releases, airs, *taken])
+        launch(k.end, [vehicles, ropes, period, sim.state, mask, sim.out])
+        self.solver.place(sim.state, self._again)
+
+    def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
+        """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
+        self.solver.place(sim.state, mask)
+        launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
+
+
+def check_fused(params: PlantParams) -> None:
+    """Raise ValueError for a payload that the fused chain does not hold."""
+
+
+def refuse(extensions: frozenset[str], params: PlantParams) -> None:
+    """Raise ValueError for what of a plant cannot be exchanged with a solver."""
+    name = params.sim.solver
+    unknown = sorted(UNKNOWN & extensions)
+    if unknown:
+        raise ValueError(f"sim.solver {name!r} with {', '.join(unknown)}; only 'chain' has that")
+    if any(law.block == "rope joint" for law in params.laws):
+        raise ValueError(f"sim.solver {name!r} with a law on the rope's joint; only 'chain' has it")
+    if name != "exchanged_chain" and params.sim.precision != "float32":
+        raise ValueError(
+            f"sim.solver {name!r} with precision {params.sim.precision!r}; expected 'float32'"
+        )

@@ -1,0 +1,165 @@
+"""The chain of :mod:`sim.kernels.rope` behind the exchange: what the exchange itself costs."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from sim.kernels.quadrotor.rigid_body import build_flow
+from sim.kernels.rope.chain import build_chain
+from sim.kernels.rope.coupling import build_coupled_step
+from sim.kernels.structs import extensions_of
+from sim.solvers import World
+
+
+class ChainSolver:
+    """The batched simulator's own rope."""
+
+    capturable = True
+
+    def __init__(self, world: World) -> None:
+        self.world, self._kernels = world, _kernels(world)
+        real, segments = world.types.real, world.params.rope.segments
+        self._stiffness = wp.zeros((segments, world.count), dtype=real, device=world.device)
+        self._scale = wp.zeros(world.count, dtype=real, device=world.device)
+
+    def place(self, state, mask) -> None:
+        w = self.world
+        inputs = [w.packed[1], state, mask, self._stiffness, self._scale, w.bodies]
+        wp.launch(self._kernels[0], w.count, inputs, device=w.device)
+
+    def advance(self, duration: float) -> None:
+        w, s = self.world, self.world.params.sim
+        numbers = [s.gamma, s.max_turn, w.gravity, duration]
+        inputs = [*w.packed, *numbers, self._scale, w.wrench, self._stiffness, w.bodies]
+        wp.launch(self._kernels[1], w.count, inputs, device=w.device, block_dim=64)
+
+
+def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels that place and advance the bodies of a world."""
+    t, L = world.types, world.params.rope.segments
+    real, vec3, vec4 = t.real, t.vec3, t.vec4
+    Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow
+    State, Wrench, Bodies = world.kernels.State, world.kernels.Wrench, world.kernels.Bodies
+    extensions = extensions_of(world.vehicles, world.ropes) | {"push"}
+
+    @wp.func
+    def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
+        """The wrench that was given: here the air carries its force in the body frame."""
+        out = Flow()
+        out.force_b = air.push_w
+        out.torque_b = air.twist_b
+        return out
+
+    _, rate, motor_advance = build_flow(t, world.params.vehicle)
+    chain = build_chain(t, L, extensions)
+
+    @wp.func
+    def hanging(rope: Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
+        return air.payload_push_w
+
+    payload = SimpleNamespace(hanging=hanging)
+    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def place(
+        # Params:
+        ropes: wp.array(dtype=Rope),
+        # In:
+        state: State,
+        mask: wp.array(dtype=wp.int32),
+        # Out:
+        stiffness: wp.array2d(dtype=real),
+        scale: wp.array(dtype=real),
+        bodies: Bodies,
+    ):
+        env = wp.tid()
+        if mask[env] == 0:
+            return
+        rope = ropes[env % ropes.shape[0]]
+        scale[env] = state.mass_scale[env]
+        s = QuadState()
+        s.pos_w = state.pos_w[env]
+        s.quat_wb = state.quat_wb[env]
+        s.vel_w = state.vel_w[env]
+        s.rate_b = state.rate_b[env]
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        for i in range(L):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+            stiffness[i, env] = state.stiffness[i, env]
+            bodies.cable_dir_w[i, env] = n[i]
+            bodies.cable_vel_w[i, env] = u[i]
+        bodies.pos_w[env] = s.pos_w
+        bodies.quat_wb[env] = s.quat_wb
+        bodies.vel_w[env] = s.vel_w
+        bodies.rate_b[env] = s.rate_b
+        pos, vel = coupled.payload(rope, s, n, u)
+        bodies.payload_pos_w[env] = pos
+        bodies.payload_vel_w[env] = vel
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        # Params:
+        vehicle: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        gamma: real,
+        max_turn: real,
+        gravity: real,
+        h: real,
+        # In:
+        scale: wp.array(dtype=real),
+        wrench: Wrench,
+        # State in:
+        stiffness: wp.array2d(dtype=real),
+        bodies: Bodies,
+    ):
+        env = wp.tid()
+        p = vehicle[env % vehicle.shape[0]]
+        p.body.mass = p.body.mass * scale[env]
+        rope = ropes[env % ropes.shape[0]]
+        air = Air()
+        air.push_w = wrench.force_b[env]
+        air.twist_b = wrench.torque_b[env]
+        air.payload_push_w = wrench.load_w[env]
+        s = QuadState()
+        s.pos_w = bodies.pos_w[env]
+        s.quat_wb = bodies.quat_wb[env]
+        s.vel_w = bodies.vel_w[env]
+        s.rate_b = bodies.rate_b[env]
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        k = wp.zeros(shape=(L,), dtype=real)
+        for i in range(L):
+            n[i] = bodies.cable_dir_w[i, env]
+            u[i] = bodies.cable_vel_w[i, env]
+            k[i] = stiffness[i, env]
+        g = vec3(real(0.0), real(0.0), -gravity)
+        s, _total, _fell_back = coupled.step(
+            p,
+            rope,
+            air,
+            s,
+            coupled.momentum(p, rope, s, u),
+            vec4(),
+            n,
+            u,
+            k,
+            g,
+            gamma,
+            max_turn,
+            h,
+        )
+        for i in range(L):
+            bodies.cable_dir_w[i, env] = n[i]
+            bodies.cable_vel_w[i, env] = u[i]
+            stiffness[i, env] = k[i]
+        bodies.pos_w[env] = s.pos_w
+        bodies.quat_wb[env] = s.quat_wb
+        bodies.vel_w[env] = s.vel_w
+        bodies.rate_b[env] = s.rate_b
+        pos, vel = coupled.payload(rope, s, n, u)
+        bodies.payload_pos_w[env] = pos
+        bodies.payload_vel_w[env] = vel
+
+    return place, advance
