@@ -218,7 +218,7 @@ class HybridSim:
         """The solver of the plant's bodies with what it exchanges; None for the fused kernel."""
         params = self.params
         if params.sim.solver == "chain":
-            solvers.check_fused(params)
+            params.rope.require_chain("sim.solver 'chain'")
             return None
         solvers.refuse(self.extensions, params)
         kernels = build_exchange(self.types, params, self._step, self.extensions)

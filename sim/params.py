@@ -316,6 +316,11 @@ class RopeParams:
     payload_side: float = 0.0  # 1/2 rho C_L A across the path, in flight [kg/m]
     payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
     compliance: float = 0.0  # lengthening for every newton of pull [m/N]
+    # of a box that swings about its upper face, homogeneous [m]; 0: a ball, rigid on the rope
+    payload_sides: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # of two cables without mass, along body x, that hold the box in the rope's place [m]; 0: a rope
+    cables_apart: float = 0.0
+    gripper_mass: float = 0.0  # at the rope's lower end, which holds the payload [kg]
 
     def __post_init__(self) -> None:
         if not 1 <= self.segments <= 64:
@@ -327,9 +332,20 @@ class RopeParams:
             finite="payload_side payload_lift",
             not_negative=(
                 "payload_inertia payload_offset joint_damping payload_drag mount_damping"
-                " swing_damping downwash compliance"
+                " swing_damping downwash compliance payload_sides cables_apart gripper_mass"
             ),
         )
+        box = any(self.payload_sides)
+        if box and abs(self.payload_sides[2] - 2.0 * self.payload_offset) > 1e-9:
+            raise ValueError(
+                f"rope.payload_sides {self.payload_sides} with payload_offset"
+                f" {self.payload_offset}; expected half the height of the box"
+            )
+        if self.cables_apart and not (box and self.segments == 1 and not self.gripper_mass):
+            raise ValueError(
+                f"rope.cables_apart {self.cables_apart} m; expected a box (payload_sides),"
+                " segments = 1 and no gripper"
+            )
 
     @property
     def segment_length(self) -> float:
@@ -343,8 +359,19 @@ class RopeParams:
 
     @property
     def hanging_mass(self) -> float:
-        """Mass of rope and payload [kg]."""
-        return self.rope_mass + self.payload_mass
+        """Mass of rope, gripper and payload [kg]; two cables have none."""
+        rope = 0.0 if self.cables_apart else self.rope_mass
+        return rope + self.gripper_mass + self.payload_mass
+
+    def require_chain(self, owner: str) -> None:
+        """Raise ValueError where something else hangs on the vehicle than a chain with a ball."""
+        for name in ("payload_sides", "cables_apart", "gripper_mass"):
+            value = getattr(self, name)
+            if value not in (0.0, (0.0, 0.0, 0.0)):
+                raise ValueError(
+                    f"rope.{name} is {value}; {owner} holds a rope with a ball; expected"
+                    " sim.solver 'mujoco_warp'"
+                )
 
 
 @dataclass(frozen=True)

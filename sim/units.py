@@ -58,8 +58,8 @@ PLANT: dict[str, dict[Dimension, str]] = {
     "VehicleParams": {LENGTH: "collision_radius"},
     "RopeParams": {
         NONE: "segments downwash",
-        LENGTH: "length payload_offset payload_radius mount",
-        MASS: "rope_mass payload_mass",
+        LENGTH: "length payload_offset payload_radius mount payload_sides cables_apart",
+        MASS: "rope_mass payload_mass gripper_mass",
         INERTIA: "payload_inertia",
         ANGULAR_DAMPING: "joint_damping mount_damping",
         DAMPING: "swing_damping",

@@ -43,6 +43,7 @@ class ExchangeKernels:
     wrench: wp.Kernel
     take: wp.Kernel
     end: wp.Kernel
+    show: wp.Kernel
     payload: wp.Kernel
     State: type
     Wrench: type
@@ -267,6 +268,37 @@ def build_exchange(
                 state.status[env] = state.status[env] | in_rotor
 
     @wp.kernel(module="unique", enable_backward=False)
+    def show_kernel(
+        # Params:
+        first: int,
+        ropes: wp.array(dtype=Rope),
+        # In:
+        state: State,
+        mask: wp.array(dtype=wp.int32),
+        # Out:
+        bodies: Bodies,
+    ):
+        """Copy bodies from the state; the payload follows from the rope."""
+        env = wp.tid() + first
+        if mask[env] == 0:
+            return
+        s = load(state, env)
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        for i in range(L):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+            bodies.cable_dir_w[i, env] = n[i]
+            bodies.cable_vel_w[i, env] = u[i]
+        bodies.pos_w[env] = s.pos_w
+        bodies.quat_wb[env] = s.quat_wb
+        bodies.vel_w[env] = s.vel_w
+        bodies.rate_b[env] = s.rate_b
+        pos, vel = coupled.payload(ropes[env % ropes.shape[0]], s, n, u)
+        bodies.payload_pos_w[env] = pos
+        bodies.payload_vel_w[env] = vel
+
+    @wp.kernel(module="unique", enable_backward=False)
     def payload_kernel(
         # Params:
         first: int,
@@ -287,6 +319,7 @@ def build_exchange(
         wrench=wrench_kernel,
         take=take_kernel,
         end=end_kernel,
+        show=show_kernel,
         payload=payload_kernel,
         State=State,
         Wrench=Wrench,

@@ -45,9 +45,9 @@ class Solver(Protocol):
         """
 
     def place(self, state: Any, mask: "wp.array[Any]") -> None:
-        """Put the bodies to a struct of state arrays where ``mask``, shape (E,), int, is not 0, and
-        show all of them.
-        """
+        """Put the bodies to a struct of state arrays where ``mask``, shape (E,), int, is not 0.
+
+        ``world.bodies`` shows them already, with the payload in line with the rope."""
 
     def advance(self, duration: float) -> None:
         """Advance all bodies under ``world.wrench`` [s], and show them in ``world.bodies``."""
@@ -68,6 +68,17 @@ class World:
     kernels: ExchangeKernels  # whose structs the arrays are in
     wrench: Any  # of sim.kernels.exchange.WRENCH_FIELDS
     bodies: Any  # of sim.kernels.exchange.BODY_FIELDS
+
+    @property
+    def substep(self) -> float:
+        """Time between two exchanges [s]."""
+        return self.params.sim.control_period / self.substeps
+
+    @property
+    def substeps(self) -> int:
+        """Number of exchanges a control period."""
+        s = self.params.sim
+        return math.ceil(s.control_period / s.substep - 1e-3)
 
     def models(self) -> tuple[list[tuple[VehicleParams, RopeParams]], np.ndarray]:
         """Different pairs of vehicle and rope, and which of them each environment has, shape (E,)."""
@@ -116,11 +127,10 @@ class Exchange:
         """
         vehicles, ropes, releases, airs = parts
         period, gravity = sim.params.sim.control_period, sim.gravity
-        substeps = math.ceil(period / sim.params.sim.substep - 1e-3)
-        h, k = period / substeps, self.kernels
+        h, k = self.world.substep, self.kernels
         flags = [self._moves, self._again]
         launch(k.begin, [releases, sim.state, sim.command, sim.release, mask, *flags, sim.out])
-        for i in range(substeps):
+        for i in range(self.world.substeps):
             time = [period, i * h, h, gravity]
             wrench = [sim.state, self._moves, sim.out, self.world.wrench]
             launch(k.wrench, [vehicles, ropes, airs, *time, *wrench])
@@ -128,21 +138,20 @@ class Exchange:
             taken = [(i + 1) * h, h, gravity, sim.state, *flags, self.world.bodies, sim.out]
             launch(k.take, [ropes, releases, airs, *taken])
         launch(k.end, [vehicles, ropes, period, sim.state, mask, sim.out])
-        self.solver.place(sim.state, self._again)
+        self.place(launch, sim, self._again)
 
     def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
         """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
+        launch(self.kernels.show, [self.world.packed[1], sim.state, mask, self.world.bodies])
         self.solver.place(sim.state, mask)
         launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
-
-
-def check_fused(params: PlantParams) -> None:
-    """Raise ValueError for a payload that the fused chain does not hold."""
 
 
 def refuse(extensions: frozenset[str], params: PlantParams) -> None:
     """Raise ValueError for what of a plant cannot be exchanged with a solver."""
     name = params.sim.solver
+    if name != "mujoco_warp":
+        params.rope.require_chain(f"sim.solver {name!r}")
     unknown = sorted(UNKNOWN & extensions)
     if unknown:
         raise ValueError(f"sim.solver {name!r} with {', '.join(unknown)}; only 'chain' has that")

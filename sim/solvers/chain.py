@@ -23,9 +23,8 @@ class ChainSolver:
         self._scale = wp.zeros(world.count, dtype=real, device=world.device)
 
     def place(self, state, mask) -> None:
-        w = self.world
-        inputs = [w.packed[1], state, mask, self._stiffness, self._scale, w.bodies]
-        wp.launch(self._kernels[0], w.count, inputs, device=w.device)
+        inputs = [state, mask, self._stiffness, self._scale]
+        wp.launch(self._kernels[0], self.world.count, inputs, device=self.world.device)
 
     def advance(self, duration: float) -> None:
         w, s = self.world, self.world.params.sim
@@ -62,41 +61,18 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.kernel(module="unique", enable_backward=False)
     def place(
-        # Params:
-        ropes: wp.array(dtype=Rope),
         # In:
         state: State,
         mask: wp.array(dtype=wp.int32),
         # Out:
         stiffness: wp.array2d(dtype=real),
         scale: wp.array(dtype=real),
-        bodies: Bodies,
     ):
         env = wp.tid()
-        if mask[env] == 0:
-            return
-        rope = ropes[env % ropes.shape[0]]
-        scale[env] = state.mass_scale[env]
-        s = QuadState()
-        s.pos_w = state.pos_w[env]
-        s.quat_wb = state.quat_wb[env]
-        s.vel_w = state.vel_w[env]
-        s.rate_b = state.rate_b[env]
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        for i in range(L):
-            n[i] = state.cable_dir_w[i, env]
-            u[i] = state.cable_vel_w[i, env]
-            stiffness[i, env] = state.stiffness[i, env]
-            bodies.cable_dir_w[i, env] = n[i]
-            bodies.cable_vel_w[i, env] = u[i]
-        bodies.pos_w[env] = s.pos_w
-        bodies.quat_wb[env] = s.quat_wb
-        bodies.vel_w[env] = s.vel_w
-        bodies.rate_b[env] = s.rate_b
-        pos, vel = coupled.payload(rope, s, n, u)
-        bodies.payload_pos_w[env] = pos
-        bodies.payload_vel_w[env] = vel
+        if mask[env] != 0:
+            scale[env] = state.mass_scale[env]
+            for i in range(L):
+                stiffness[i, env] = state.stiffness[i, env]
 
     @wp.kernel(module="unique", enable_backward=False)
     def advance(

@@ -1,0 +1,289 @@
+"""MuJoCo behind the exchange: MuJoCo Warp on a GPU, MuJoCo's C library, which takes the same
+models, on a CPU.
+
+RK4 up to a substep of 0.5 ms, where it has converged on the paper's rope; implicitfast above, where
+RK4 is unstable."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from sim.solvers import World
+from sim.solvers.payloads import compile_model
+from sim.solvers.rods import build_place, quat, vec3
+
+RK4_STEP = 5e-4
+"""Largest substep of RK4 [s]: half of it moves the end of a hard throw by less than a micrometre."""
+
+OWN = (
+    "body_pos",
+    "body_ipos",
+    "body_mass",
+    "body_subtreemass",
+    "body_inertia",
+    "body_invweight0",
+    "dof_damping",
+    "dof_invweight0",
+    "site_pos",
+    "tendon_range",
+    "tendon_invweight0",
+    "tendon_length0",
+)
+"""Fields of a model in which vehicles and ropes of one batch may differ."""
+
+CONSTRAINTS = 8
+"""Room for constraints of a world: cables that are taut."""
+
+
+class MujocoSolver:
+    """Copies of MuJoCo's models, one a vehicle."""
+
+    capturable = False  # on a GPU a step is a captured graph of its own
+
+    def __init__(self, world: World) -> None:
+        self.world, device, count = world, world.device, world.count
+        pairs, of = world.models()
+        models = [compile_model(vehicle.body, rope) for vehicle, rope in pairs]
+        for model in models:
+            model.opt.timestep = world.substep
+            rk4 = world.substep <= RK4_STEP * (1.0 + 1e-9)
+            kind = mujoco.mjtIntegrator
+            model.opt.integrator = kind.mjINT_RK4 if rk4 else kind.mjINT_IMPLICITFAST
+        own = {name: np.stack([getattr(model, name) for model in models])[of] for name in OWN}
+        wide = {
+            name: value
+            for name, value in own.items()
+            if value.size and (name == "body_mass" or (value != value[0]).any())
+        }
+        make = _on_cpu if device == "cpu" else _on_gpu
+        self.qpos, self.qvel, self.ctrl, self._masses, self._step, self._placed = make(
+            models[0], wide, count, device
+        )
+        self._vehicle = mujoco.mj_name2id(models[0], mujoco.mjtObj.mjOBJ_BODY, "vehicle")
+        self._nominal = wp.array(own["body_mass"][:, self._vehicle], dtype=float, device=device)
+        segments = world.params.rope.segments
+        shapes = ((count, 7), (count, 6), (count, 2 * segments), (count, 2 * segments))
+        self._arrays = [wp.zeros(shape, dtype=wp.float32, device=device) for shape in shapes]
+        self._rows = wp.array(np.arange(count), dtype=wp.int32, device=device)
+        self._payload_quat = wp.zeros(count, dtype=quat, device=device)
+        self._kernels = _kernels(world)
+
+    def place(self, state, mask) -> None:
+        w, device = self.world, self.world.device
+        place = [state, mask, self._rows, *self._arrays]
+        wp.launch(self._kernels["place"], w.count, place, device=device)
+        masses = [self._nominal, self._vehicle, self._masses]
+        pack = [w.packed[1], state, mask, *self._arrays, *masses, self.qpos, self.qvel]
+        wp.launch(self._kernels["pack"], w.count, pack, device=device)
+        self._placed(mask)
+        self._show()
+
+    def advance(self, duration: float) -> None:
+        w, device = self.world, self.world.device
+        push = [w.wrench, self._payload_quat, self.ctrl]
+        wp.launch(self._kernels["push"], w.count, push, device=device)
+        self._step()
+        self._show()
+
+    def _show(self) -> None:
+        w = self.world
+        shown = [w.packed[1], self.qpos, self.qvel, w.bodies, self._payload_quat]
+        wp.launch(self._kernels["show"], w.count, shown, device=w.device)
+
+
+def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tuple:
+    """Batch of MuJoCo's C library: arrays of coordinates, controls and masses, functions that step
+    and that take over what was placed where a mask is not 0.
+    """
+    from mujoco.batch import Batch
+
+    batch = Batch(model, count, nthread=1)
+    for name, value in wide.items():
+        batch.expand(name)[:] = value
+    shapes = ((count, model.nq), (count, model.nv), (count, model.nu), (count, model.nbody))
+    qpos, qvel, ctrl, masses = (wp.zeros(shape, dtype=wp.float32) for shape in shapes)
+    masses.assign(wide["body_mass"].astype(np.float32))
+
+    def step() -> None:
+        batch.ctrl[:] = ctrl.numpy()
+        batch.step()
+        qpos.numpy()[:], qvel.numpy()[:] = batch.qpos, batch.qvel
+
+    def placed(mask) -> None:
+        rows = mask.numpy() != 0
+        batch.expand("body_mass")[rows] = masses.numpy()[rows]
+        batch.qpos[rows], batch.qvel[rows] = qpos.numpy()[rows], qvel.numpy()[rows]
+        batch.bind("qacc_warmstart")[rows] = 0.0
+
+    return qpos, qvel, ctrl, masses, step, placed
+
+
+def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tuple:
+    """MuJoCo Warp's worlds: see :func:`_on_cpu`."""
+    import mujoco_warp
+
+    with wp.ScopedDevice(device), wp.ScopedStream(wp.Stream(device)):
+        there = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(wide, count))
+        for name, value in wide.items():
+            getattr(there, name).assign(value.astype(np.float32))
+        data = mujoco_warp.make_data(model, nworld=count, njmax=CONSTRAINTS)
+        mujoco_warp.step(there, data)  # modules load, which a capture cannot
+        with wp.ScopedCapture(device=device, force_module_load=False) as captured:
+            mujoco_warp.step(there, data)
+        wp.synchronize_device(device)
+
+    def step() -> None:
+        wp.capture_launch(captured.graph, stream=wp.get_stream(device))
+
+    def placed(mask) -> None:
+        wp.launch(_clear, data.qacc_warmstart.shape, [mask, data.qacc_warmstart], device=device)
+
+    return data.qpos, data.qvel, data.ctrl, there.body_mass, step, placed
+
+
+@wp.kernel(enable_backward=False)
+def _clear(mask: wp.array(dtype=wp.int32), values: wp.array2d(dtype=float)):
+    env, i = wp.tid()
+    if mask[env] != 0:
+        values[env, i] = 0.0
+
+
+def _kernels(world: World) -> dict[str, Callable]:
+    """Kernels between the exchange's arrays and MuJoCo's coordinates."""
+    t, rope = world.types, world.params.rope
+    L, cables, box = rope.segments, rope.cables_apart > 0.0, any(rope.payload_sides)
+    N = L + 1 if box else L  # the box turns like one more rod
+    Rope, State = t.Rope, world.kernels.State
+    Wrench, Bodies = world.kernels.Wrench, world.kernels.Bodies
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pack(
+        # Params:
+        ropes: wp.array(dtype=Rope),
+        # In:
+        state: State,
+        mask: wp.array(dtype=wp.int32),
+        pose: wp.array2d(dtype=float),
+        velocity: wp.array2d(dtype=float),
+        angles: wp.array2d(dtype=float),
+        rates: wp.array2d(dtype=float),
+        nominal: wp.array(dtype=float),
+        vehicle: int,
+        # Out:
+        masses: wp.array2d(dtype=float),
+        qpos: wp.array2d(dtype=float),
+        qvel: wp.array2d(dtype=float),
+    ):
+        env = wp.tid()
+        if mask[env] == 0:
+            return
+        masses[env, vehicle] = nominal[env] * state.mass_scale[env]
+        qpos[env, 3] = pose[env, 6]
+        for k in range(3):
+            qpos[env, k] = pose[env, k]
+            qpos[env, 4 + k] = pose[env, 3 + k]
+            qvel[env, k] = velocity[env, k]
+            qvel[env, 3 + k] = state.rate_b[env][k]
+        if wp.static(cables):  # both taut: the box hangs level with the vehicle
+            rope = ropes[env % ropes.shape[0]]
+            q = state.quat_wb[env]
+            w = wp.quat_rotate(q, state.rate_b[env])
+            arm = wp.quat_rotate(q, rope.mount - vec3(0.0, 0.0, rope.payload_offset))
+            pos = state.pos_w[env] + arm + rope.segment_length * state.cable_dir_w[0, env]
+            vel = state.vel_w[env] + wp.cross(w, arm)
+            vel += rope.segment_length * state.cable_vel_w[0, env]
+            qpos[env, 10] = pose[env, 6]
+            for k in range(3):
+                qpos[env, 7 + k] = pos[k]
+                qpos[env, 11 + k] = pose[env, 3 + k]
+                qvel[env, 6 + k] = vel[k]
+                qvel[env, 9 + k] = state.rate_b[env][k]
+        else:
+            for i in range(2 * N):
+                qpos[env, 7 + i] = 0.0
+                qvel[env, 6 + i] = 0.0
+                if i < 2 * L:
+                    qpos[env, 7 + i] = angles[env, i]
+                    qvel[env, 6 + i] = rates[env, i]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def push(
+        # In:
+        wrench: Wrench,
+        payload_quat: wp.array(dtype=quat),
+        # Out:
+        ctrl: wp.array2d(dtype=float),
+    ):
+        env = wp.tid()
+        load = wp.quat_rotate_inv(payload_quat[env], wrench.load_w[env])
+        for k in range(3):
+            ctrl[env, k] = wrench.force_b[env][k]
+            ctrl[env, 3 + k] = wrench.torque_b[env][k]
+            ctrl[env, 6 + k] = load[k]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def show(
+        # Params:
+        ropes: wp.array(dtype=Rope),
+        # In:
+        qpos: wp.array2d(dtype=float),
+        qvel: wp.array2d(dtype=float),
+        # Out:
+        bodies: Bodies,
+        payload_quat: wp.array(dtype=quat),
+    ):
+        env = wp.tid()
+        rope = ropes[env % ropes.shape[0]]
+        q = quat(qpos[env, 4], qpos[env, 5], qpos[env, 6], qpos[env, 3])
+        rate = vec3(qvel[env, 3], qvel[env, 4], qvel[env, 5])
+        w = wp.quat_rotate(q, rate)
+        arm = wp.quat_rotate(q, rope.mount)
+        pos = vec3(qpos[env, 0], qpos[env, 1], qpos[env, 2])
+        vel = vec3(qvel[env, 0], qvel[env, 1], qvel[env, 2])
+        bodies.pos_w[env] = pos
+        bodies.quat_wb[env] = q
+        bodies.vel_w[env] = vel
+        bodies.rate_b[env] = rate
+        pos += arm
+        vel += wp.cross(w, arm)
+        if wp.static(cables):
+            turn = quat(qpos[env, 11], qpos[env, 12], qpos[env, 13], qpos[env, 10])
+            spin = wp.quat_rotate(turn, vec3(qvel[env, 9], qvel[env, 10], qvel[env, 11]))
+            box = vec3(qpos[env, 7], qpos[env, 8], qpos[env, 9])
+            box_vel = vec3(qvel[env, 6], qvel[env, 7], qvel[env, 8])
+            top = wp.quat_rotate(turn, vec3(0.0, 0.0, rope.payload_offset))
+            along = box + top - pos
+            n = wp.normalize(along)
+            u = (box_vel + wp.cross(spin, top) - vel) / wp.length(along)
+            bodies.cable_dir_w[0, env] = n
+            bodies.cable_vel_w[0, env] = u - n * wp.dot(n, u)
+            bodies.payload_pos_w[env] = box
+            bodies.payload_vel_w[env] = box_vel
+            payload_quat[env] = turn
+        else:
+            n = vec3()
+            u = vec3()
+            for i in range(N):
+                a = qpos[env, 7 + 2 * i]
+                b = qpos[env, 8 + 2 * i]
+                turn = wp.quat_from_axis_angle(vec3(0.0, 1.0, 0.0), a)
+                q = q * turn * wp.quat_from_axis_angle(vec3(1.0, 0.0, 0.0), b)
+                about_y = qvel[env, 6 + 2 * i]
+                about_x = qvel[env, 7 + 2 * i]
+                spin = vec3(about_x, about_y * wp.cos(b), -about_y * wp.sin(b))
+                w += wp.quat_rotate(q, spin)
+                n = wp.quat_rotate(q, vec3(0.0, 0.0, -1.0))
+                u = wp.cross(w, n)
+                if i < L:
+                    bodies.cable_dir_w[i, env] = n
+                    bodies.cable_vel_w[i, env] = u
+                    pos += rope.segment_length * n
+                    vel += rope.segment_length * u
+            bodies.payload_pos_w[env] = pos + rope.payload_offset * n
+            bodies.payload_vel_w[env] = vel + rope.payload_offset * u
+            payload_quat[env] = q
+
+    place = build_place(world, hinges=True)
+    return {"place": place, "pack": pack, "push": push, "show": show}

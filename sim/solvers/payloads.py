@@ -1,0 +1,76 @@
+"""MuJoCo's models of what may hang below a vehicle: :mod:`sim.reference.model` has the rope.
+
+A ball on the rope; a box on it; a box on two cables; a gripper at the end of rope or rod."""
+
+import mujoco
+
+from sim.params import BodyParams, RopeParams
+from sim.reference.model import add_chain, add_vehicle, new_spec
+
+
+def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
+    """Compile a vehicle on a free joint with its rope and payload, as the rope's parameters say.
+
+    Six actuators push the vehicle in its own frame, three more the payload at the site ``payload``
+    in its own.
+    """
+    spec = new_spec(constraints=rope.cables_apart > 0.0)
+    vehicle = add_vehicle(spec, body)
+    if rope.cables_apart > 0.0:
+        _add_two_cables(spec, vehicle, rope)
+    else:
+        ball, mount = not any(rope.payload_sides), list(rope.mount)
+        last = add_chain(
+            spec, rope, vehicle, mount, "universal", 0.0, None, free_root=False, load=ball
+        )
+        end = [0.0, 0.0, -rope.segment_length]
+        if not ball:
+            box = last.add_body(name="box", pos=end)
+            for name, axis in (("box_y", [0, 1, 0]), ("box_x", [1, 0, 0])):
+                hinge = box.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
+                hinge.damping[0] = rope.joint_damping
+            _as_box(box, rope, -rope.payload_offset)
+        if rope.gripper_mass > 0.0:
+            gripper = last.add_body(name="gripper", pos=end)
+            gripper.mass, gripper.explicitinertial = rope.gripper_mass, True
+            gripper.inertia = [GRIPPER_INERTIA] * 3
+    for i, name in enumerate(("px", "py", "pz")):
+        gear = [0.0] * 6
+        gear[i] = 1.0
+        spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_SITE, target="payload", gear=gear)
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # a NaN is to be seen
+    return spec.compile()
+
+
+GRIPPER_INERTIA = 1e-8
+"""Of a gripper about its own centre [kg m^2]: it counts as a point."""
+
+
+def _add_two_cables(spec: "mujoco.MjSpec", vehicle: "mujoco.MjsBody", rope: RopeParams) -> None:
+    """Add a box on two cables without mass, side by side along the vehicle's x axis; a cable pulls
+    or is slack.
+    """
+    x, y, z = rope.mount
+    box = spec.worldbody.add_body(name="box", pos=[x, y, z - rope.length - rope.payload_offset])
+    box.add_freejoint(name="box")
+    _as_box(box, rope, 0.0)
+    for name, side in (("front", 0.5), ("rear", -0.5)):
+        across = side * rope.cables_apart
+        vehicle.add_site(name=f"{name}_above", pos=[x + across, y, z])
+        box.add_site(name=f"{name}_below", pos=[across, 0.0, rope.payload_offset])
+        cable = spec.add_tendon(
+            name=name, limited=True, range=[0.0, rope.length], solref_limit=[0.002, 1.0]
+        )
+        cable.wrap_site(f"{name}_above")
+        cable.wrap_site(f"{name}_below")
+
+
+def _as_box(body: "mujoco.MjsBody", rope: RopeParams, centre_z: float) -> None:
+    """Give a body a homogeneous box's inertia about a centre on its z axis, and the site
+    ``payload`` there.
+    """
+    a, b, c = (side * side for side in rope.payload_sides)
+    twelfth = rope.payload_mass / 12.0
+    body.mass, body.ipos, body.explicitinertial = rope.payload_mass, [0.0, 0.0, centre_z], True
+    body.inertia = [twelfth * (b + c), twelfth * (a + c), twelfth * (a + b)]
+    body.add_site(name="payload", pos=[0.0, 0.0, centre_z])

@@ -1,0 +1,285 @@
+"""PhysX, the solver of the paper, behind the exchange: ovphysx, on a CPU or a GPU.
+
+One articulation a vehicle: the body, and rods on joints with two angles, without colliders. What
+each setting is for: docs/explanation/physx.md."""
+
+import tempfile
+import weakref
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import warp as wp
+
+from sim.kernels.rope.payload import LOADS
+from sim.kernels.structs import extensions_of
+from sim.params import RopeParams, VehicleParams
+from sim.solvers import World
+from sim.solvers.rods import AXIAL_INERTIA, build_place, quat, rod_inertial, vec3
+
+LOCKED, FREE = ("transX", "transY", "transZ", "rotZ"), ("rotX", "rotY")
+SCENE = """#usda 1.0
+(
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def PhysicsScene "scene" (prepend apiSchemas = ["PhysxSceneAPI"]) {{
+    vector3f physics:gravityDirection = (0, 0, -1)
+    float physics:gravityMagnitude = {gravity!r}
+    uniform token physxScene:solverType = "TGS"
+    bool physxScene:enableGPUDynamics = {gpu:d}
+    uniform token physxScene:broadphaseType = "{broadphase}"
+    bool physxScene:enableExternalForcesEveryIteration = 0
+    uniform bool physxScene:disableSleeping = 1
+}}
+"""
+LINK = """
+    def Xform "{name}" (prepend apiSchemas = [{apis}"PhysicsRigidBodyAPI", "PhysicsMassAPI",
+            "PhysxRigidBodyAPI"]) {{
+        double3 xformOp:translate = (0, 0, {z!r})
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+        float physics:mass = {mass!r}
+        point3f physics:centerOfMass = (0, 0, {centre!r})
+        float3 physics:diagonalInertia = {inertia!r}
+        quatf physics:principalAxes = (1, 0, 0, 0)
+        float physxRigidBody:angularDamping = 0{more}
+    }}"""
+ROOT = """
+        bool physxArticulation:enabledSelfCollisions = 0
+        int physxArticulation:solverPositionIterationCount = 4
+        int physxArticulation:solverVelocityIterationCount = 1"""
+JOINT = """
+    def PhysicsJoint "joint{i}" (prepend apiSchemas = [{apis}]) {{
+        rel physics:body0 = </{env}/{above}>
+        rel physics:body1 = </{env}/rod{i}>
+        point3f physics:localPos0 = {at!r}
+{axes}
+    }}"""
+LIMIT = "        float limit:{0}:physics:low = 1\n        float limit:{0}:physics:high = -1"
+DRIVE = """        float drive:{0}:physics:damping = {1!r}
+        float drive:{0}:physics:stiffness = 0"""
+
+_device: list[str] = []
+"""Device of this process' PhysX, once it has run."""
+
+
+def environment(env: str, vehicle: VehicleParams, rope: RopeParams) -> str:
+    """USD text of one vehicle with its rope, level and hanging straight down."""
+    length, mount, body = rope.segment_length, rope.mount, vehicle.body
+    apis = '"PhysicsArticulationRootAPI", "PhysxArticulationAPI", '
+    place = {"z": 0.0, "mass": body.mass, "centre": 0.0, "inertia": tuple(body.inertia)}
+    parts = [LINK.format(name="vehicle", apis=apis, more=ROOT, **place)]
+    joint_apis = [f'"PhysicsLimitAPI:{axis}"' for axis in LOCKED]
+    joint_apis += [f'"PhysicsDriveAPI:{axis}"' for axis in FREE]
+    for i in range(rope.segments):
+        mass, centre, across = rod_inertial(rope, i == rope.segments - 1)
+        place = {"z": mount[2] - i * length, "mass": mass, "centre": centre}
+        inertia = (across, across, AXIAL_INERTIA)
+        parts.append(LINK.format(name=f"rod{i}", apis="", more="", inertia=inertia, **place))
+        damping = rope.joint_damping + (rope.mount_damping if i == 0 else 0.0)
+        axes = [LIMIT.format(axis) for axis in LOCKED]
+        axes += [DRIVE.format(axis, float(np.radians(damping))) for axis in FREE]  # per degree
+        above, at = ("vehicle", tuple(mount)) if i == 0 else (f"rod{i - 1}", (0.0, 0.0, -length))
+        joint = {"apis": ", ".join(joint_apis), "above": above, "at": at, "axes": "\n".join(axes)}
+        parts.append(JOINT.format(i=i, env=env, **joint))
+    return f'def Xform "{env}" {{{"".join(parts)}\n}}\n'
+
+
+class PhysxSolver:
+    """Articulations of E vehicles in one scene.
+
+    Raises RuntimeError: PhysX runs on another device in this process already.
+    """
+
+    capturable = False
+
+    def __init__(self, world: World) -> None:
+        self.world, self._gpu = world, world.device != "cpu"
+        ovphysx = _start(world.device)
+        import ovstage
+        from ovphysx.types import TensorType
+
+        models, of = world.models()
+        first = [int(np.argmax(of == k)) for k in range(len(models))]
+        name = "env{:06d}".format
+        usd = [environment(name(e), *model) for e, model in zip(first, models)]
+        head = SCENE.format(
+            gravity=world.gravity, gpu=self._gpu, broadphase="GPU" if self._gpu else "MBP"
+        )
+        self._physx, stage = ovphysx.PhysX(**_options(ovphysx, self._gpu)), ovstage.Stage()
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "scene.usda"
+            file.write_text(head + "".join(usd))
+            domains = ovstage.PopulationDomain.ALL
+            ovstage.population.open_usd(stage, str(file), ordinal=1, domains=domains)
+        stage.advance_write_floor(ordinal=1).wait()
+        self._stage, wait = stage, self._physx.wait_task
+        wait(self._physx.attach_ovstage(stage, read_ordinal=1))
+        for k, e in enumerate(first):
+            copies = [f"/{name(c)}" for c in np.flatnonzero(of == k) if c != e]
+            if copies:  # nothing collides, so all may stand in one place
+                wait(self._physx.clone(f"/{name(e)}", copies, [(0.0,) * 6 + (1.0,)] * len(copies)))
+        weakref.finalize(self, self._physx.destroy)
+        self._physx.warmup()  # a first step, which the first read or write would make
+        self._bind(TensorType)
+        self._kernels = _kernels(world)
+        self._unscaled = self._masses[:, 0].copy()
+
+    def _bind(self, kind) -> None:
+        """Tensors of the scene, and arrays to exchange them by."""
+        kinds = {
+            "pose": kind.ARTICULATION_ROOT_POSE,
+            "velocity": kind.ARTICULATION_ROOT_VELOCITY,
+            "angles": kind.ARTICULATION_DOF_POSITION,
+            "rates": kind.ARTICULATION_DOF_VELOCITY,
+            "links": kind.ARTICULATION_LINK_POSE,
+            "link_velocities": kind.ARTICULATION_LINK_VELOCITY,
+            "wrench": kind.ARTICULATION_LINK_WRENCH,
+            "mass": kind.ARTICULATION_BODY_MASS,
+        }
+        bind = self._physx.create_tensor_binding
+        self._tensors = {
+            name: bind(pattern="/env*/vehicle", tensor_type=value, raise_if_empty=True)
+            for name, value in kinds.items()
+        }
+        paths = self._tensors["pose"].prim_paths
+        self._order = np.array([int(path.split("/")[1].removeprefix("env")) for path in paths])
+        self._rows = wp.array(self._order, dtype=wp.int32, device=self.world.device)
+        self._arrays = {
+            name: wp.zeros(tensor.shape, dtype=wp.float32, device=self.world.device)
+            for name, tensor in self._tensors.items()
+            if name != "mass"
+        }
+        self._masses = np.zeros(self._tensors["mass"].shape, np.float32)  # PhysX has them on host
+        self._tensors["mass"].read(self._masses)
+
+    def place(self, state, mask) -> None:
+        w, moved = self.world, mask.numpy()[self._order] != 0
+        if not moved.any():
+            return
+        names = ("pose", "velocity", "angles", "rates")
+        arrays = [self._arrays[name] for name in names]
+        rows = wp.array(moved, dtype=wp.uint8, device=w.device)
+        wp.launch(self._kernels["place"], w.count, [state, mask, self._rows, *arrays], device=w.device)
+        scale = state.mass_scale.numpy()[self._order]
+        masses = np.where(moved, self._unscaled * scale, self._masses[:, 0])
+        changed = masses != self._masses[:, 0]
+        if changed.any():
+            self._masses[:, 0] = masses
+            self._tensors["mass"].write(self._masses, mask=changed.astype(np.uint8))
+        for name, array in zip(names, arrays):
+            self._tensors[name].write(array, mask=rows)
+
+    def advance(self, duration: float) -> None:
+        w, arrays, tensors = self.world, self._arrays, self._tensors
+        given = [w.wrench, w.bodies, self._rows, arrays["wrench"]]
+        wp.launch(self._kernels["push"], w.count, given, device=w.device)
+        tensors["wrench"].write(arrays["wrench"])
+        self._physx.step_sync(duration)
+        for name in ("links", "link_velocities"):
+            tensors[name].read(arrays[name])
+        shown = [w.packed[1], self._rows, arrays["links"], arrays["link_velocities"], w.bodies]
+        wp.launch(self._kernels["show"], w.count, shown, device=w.device)
+
+
+def _start(device: str) -> ModuleType:
+    """Start PhysX in this process, on one device for good."""
+    import ovphysx
+    import ovstage
+    from ovphysx.samples.python_samples.schema_support import physx_schema_paths
+    from ovphysx.types import GlobalConfigKey
+
+    if not _device:
+        ovphysx.PhysX.set_cpu_mode(device == "cpu")
+        if device == "cpu":  # its default of 8 makes a step of one vehicle 12 times as dear
+            ovphysx.set_global_config(GlobalConfigKey.NUM_THREADS, 0)
+        schemas = [*map(str, physx_schema_paths()), str(ovphysx.newton_schema_root())]
+        ovstage.population.register_usd_schemas(schemas)
+        _device.append(device)
+    if _device != [device]:
+        raise RuntimeError(
+            f"PhysX on {device}: this process runs it on {_device[0]}, and it takes one device a"
+            " process"
+        )
+    return ovphysx
+
+
+def _options(ovphysx: ModuleType, gpu: bool) -> dict:
+    """Of an instance: nothing collides, and on a GPU its state stays there."""
+    settings = {"/ovphysx/clone/useEnvIds": False, "/physics/suppressReadback": gpu}
+    return {"config": ovphysx.PhysXConfig(carbonite_overrides=settings)}
+
+
+def _kernels(world: World) -> dict[str, wp.Kernel]:
+    """Kernels between the exchange's arrays and PhysX's tensors."""
+    t, L = world.types, world.params.rope.segments
+    Rope, Wrench, Bodies = t.Rope, world.kernels.Wrench, world.kernels.Bodies
+    loaded = bool(extensions_of(world.vehicles, world.ropes) & LOADS) or bool(world.params.laws)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def push(
+        # In:
+        wrench: Wrench,
+        bodies: Bodies,
+        rows: wp.array(dtype=wp.int32),
+        # Out:
+        out: wp.array3d(dtype=float),
+    ):
+        """Wrenches in the world frame, which PhysX holds over the step."""
+        row = wp.tid()
+        env = rows[row]
+        q = bodies.quat_wb[env]
+        force = wp.quat_rotate(q, wrench.force_b[env])
+        torque = wp.quat_rotate(q, wrench.torque_b[env])
+        pos = bodies.pos_w[env]
+        for k in range(3):
+            out[row, 0, k] = force[k]
+            out[row, 0, 3 + k] = torque[k]
+            out[row, 0, 6 + k] = pos[k]
+        if wp.static(loaded):
+            load = wrench.load_w[env]
+            at = bodies.payload_pos_w[env]
+            for k in range(3):
+                out[row, L, k] = load[k]
+                out[row, L, 6 + k] = at[k]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def show(
+        # Params:
+        ropes: wp.array(dtype=Rope),
+        # In:
+        rows: wp.array(dtype=wp.int32),
+        links: wp.array3d(dtype=float),
+        velocities: wp.array3d(dtype=float),
+        # Out:
+        bodies: Bodies,
+    ):
+        row = wp.tid()
+        env = rows[row]
+        rope = ropes[env % ropes.shape[0]]
+        q = quat(links[row, 0, 3], links[row, 0, 4], links[row, 0, 5], links[row, 0, 6])
+        rate_w = vec3(velocities[row, 0, 3], velocities[row, 0, 4], velocities[row, 0, 5])
+        pos = vec3(links[row, 0, 0], links[row, 0, 1], links[row, 0, 2])
+        vel = vec3(velocities[row, 0, 0], velocities[row, 0, 1], velocities[row, 0, 2])
+        bodies.pos_w[env] = pos
+        bodies.quat_wb[env] = q
+        bodies.vel_w[env] = vel
+        bodies.rate_b[env] = wp.quat_rotate_inv(q, rate_w)
+        arm = wp.quat_rotate(q, rope.mount)
+        pos += arm
+        vel += wp.cross(rate_w, arm)
+        n = vec3()
+        u = vec3()
+        for i in range(1, L + 1):
+            turn = quat(links[row, i, 3], links[row, i, 4], links[row, i, 5], links[row, i, 6])
+            spin = vec3(velocities[row, i, 3], velocities[row, i, 4], velocities[row, i, 5])
+            n = wp.quat_rotate(turn, vec3(0.0, 0.0, -1.0))
+            u = wp.cross(spin, n)
+            bodies.cable_dir_w[i - 1, env] = n
+            bodies.cable_vel_w[i - 1, env] = u
+            pos += rope.segment_length * n
+            vel += rope.segment_length * u
+        bodies.payload_pos_w[env] = pos + rope.payload_offset * n
+        bodies.payload_vel_w[env] = vel + rope.payload_offset * u
+
+    return {"place": build_place(world, hinges=False), "push": push, "show": show}

@@ -1,0 +1,98 @@
+"""Rods on joints with two angles, as engines of rigid bodies have them in place of the chain."""
+
+import warp as wp
+
+from sim.params import RopeParams
+from sim.solvers import World
+
+vec3, quat = wp.vec3f, wp.quatf
+
+AXIAL_INERTIA = 1e-8
+"""Of a rod about its axis [kg m^2]. Its joints pass the vehicle's yaw on, a cord does not: it must
+not load the vehicle; 1e-9 and 1e-10 move nothing more."""
+
+
+def rod_inertial(rope: RopeParams, last: bool) -> tuple[float, float, float]:
+    """Mass [kg], height of the centre of mass above the upper end [m] and transverse inertia about
+    it [kg m^2] of a rod; the last one carries the ball.
+    """
+    mass, length = rope.segment_mass, rope.segment_length
+    about_centre = mass * length**2 / 12.0
+    if not last:
+        return mass, -length / 2, about_centre
+    ball, reach = rope.payload_mass, length + rope.payload_offset
+    centre = (mass * length / 2 + ball * reach) / (mass + ball)
+    across = about_centre + rope.payload_inertia
+    across += mass * (centre - length / 2) ** 2 + ball * (reach - centre) ** 2
+    return mass + ball, -centre, across
+
+
+def build_place(world: World, hinges: bool) -> wp.Kernel:
+    """Build the kernel that turns state arrays into an engine's coordinates where a mask is not 0.
+
+    It fills in poses (E, 7) and velocities (E, 6) of the roots, in the world frame, and angles and
+    their rates (E, 2 L). A joint's two angles are a rotation vector in its x-y plane, and their
+    rates lie in that plane of the lower rod; with ``hinges`` the rod turns by them about y, then
+    about x. Environment ``rows[r]`` stands in row r.
+    """
+    L, State = world.params.rope.segments, world.kernels.State
+
+    @wp.func
+    def turned(d: vec3):
+        """Angles of the joint that turns -z into a direction, and the rotation."""
+        if wp.static(hinges):
+            b = wp.asin(wp.clamp(d[1], -1.0, 1.0))
+            a = wp.atan2(-d[0], -d[2])
+            about_y = wp.quat_from_axis_angle(vec3(0.0, 1.0, 0.0), a)
+            return a, b, about_y * wp.quat_from_axis_angle(vec3(1.0, 0.0, 0.0), b)
+        else:
+            axis = vec3(d[1], -d[0], 0.0)
+            size = wp.length(axis)
+            angle = wp.atan2(size, -d[2])
+            axis = wp.normalize(axis)
+            return axis[0] * angle, axis[1] * angle, wp.quat_from_axis_angle(axis, angle)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def place(
+        # In:
+        state: State,
+        mask: wp.array(dtype=wp.int32),
+        rows: wp.array(dtype=wp.int32),
+        # Out:
+        pose: wp.array2d(dtype=float),
+        velocity: wp.array2d(dtype=float),
+        angles: wp.array2d(dtype=float),
+        rates: wp.array2d(dtype=float),
+    ):
+        row = wp.tid()
+        env = rows[row]
+        if mask[env] == 0:
+            return
+        q = state.quat_wb[env]
+        w = wp.quat_rotate(q, state.rate_b[env])
+        for k in range(3):
+            pose[row, k] = state.pos_w[env][k]
+            velocity[row, k] = state.vel_w[env][k]
+            velocity[row, 3 + k] = w[k]
+        for k in range(4):
+            pose[row, 3 + k] = q[k]
+        for i in range(L):
+            n = state.cable_dir_w[i, env]
+            u = state.cable_vel_w[i, env]
+            x, y, turn = turned(wp.quat_rotate_inv(q, n))
+            angles[row, 2 * i] = x
+            angles[row, 2 * i + 1] = y
+            above = wp.quat_rotate_inv(turn, wp.quat_rotate_inv(q, w))
+            q = q * turn
+            rate = wp.quat_rotate_inv(q, wp.cross(n, u)) - above
+            spin = above[2]
+            if wp.static(hinges):
+                rates[row, 2 * i] = rate[1] / wp.cos(y)
+                rates[row, 2 * i + 1] = rate[0]
+                spin -= rate[1] * wp.tan(y)
+            else:
+                rates[row, 2 * i] = rate[0]
+                rates[row, 2 * i + 1] = rate[1]
+            w = wp.cross(n, u) - spin * n
+
+    return place
