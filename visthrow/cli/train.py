@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Any
 
-from visthrow.common.arguments import NUMBER, WHOLE, add_common
+from visthrow.common.arguments import NUMBER, SOLVER, WHOLE, add_common
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,6 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="show a throw of each evaluation in this machine's browser",
     )
     parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
+    parser.add_argument("--solver", **SOLVER)
     add_common(parser)
 
 

@@ -71,6 +71,17 @@ def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bo
         )
 
 
+SOLVER: Mapping[str, Any] = {
+    "dest": "overrides",
+    "action": "append",
+    "default": [],
+    "type": "sim.solver={}".format,
+    "metavar": "NAME",
+    "help": "engine that holds vehicle and rope, of sim.solver",
+}
+"""Option of a command that flies the training simulator."""
+
+
 def add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
     """Add ``--out``: the folder of what a command writes."""
     parser.add_argument(
@@ -94,6 +105,7 @@ def add_conditions(parser: argparse.ArgumentParser, whose: str) -> None:
         " which is told; may be repeated"
     )
     add("--allow", action="append", default=[], metavar="KEY", help=allow)
+    add("--solver", **SOLVER)
 
 
 def add_commands(

@@ -117,9 +117,10 @@ class PPOTraining:
 
     def rollout(self) -> None:
         """Collect one batch: eagerly the first time (everything is allocated then), from a captured
-        graph afterwards.
+        graph afterwards where the simulator's work can be captured.
         """
-        if not self.device.startswith("cuda") or self._rollouts == 0:
+        capturable = self.device.startswith("cuda") and self.env.sim.capturable
+        if not capturable or self._rollouts == 0:
             self._rollout()
         else:
             if self._graph is None:
