@@ -7,6 +7,7 @@ import tempfile
 import weakref
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -106,7 +107,7 @@ class PhysxSolver:
         head = SCENE.format(
             gravity=world.gravity, gpu=self._gpu, broadphase="GPU" if self._gpu else "MBP"
         )
-        self._physx, stage = ovphysx.PhysX(**_options(ovphysx, self._gpu)), ovstage.Stage()
+        self._physx, stage = _instance(ovphysx, world.device), ovstage.Stage()
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "scene.usda"
             file.write_text(head + "".join(usd))
@@ -204,10 +205,14 @@ def _start(device: str) -> ModuleType:
     return ovphysx
 
 
-def _options(ovphysx: ModuleType, gpu: bool) -> dict:
-    """Of an instance: nothing collides, and on a GPU its state stays there."""
+def _instance(ovphysx: ModuleType, device: str) -> Any:
+    """Make an instance in which nothing collides, and whose state stays on its GPU."""
+    gpu = device != "cpu"
     settings = {"/ovphysx/clone/useEnvIds": False, "/physics/suppressReadback": gpu}
-    return {"config": ovphysx.PhysXConfig(carbonite_overrides=settings)}
+    physx = ovphysx.PhysX(config=ovphysx.PhysXConfig(carbonite_overrides=settings))
+    if gpu:
+        physx.set_config(ovphysx.ConfigKey.ACTIVE_CUDA_GPUS, str(wp.get_device(device).ordinal))
+    return physx
 
 
 def _kernels(world: World) -> dict[str, wp.Kernel]:
@@ -225,13 +230,15 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
         # Out:
         out: wp.array3d(dtype=float),
     ):
-        """Wrenches in the world frame, which PhysX holds over the step."""
+        """Wrenches in the world frame, which PhysX holds over the step; none on broken bodies."""
         row = wp.tid()
         env = rows[row]
         q = bodies.quat_wb[env]
         force = wp.quat_rotate(q, wrench.force_b[env])
         torque = wp.quat_rotate(q, wrench.torque_b[env])
         pos = bodies.pos_w[env]
+        if not (wp.isfinite(force) and wp.isfinite(torque) and wp.isfinite(pos)):
+            force, torque, pos = vec3(), vec3(), vec3()
         for k in range(3):
             out[row, 0, k] = force[k]
             out[row, 0, 3 + k] = torque[k]

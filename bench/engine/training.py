@@ -1,0 +1,74 @@
+"""Train a policy through a solver until a time is up, and keep policies on the way, to be thrown
+afterwards."""
+
+import json
+import math
+import time
+from pathlib import Path
+
+from bench import start
+from bench.engine import overrides
+from visthrow import config
+from visthrow.common import provenance
+from visthrow.task import Experiment, contract_of
+from visthrow.training.trainer import Trainer
+
+FIRST = 4  # iterations after which the time of one is known; the first loads kernels
+KEPT = 10  # policies
+
+
+def train(experiment: Experiment, out: Path, seconds: float, device: str, seed: int) -> dict:
+    """Train for so many seconds at most, with a schedule that ends then; returns what came of it.
+
+    Writes ``policy-K.npz``, the last of them as ``policy.npz``."""
+    begin = time.perf_counter()
+    trainer, curve, spent = Trainer(experiment, device, seed), [], 0.0
+    built = time.perf_counter() - begin
+    made_by = {"seed": seed, "config": config.to_dict(experiment, defaults=False)}
+    last = experiment.iterations
+    while trainer.iteration < last:
+        step = time.perf_counter()
+        figures = trainer.step()
+        step = time.perf_counter() - step
+        spent += step
+        if trainer.iteration == FIRST:
+            left = seconds - (time.perf_counter() - begin)
+            last = min(last, FIRST + max(1, math.floor(0.97 * left / step)))
+            trainer.algorithm.iterations = last
+        steps = trainer.iteration * trainer.algorithm.samples
+        kept = trainer.iteration == last or trainer.iteration % math.ceil(last / KEPT) == 0
+        row = {name: float(figures[name]) for name in ("landing_error", "released", "episodes")}
+        curve.append({"seconds": spent, "steps": steps, "kept": kept, **row})
+        if kept:
+            policy = trainer.algorithm.export(contract_of(experiment), made_by)
+            policy.save(out / f"policy-{trainer.iteration}.npz")
+            policy.save(out / "policy.npz")
+        if trainer.iteration % 10 == 0:
+            print(json.dumps({"iteration": trainer.iteration, "of": last, **curve[-1]}), flush=True)
+    times = dict(trainer.seconds)
+    told = {"built_s": built, "seconds": times, "curve": curve, "seed": seed}
+    return {**told, "solver": experiment.sim.solver, "provenance": provenance.collect()}
+
+
+def run(args) -> int:
+    changes = overrides(args.solver) if args.solver else []
+    experiment = config.load(
+        Experiment, config.find("train", args.config), [*changes, *args.overrides]
+    )
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    figures = train(experiment, out, args.seconds, args.device, args.seed)
+    (out / "training.json").write_text(json.dumps(figures))
+    return 0
+
+
+if __name__ == "__main__":
+    parser = start.parser_of(__doc__, record=False)
+    parser.add_argument("config", help="of configs/train")
+    parser.add_argument("--solver", help="default: the config's")
+    parser.add_argument("--seconds", type=float, default=900.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--out", required=True)
+    raise SystemExit(start.main(parser, run))
