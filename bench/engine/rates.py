@@ -22,7 +22,7 @@ FEWEST, SECONDS = 3, 1.0  # stretches of so many control steps, and for so long 
 
 
 def measure(solver: str, count: int, device: str, changes: list[str]) -> dict:
-    """Rate of one solver: substeps of 2 ms a second, whatever its own step, and how it was built."""
+    """Rate of one solver in substeps of 2 ms a second, whatever its own step."""
     experiment = config.load(Experiment, config.find("train", "state"), changes)
     plant = plant_of(experiment)
     numerics = dataclasses.replace(plant.sim, solver=solver, substep=SUBSTEPS[solver])

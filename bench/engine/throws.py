@@ -59,8 +59,8 @@ def run(args) -> int:
     title = f"Landings by solver, {device_name(args.device)}"
     notes = (
         (
-            "Moved: distance of each landing from that on the first solver in the same throw, median"
-            " and largest. A release one control step later moves a landing by some 25 mm."
+            "Moved: distance of each landing from that on the first solver in the same throw,"
+            " median and largest. A release one control step later moves a landing by some 25 mm."
         ),
     )
     report = Report("engine", title, (Table(title, header, tuple(cells)),), notes, {"rows": rows})

@@ -10,6 +10,7 @@ from bench import start
 from bench.engine import overrides
 from visthrow import config
 from visthrow.common import provenance
+from visthrow.common.storage import write_json
 from visthrow.task import Experiment, contract_of
 from visthrow.training.trainer import Trainer
 
@@ -17,10 +18,10 @@ FIRST = 4  # iterations after which the time of one is known; the first loads ke
 KEPT = 10  # policies
 
 
-def train(experiment: Experiment, out: Path, seconds: float, device: str, seed: int) -> dict:
-    """Train for so many seconds at most, with a schedule that ends then; returns what came of it.
+def train(experiment: Experiment, out: Path, seconds: float, device: str, seed: int) -> None:
+    """Train for so many seconds at most, with a schedule that ends then.
 
-    Writes ``policy-K.npz``, the last of them as ``policy.npz``."""
+    Writes ``policy-K.npz``, the last of them as ``policy.npz``, and with each ``training.json``."""
     begin = time.perf_counter()
     trainer, curve, spent = Trainer(experiment, device, seed), [], 0.0
     built = time.perf_counter() - begin
@@ -43,11 +44,11 @@ def train(experiment: Experiment, out: Path, seconds: float, device: str, seed: 
             policy = trainer.algorithm.export(contract_of(experiment), made_by)
             policy.save(out / f"policy-{trainer.iteration}.npz")
             policy.save(out / "policy.npz")
+            told = {"built_s": built, "seconds": dict(trainer.seconds), "curve": curve}
+            told |= {"solver": experiment.sim.solver, "seed": seed}
+            write_json(out / "training.json", {**told, "provenance": provenance.collect()})
         if trainer.iteration % 10 == 0:
             print(json.dumps({"iteration": trainer.iteration, "of": last, **curve[-1]}), flush=True)
-    times = dict(trainer.seconds)
-    told = {"built_s": built, "seconds": times, "curve": curve, "seed": seed}
-    return {**told, "solver": experiment.sim.solver, "provenance": provenance.collect()}
 
 
 def run(args) -> int:
@@ -57,8 +58,7 @@ def run(args) -> int:
     )
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
-    figures = train(experiment, out, args.seconds, args.device, args.seed)
-    (out / "training.json").write_text(json.dumps(figures))
+    train(experiment, out, args.seconds, args.device, args.seed)
     return 0
 
 

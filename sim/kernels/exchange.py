@@ -147,9 +147,7 @@ def build_exchange(
             return
         f = flow(p, now, s, active)
         acc = wp.quat_rotate(s.quat_wb, f.force_b) / p.body.mass + g
-        middle = advance(
-            s, rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b)), half
-        )
+        middle = advance(s, rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b)), half)
         middle.motor_speed = motor_advance(middle.motor_speed, f.motor_speed)
         f = flow(p, now, middle, active)
         wrench.force_b[env] = f.force_b

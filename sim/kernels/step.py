@@ -116,7 +116,7 @@ def build_parts(
         env: int,
         elapsed: real,
     ):
-        """Write what follows from the payload's state at separation, before the mechanism's kick."""
+        """Write what follows from the payload's state at separation, without the kick."""
         vel = leaving.kick(r, vel, along)
         time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos

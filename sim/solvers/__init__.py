@@ -81,7 +81,7 @@ class World:
         return math.ceil(s.control_period / s.substep - 1e-3)
 
     def models(self) -> tuple[list[tuple[VehicleParams, RopeParams]], np.ndarray]:
-        """Different pairs of vehicle and rope, and which of them each environment has, shape (E,)."""
+        """Different pairs of vehicle and rope, and which of them each environment has."""
         period = math.lcm(len(self.vehicles), len(self.ropes))
         rows = range(min(period, self.count))
         pairs = [

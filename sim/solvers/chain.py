@@ -29,7 +29,7 @@ class ChainSolver:
     def advance(self, duration: float) -> None:
         w, s = self.world, self.world.params.sim
         numbers = [s.gamma, s.max_turn, w.gravity, duration]
-        inputs = [*w.packed, *numbers, self._scale, w.wrench, self._stiffness, w.bodies]
+        inputs = [*w.packed, *numbers, self._stiffness, w.bodies, self._scale, w.wrench]
         wp.launch(self._kernels[1], w.count, inputs, device=w.device, block_dim=64)
 
 
@@ -83,12 +83,12 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
         max_turn: real,
         gravity: real,
         h: real,
-        # In:
-        scale: wp.array(dtype=real),
-        wrench: Wrench,
         # State in:
         stiffness: wp.array2d(dtype=real),
         bodies: Bodies,
+        # In:
+        scale: wp.array(dtype=real),
+        wrench: Wrench,
     ):
         env = wp.tid()
         p = vehicle[env % vehicle.shape[0]]

@@ -15,7 +15,7 @@ from sim.solvers.payloads import compile_model
 from sim.solvers.rods import build_place, quat, vec3
 
 RK4_STEP = 5e-4
-"""Largest substep of RK4 [s]: half of it moves the end of a hard throw by less than a micrometre."""
+"""Largest substep of RK4 [s]: half of it moves a hard throw's end by less than a micrometre."""
 
 OWN = (
     "body_pos",
@@ -99,6 +99,7 @@ def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
     """
     from mujoco.batch import Batch
 
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # a NaN is to be seen
     batch = Batch(model, count, nthread=1)
     for name, value in wide.items():
         batch.expand(name)[:] = value
@@ -144,7 +145,12 @@ def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
 
 
 @wp.kernel(enable_backward=False)
-def _clear(mask: wp.array(dtype=wp.int32), values: wp.array2d(dtype=float)):
+def _clear(
+    # In:
+    mask: wp.array(dtype=wp.int32),
+    # Out:
+    values: wp.array2d(dtype=float),
+):
     env, i = wp.tid()
     if mask[env] != 0:
         values[env, i] = 0.0

@@ -38,7 +38,6 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
         gear = [0.0] * 6
         gear[i] = 1.0
         spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_SITE, target="payload", gear=gear)
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # a NaN is to be seen
     return spec.compile()
 
 

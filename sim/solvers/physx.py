@@ -161,7 +161,9 @@ class PhysxSolver:
         names = ("pose", "velocity", "angles", "rates")
         arrays = [self._arrays[name] for name in names]
         rows = wp.array(moved, dtype=wp.uint8, device=w.device)
-        wp.launch(self._kernels["place"], w.count, [state, mask, self._rows, *arrays], device=w.device)
+        wp.launch(
+            self._kernels["place"], w.count, [state, mask, self._rows, *arrays], device=w.device
+        )
         scale = state.mass_scale.numpy()[self._order]
         masses = np.where(moved, self._unscaled * scale, self._masses[:, 0])
         changed = masses != self._masses[:, 0]

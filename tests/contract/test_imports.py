@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from sim.solvers import SOLVERS
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
@@ -141,15 +143,15 @@ for words in {commands!r}:
 
 
 def test_sim_uses_numpy_and_warp_only():
-    """Torch in the one bridge, MuJoCo in the reference plant only."""
+    """Torch in the one bridge, MuJoCo in the reference plant and where the solvers are."""
     wrong = []
     for path in sources("sim"):
         banned = set(NUMPY_WARP_ONLY)
         if path.name == "torch_bridge.py":
             banned.discard("torch")
-        if "reference" not in path.parts:
+        if not {"reference", "solvers"} & set(path.parts):
             banned.add("mujoco")
-        else:
+        if "reference" in path.parts:
             banned.add("warp")
         wrong += [
             f"{path.relative_to(ROOT)} imports {name}"
@@ -224,3 +226,15 @@ print(*sys.modules)
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
     )
     assert {"tensordict", "rsl_rl", "torch._dynamo"}.isdisjoint(result.stdout.split())
+
+
+def test_only_the_configuration_names_a_solver():
+    """``visthrow`` and ``hil`` know the simulator, not the engine behind it."""
+    wrong = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for room in ("visthrow", "hil")
+        for path in sources(room)
+        for name in SOLVERS
+        if name in path.read_text(encoding="utf-8")
+    ]
+    assert not wrong
