@@ -3,8 +3,8 @@
 The paper's simulator (Sec. III-B): the quadrotor's blocks give one wrench a substep, a solver
 advances the bodies, and the blocks see the root's kinematics then. Substeps are equal here: a
 command acts from the substep whose middle it reaches, and a separation within a substep is
-interpolated between its ends. A wrench is that of the substep's middle, to second order. After the
-release the vehicle flies on by itself, without the solver."""
+interpolated between its ends. A wrench is that of the substep's middle, which is predicted, to
+second order. After the release the vehicle flies on by itself, without the solver."""
 
 from dataclasses import dataclass
 
@@ -18,9 +18,16 @@ from sim.kernels.step import StepKernels
 from sim.kernels.structs import Types
 from sim.params import PlantParams
 
-WRENCH_FIELDS = {"force_b": "vec3", "torque_b": "vec3", "load_w": "vec3"}
+WRENCH_FIELDS = {
+    "force_b": "vec3",
+    "torque_b": "vec3",
+    "load_w": "vec3",
+    "pull_w": "vec3",
+    "twist_b": "vec3",
+}
 """What a solver is given, held over a substep: force [N] and torque [N m] of the vehicle's blocks
-about its centre of mass, body frame, without gravity; force of the air on the payload [N]."""
+about its centre of mass, body frame, without gravity; force of the air on the payload [N]. And what
+the rope did to the vehicle in the last substep, by which the next middle is predicted."""
 
 BODY_FIELDS = {
     "pos_w": ("vec3", False),
@@ -146,8 +153,9 @@ def build_exchange(
                 moves[env] = 0
             return
         f = flow(p, now, s, active)
-        acc = wp.quat_rotate(s.quat_wb, f.force_b) / p.body.mass + g
-        middle = advance(s, rate(p, s, f, acc, angular_acceleration(p, s.rate_b, f.torque_b)), half)
+        acc = (wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]) / p.body.mass + g
+        turn = angular_acceleration(p, s.rate_b, f.torque_b + wrench.twist_b[env])
+        middle = advance(s, rate(p, s, f, acc, turn), half)
         middle.motor_speed = motor_advance(middle.motor_speed, f.motor_speed)
         f = flow(p, now, middle, active)
         wrench.force_b[env] = f.force_b
@@ -167,6 +175,7 @@ def build_exchange(
     def take_kernel(
         # Params:
         first: int,
+        vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
         releases: wp.array(dtype=Release),
         airs: wp.array(dtype=Air),
@@ -177,6 +186,7 @@ def build_exchange(
         state: State,
         moves: wp.array(dtype=wp.int32),
         again: wp.array(dtype=wp.int32),
+        wrench: Wrench,
         # In:
         bodies: Bodies,
         # Out:
@@ -204,6 +214,15 @@ def build_exchange(
             moves[env] = 0
             again[env] = 1
             return
+        mass = vehicle[env % vehicle.shape[0]].body.mass * state.mass_scale[env]
+        inertia = vehicle[env % vehicle.shape[0]].body.inertia
+        mean_b = real(0.5) * (s.rate_b + state.rate_b[env])
+        own = wp.quat_rotate(state.quat_wb[env], wrench.force_b[env])
+        fall = vec3(real(0.0), real(0.0), gravity)
+        wrench.pull_w[env] = mass * ((s.vel_w - state.vel_w[env]) / h + fall) - own
+        momentum = wp.cw_mul(inertia, (s.rate_b - state.rate_b[env]) / h)
+        gyroscopic = wp.cross(mean_b, wp.cw_mul(inertia, mean_b))
+        wrench.twist_b[env] = momentum + gyroscopic - wrench.torque_b[env]
         store(state, env, s)
         for i in range(L):
             state.cable_dir_w[i, env] = n[i]
@@ -275,6 +294,7 @@ def build_exchange(
         mask: wp.array(dtype=wp.int32),
         # Out:
         bodies: Bodies,
+        wrench: Wrench,
     ):
         """Copy bodies from the state; the payload follows from the rope."""
         env = wp.tid() + first
@@ -295,6 +315,8 @@ def build_exchange(
         pos, vel = coupled.payload(ropes[env % ropes.shape[0]], s, n, u)
         bodies.payload_pos_w[env] = pos
         bodies.payload_vel_w[env] = vel
+        wrench.pull_w[env] = vec3()
+        wrench.twist_b[env] = vec3()
 
     @wp.kernel(module="unique", enable_backward=False)
     def payload_kernel(

@@ -135,14 +135,15 @@ class Exchange:
             wrench = [sim.state, self._moves, sim.out, self.world.wrench]
             launch(k.wrench, [vehicles, ropes, airs, *time, *wrench])
             self.solver.advance(h)
-            taken = [(i + 1) * h, h, gravity, sim.state, *flags, self.world.bodies, sim.out]
-            launch(k.take, [ropes, releases, airs, *taken])
+            taken = [sim.state, *flags, self.world.wrench, self.world.bodies, sim.out]
+            launch(k.take, [*parts, (i + 1) * h, h, gravity, *taken])
         launch(k.end, [vehicles, ropes, period, sim.state, mask, sim.out])
         self.place(launch, sim, self._again)
 
     def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
         """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
-        launch(self.kernels.show, [self.world.packed[1], sim.state, mask, self.world.bodies])
+        shared = [self.world.bodies, self.world.wrench]
+        launch(self.kernels.show, [self.world.packed[1], sim.state, mask, *shared])
         self.solver.place(sim.state, mask)
         launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
 
