@@ -92,7 +92,7 @@ class FisheyeParams:
 
 @dataclass(frozen=True)
 class MountParams:
-    """Where the camera sits on the body and how it is turned.
+    """The camera's place on the body and its rotation.
 
     Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the
     vehicle's front: x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c

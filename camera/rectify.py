@@ -45,7 +45,7 @@ def view_focal(view: ViewParams) -> float:
 
 
 def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where in the fisheye frame each pixel of a view comes from.
+    """Return the place in the fisheye frame that each pixel of a view comes from.
 
     Returns pixels [px], float64, shape (H, W, 2), and whether they lie in the field of view and on
     the sensor, shape (H, W)."""

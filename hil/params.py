@@ -60,7 +60,7 @@ class LinkParams(Bounded):
 
 @dataclass(frozen=True)
 class SourceParams:
-    """Where poses come from."""
+    """The source of poses."""
 
     kind: Literal["mavlink", "tlog", "csv", "bin", "ulg", "mocap"]
     file: str | None  # of a recording: tlog, csv, bin or ulg

@@ -349,12 +349,12 @@ class RopeParams:
 
     @property
     def segment_length(self) -> float:
-        """Of each segment [m]."""
+        """Length of each segment [m]."""
         return self.length / self.segments
 
     @property
     def segment_mass(self) -> float:
-        """Of each segment [kg]."""
+        """Mass of each segment [kg]."""
         return self.rope_mass / self.segments
 
     @property

@@ -75,7 +75,7 @@ class BoardParams:
 
 @dataclass(frozen=True)
 class View:
-    """What of a board one picture shows: points [m], shape (N, 3), board frame, and their pixels
+    """A board as one picture shows it: points [m], shape (N, 3), board frame, and their pixels
     [px], shape (N, 2).
     """
 
@@ -85,7 +85,7 @@ class View:
 
 @dataclass(frozen=True)
 class BoardReport:
-    """How well a calibration explains its pictures.
+    """Residuals of a calibration over its pictures.
 
     Attributes:
         rms_px: Root mean square distance of corners and their reprojections over all views [px].

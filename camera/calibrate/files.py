@@ -191,7 +191,7 @@ def _unzipped(tree: Node) -> Node:
 
 
 def _any(node: Node, *names: str) -> Any:
-    """What stands under the first of these keys that is there; a dot leads into a mapping."""
+    """Return the value of the first key that exists; a dot leads into a mapping."""
     for name in names:
         value: Any = node
         for part in name.split("."):
@@ -205,7 +205,7 @@ def _any(node: Node, *names: str) -> Any:
 
 
 def _floats(value: Any, name: str, counts: tuple[int, ...] | None = None) -> list[float]:
-    """So many numbers, in a list, a list of lists, or the ``data`` of a matrix."""
+    """Return so many numbers from a list, a list of lists, or the ``data`` of a matrix."""
     flat = value.get("data", value) if isinstance(value, dict) else value
     if isinstance(flat, list) and flat and all(isinstance(row, list) for row in flat):
         flat = [cell for row in flat for cell in row]

@@ -26,7 +26,7 @@ LARGEST_DECENTRING = 0.01
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well our model took over a foreign one, as a difference of pixels for the same ray."""
+    """The error of our model fitted to another, as a difference of pixels for the same ray."""
 
     model: str  # of the file
     rms_px: float = 0.0  # over all that the image sees [px]

@@ -49,7 +49,7 @@ DISTANCE_ERROR = 0.15
 
 @dataclass(frozen=True)
 class DetectorParams:
-    """What ball and goal look like."""
+    """The looks of ball and goal."""
 
     ball_hue_deg: tuple[float, float] = (
         46.0,
@@ -90,7 +90,7 @@ class GoalSeen:
 
 @dataclass(frozen=True)
 class Seen:
-    """What one frame shows; None where nothing was found."""
+    """The ball and the goal of one frame; None where nothing was detected."""
 
     ball: BallSeen | None
     goal: GoalSeen | None
@@ -99,7 +99,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known before looking; each part may be left out."""
+    """Prior knowledge of a frame; each part may be missing."""
 
     up_c: np.ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
     height: float | None = (

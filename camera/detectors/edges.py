@@ -63,7 +63,7 @@ def colour_maps(
     in_view: np.ndarray,
     kind: Literal["yellow", "green"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where a colour is, and how much of it.
+    """A colour's place in an image, and its amount.
 
     Args:
         colours: of the frame.
@@ -309,7 +309,7 @@ def _line(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _meet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Where two lines cross; NaN where they are parallel."""
+    """Return the intersection of two lines; NaN if they are parallel."""
     matrix = np.array([first[:2], second[:2]])
     if abs(np.linalg.det(matrix)) < 1e-3:
         return np.full(2, math.nan)
@@ -329,7 +329,8 @@ def _scaled(corners: np.ndarray, factor: float) -> np.ndarray:
 def _rim_contrast(
     lens: Fisheye, corners: np.ndarray, frame: np.ndarray, bright: np.ndarray, share: float
 ) -> float:
-    """How much brighter the rim is than what lies beyond it, of that; the median along all sides.
+    """Return the rim's brightness relative to its surroundings, minus one; the median along all
+    sides.
 
     Where both are overexposed nothing can be said, and the rim is taken for there.
     """

@@ -86,7 +86,7 @@ class Track:
 
 @dataclass(eq=False)
 class Square:
-    """What may be the goal: where it was seen last on the ground [m], shape (2,), when [s], and its
+    """A possible goal: its last place on the ground [m], shape (2,), when [s], and its
     log-odds by the frames so far.
     """
 
@@ -96,7 +96,7 @@ class Square:
 
 
 class Following:
-    """What one camera has seen of ball and goal."""
+    """Tracks of ball and goal in one camera."""
 
     def __init__(self, radius: float, side: float, ball_w: np.ndarray | None = None) -> None:
         """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the
@@ -115,7 +115,7 @@ class Following:
         distance: tuple[float, float] | None,
         stamp: float,
     ) -> Known:
-        """What a detector is told of a frame.
+        """Return the prior knowledge for a frame.
 
         Args:
             rot_wc: camera to world, shape (3, 3). up_w: the vehicle's z, along which it thrusts,
@@ -154,8 +154,8 @@ class Following:
         return Known(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
     def take(self, seen: Seen, rot_wc: np.ndarray | None, stamp: float) -> Seen:
-        """What was seen in a frame, with a ball that was missed where it is predicted, and of the
-        squares the one that is the goal.
+        """Return the detections of a frame, with a ball that was missed where it is predicted, and
+        of the squares the one that is the goal.
 
         Without an attitude nothing is followed.
         """

@@ -285,8 +285,8 @@ class LearntDetector(Detector):
         return None
 
     def _squares(self, probability: Tensor, things: Tensor, known: Known) -> tuple[GoalSeen, ...]:
-        """What is sure, or sure where it is expected, the likeliest first; each by its own
-        probability, which frames add up.
+        """Return detections that are certain, or certain where expected, the likeliest first; each
+        by its own probability, which frames add up.
         """
         raised = self._expected_there(
             probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within

@@ -21,7 +21,7 @@ LONGEST = 3.0  # after which a payload that has not come down is not followed fu
 
 @dataclass(frozen=True)
 class AimParams(Bounded):
-    """What is done about releases that would lead astray."""
+    """Parameters of the check of predicted landings before a release."""
 
     # a release whose predicted landing is further from the goal than this is held back [m]
     bound: Positive

@@ -24,7 +24,7 @@ from visthrow.onboard.calibration import Calibration, Hovered, Spreads
 
 @dataclass(frozen=True)
 class CalibrationParams(Bounded):
-    """How to calibrate, and which findings a throw may begin with."""
+    """Parameters of the calibration, and limits of its results for a throw."""
 
     still: Positive = calibration.STILL  # of hover before the sway [s]
     sway: Positive = calibration.SWAY  # [s]

@@ -37,7 +37,7 @@ COLLECT_ALL = 50
 
 
 class Operator(Protocol):
-    """Who arms."""
+    """The source of the operator's commands."""
 
     def words(self, state: str) -> OperatorInput:
         """Return what was said since the last tick; ``state`` is the runner's. Never waits."""

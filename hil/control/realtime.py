@@ -24,7 +24,7 @@ LOCK_CURRENT, LOCK_FUTURE = 1, 2  # Flags of mlockall(2)
 
 @dataclass(frozen=True)
 class RealtimeParams(Bounded):
-    """What is done for ticks in time."""
+    """Parameters of the real-time scheduling."""
 
     priority: Annotated[int, Bound(0, 99)] = 0  # of SCHED_FIFO, 1 to 99; 0: as any process
     lock_memory: bool = False  # no page of the process leaves the memory

@@ -61,7 +61,7 @@ MOST_ERRORS = 100  # tracebacks that are kept
 
 @dataclass(frozen=True)
 class Seen:
-    """Where things are as of a tick, in our world; None for what has no good pose yet."""
+    """States of the bodies at a tick, world frame; None without a good pose yet."""
 
     vehicle: BodyState | None
     payload: BodyState | None

@@ -111,7 +111,7 @@ def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | N
 
 @dataclass(frozen=True)
 class CheckParams:
-    """What must hold before the runner lets itself be armed; each catches a mistake that no single
+    """List the conditions for arming that fail; each catches a mistake that no single
     pose betrays.
     """
 

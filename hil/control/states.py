@@ -16,7 +16,7 @@ from visthrow.config.bounds import Bounded, Positive
 
 
 class State(StrEnum):
-    """Where a run is."""
+    """The state of a run."""
 
     IDLE = "idle"
     CHECK = "check"
@@ -57,7 +57,7 @@ class StateParams(Bounded):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What one tick knows. Levels are those of `hil.poses.gate`."""
+    """The inputs of one tick. Levels are those of `hil.poses.gate`."""
 
     vehicle: int
     payload: int
@@ -306,7 +306,7 @@ A name put together at each tick would stay in Python's cache of attributes, a n
 
 @dataclass(frozen=True)
 class OperatorInput:
-    """What the operator said since the last tick."""
+    """Return the operator's commands since the last tick."""
 
     arm: bool = False
     land: bool = False

@@ -73,7 +73,7 @@ def check_device(text: str, *, remote: bool = False) -> Device:
 
 
 class Port(Protocol):
-    """Where bytes come from and go to; neither call ever waits."""
+    """A port for bytes in and out; neither call waits."""
 
     whole: bool  # whether each chunk is a whole datagram
     sender: tuple[str, int] | None  # of the last chunk; None on a stream, which has one peer
@@ -114,7 +114,7 @@ def chunks(
 
 
 class _Opened:
-    """What is open behind a port."""
+    """The open end of a port."""
 
     _open: Any
 

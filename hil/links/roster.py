@@ -55,7 +55,7 @@ class Party:
 
 @dataclass(frozen=True)
 class Seen:
-    """What came from one sender, as it is counted."""
+    """The count of messages from one sender."""
 
     address: Address
     system: int | None

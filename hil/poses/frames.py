@@ -26,7 +26,7 @@ from visthrow.logs.axes import turn_of
 
 @dataclass(frozen=True)
 class FrameParams:
-    """How a source describes poses.
+    """Conventions of a source's poses.
 
     Every entry is stated; none has a default. Raises `FrameError` for axes that are no turn.
     """

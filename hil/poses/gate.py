@@ -45,7 +45,7 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Tether:
-    """Where the cable ends, while the payload hangs on it."""
+    """The other end of the cable while the payload hangs on it."""
 
     pos: Vector  # of the other body, expected at the pose's arrival [m]
     length: float  # that the two can be apart [m]; infinite where the other body is not known well

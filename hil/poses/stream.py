@@ -31,7 +31,7 @@ pose by less than a centimetre.
 
 @dataclass(frozen=True)
 class Flow:
-    """What a body's poses of the last seconds were like; NaN where there are too few."""
+    """Statistics of a body's poses over the last seconds; NaN where there are too few."""
 
     count: int  # of poses that came
     rate: float  # of accepted ones [Hz]

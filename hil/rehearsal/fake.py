@@ -43,7 +43,7 @@ DESCENT, TOUCH = (
 
 
 class WirePlant(Protocol):
-    """What flies behind the wire."""
+    """The vehicle behind the link."""
 
     period: float
     time: float
@@ -67,7 +67,7 @@ class WirePlant(Protocol):
 
 @dataclass(frozen=True)
 class Options(Bounded):
-    """How a fake behaves."""
+    """Options of a fake's behaviour."""
 
     # To a release; "stuck" says accepted and moves nothing, and nobody but "accepted" moves
     # anything.

@@ -18,7 +18,7 @@ SLACK = 1e-9  # tolerance of times that are sums of periods [s]
 
 @dataclass(frozen=True)
 class MocapParams(Bounded):
-    """What the motion capture makes of the truth."""
+    """The motion capture's measurement of the true poses."""
 
     rate: Positive = 100.0  # poses a second of each body [Hz]
     position_noise: NotNegative = 1e-3  # standard deviation [m]

@@ -48,8 +48,8 @@ def _mixes_motors(setting: Setting) -> bool:
 
 
 def _motor_mixing(setting: Setting) -> Setting:
-    """With the same gains in hover, iterm_relax of 15 Hz in place of the set-point's filter, the
-    feed-forward off.
+    """Relax the integral with the same gains in hover: iterm_relax of 15 Hz in place of the
+    set-point's filter, the feed-forward off.
     """
     plant = setting.plant
     return _vehicle(

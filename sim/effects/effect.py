@@ -78,7 +78,7 @@ def _replaced(owner: Any, names: list[str], new: Any) -> Any:
 
 @dataclass(frozen=True)
 class Lowest:
-    """How low a number of the setting may come: theta is at least ``least - share * number /
+    """A lower limit for a number of the setting: theta is at least ``least - share * number /
     factor``.
     """
 

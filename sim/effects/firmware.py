@@ -44,7 +44,7 @@ def numbers(settings: Mapping[str, str], name: str, default: str = "0") -> list[
 
 
 def left_out(settings: Mapping[str, str]) -> list[str]:
-    """What the firmware does by these settings and the block does not."""
+    """List the firmware's features under these settings that the block lacks."""
     told = []
     for name, does in NOT_SAID.items():
         values = numbers(settings, name)

@@ -23,7 +23,7 @@ AERODYNAMICS = (
 
 @dataclass(frozen=True)
 class Setting:
-    """What a replay simulates: the plant that training reads too, the sensors, and the step."""
+    """The setting of a replay: the plant that training reads too, the sensors, and the step."""
 
     plant: PlantParams
     sensing: SensingParams = dataclasses.field(default_factory=SensingParams)

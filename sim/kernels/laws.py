@@ -230,7 +230,7 @@ def _around(t: Types) -> dict[str, type]:
 
 
 def structure(laws: tuple[LawParams, ...]) -> tuple:
-    """What a kernel is built for: everything of the laws but their coefficients."""
+    """The constants a kernel is built for: everything of the laws but their coefficients."""
     return tuple((law.block, law.factors, law.vector) for law in laws)
 
 

@@ -517,7 +517,7 @@ class ReferencePlant:
 
     @property
     def landing(self) -> Landings:
-        """Where and when the payloads came down."""
+        """Landing places and times of the payloads."""
         separated = np.where(self._attached, np.nan, self._separation)
         return Landings(
             self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated

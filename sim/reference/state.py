@@ -31,7 +31,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Landings:
-    """Where and when the payloads came down, on the plant's clock; NaN where they did not yet."""
+    """Landing places and times of the payloads, on the plant's clock; NaN before the landing."""
 
     landed: np.ndarray  # shape (E,), bool
     point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)

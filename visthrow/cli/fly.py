@@ -161,7 +161,7 @@ def export(path: str, log, experiment) -> None:
 
 
 def summary_text(log) -> str:
-    """What happened, in a few lines."""
+    """Return a summary of the throw in a few lines."""
     times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
     start = times["policy_start"]
     plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"

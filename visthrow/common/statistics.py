@@ -151,7 +151,7 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Bias:
-    """Where throws land on average, and how they scatter about that place."""
+    """The mean landing place and the scatter about it."""
 
     along: Interval  # mean miss along the throw, positive past the target [m]
     lateral: Interval  # to the left of it [m]
@@ -161,7 +161,7 @@ class Bias:
 
     @property
     def direction(self) -> str:
-        """What the signs say, where the interval excludes zero:
+        """Return the direction of the miss, if the interval excludes zero:
 
         "undershoots, lands left", or "no bias".
         """

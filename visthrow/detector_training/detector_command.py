@@ -422,7 +422,7 @@ def figures_of(
 
 
 def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator):
-    """What a detector is told of scene e; see :data:`KNOWN`."""
+    """Return a detector's prior knowledge of scene e; see :data:`KNOWN`."""
     from camera.detectors.contours import Known
     from visthrow.detector_training.eyes import HANGING
 

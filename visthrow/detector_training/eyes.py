@@ -149,7 +149,7 @@ class Eyes:
         return points, valid
 
     def lost(self) -> dict[int, str]:
-        """By vehicle, which of ball and goal was found too seldom to throw with; asked
+        """Return, by vehicle, which of ball and goal was detected too seldom for a throw; asked
         in a hover.
         """
         lost = {
@@ -176,7 +176,7 @@ class Eyes:
         carried: bool,
         stamp: float,
     ) -> Seen:
-        """What the detector finds, or of a ball that it misses where it is predicted; vehicle e and
+        """Return the detections, with a missed ball where it is predicted; vehicle e and
         its measured pose at a time [s].
         """
         rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T

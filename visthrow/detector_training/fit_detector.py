@@ -81,7 +81,7 @@ class FitParams:
 
 @dataclass(frozen=True)
 class Labels:
-    """What is where in frames; `Truth` on the device, float32."""
+    """The true places in frames; `Truth` on the device, float32."""
 
     rays: dict[str, Tensor]  # by kind, unit ray to the middle, shape (F, 3)
     sizes: dict[str, Tensor]  # by kind [rad], shape (F,)
@@ -292,7 +292,7 @@ def look_loss(
 
 
 def offsets(kind: str, views: Views, found: Tensor, labels: Labels, index: Tensor) -> Tensor:
-    """How far off what was found is, in half sides; of a ball the last column is of its
+    """Return the error of detections in half sides; of a ball the last column is of its
     log size.
     """
     if kind == "ball":
@@ -470,7 +470,7 @@ class Fit:
 
 
 def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -> dict[str, Tensor]:
-    """What becomes of the places of one frame: logit, whether it is of the thing, error [rad], told
+    """Score the places of one frame: logit, whether it is of the thing, error [rad], told
     accuracy [rad]; a row each.
     """
     places, found = places_of(networks.search(halved(frame)), lens), {}

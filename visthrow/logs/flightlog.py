@@ -20,7 +20,7 @@ FRAMES = ("world", "body", "camera", "image", "mocap", "none")
 
 @dataclass(frozen=True)
 class ChannelSpec:
-    """What a channel of a standard name holds."""
+    """The content of a channel of a standard name."""
 
     unit: str
     frame: str  # one of FRAMES

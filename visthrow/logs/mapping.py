@@ -96,7 +96,7 @@ class ChannelMap:
 
 @dataclass(frozen=True)
 class Split:
-    """How one table becomes several logs."""
+    """The rule that splits one table into several logs."""
 
     column: str = ""  # a log for each of its values; "": one
     gap: float = 0.0  # a new log begins where no row comes for so long [s]; 0: never

@@ -101,7 +101,7 @@ class Spreads:
 
 @dataclass(frozen=True)
 class Hovered:
-    """What came in a hover, a row a step, on one clock."""
+    """The measurements of a hover, a row for each step, on one clock."""
 
     time: np.ndarray  # [s], shape (N,)
     pos_w: np.ndarray  # [m], shape (N, 3)
@@ -119,7 +119,7 @@ class Hovered:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a hover showed, each with its standard deviation."""
+    """The estimates from a hover, each with its standard deviation."""
 
     turn_b: tuple[
         float, float, float
@@ -135,7 +135,7 @@ class Calibration:
     scale_sigma: float = 0.0  # [-]
 
     def values(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the estimates for JSON."""
         return {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in vars(self).items()

@@ -152,7 +152,7 @@ def goal_by_corner(
 
 
 class Fitted(NamedTuple):
-    """What :func:`fitted_goal` makes of a frame."""
+    """The sums that :func:`fitted_goal` adds for a frame."""
 
     sums: Tensor
     velocity: Tensor | None  # of the goal [m/s], shape (E, 2), where the layout has it

@@ -219,7 +219,7 @@ def state_part(pos_w: Tensor, goal_w: Tensor, payload_w: Tensor) -> Tensor:
 
 
 def answer(frame: Tensor, previous_action: Tensor) -> Tensor:
-    """What one step shows of the vehicle's response, shape (E, 10): velocity, body rates, and the
+    """Return the vehicle's response in one step, shape (E, 10): velocity, body rates, and the
     action before it.
     """
     return torch.cat([frame[:, 3:9], previous_action[:, :4]], dim=-1)

@@ -48,7 +48,7 @@ millimetres in it.
 
 @dataclass(frozen=True)
 class PilotOutput:
-    """What one control step decided, and what it saw. NumPy, shape (E, ...)."""
+    """The decision and the observation of one control step. NumPy, shape (E, ...)."""
 
     action: np.ndarray  # normalised, clipped, shape (E, 5)
     command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
@@ -235,7 +235,7 @@ class Pilot:
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
     def _seen(self, views: np.ndarray, given: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """What `_observed` makes of a step's measurements and all that was before; ``given``:
+        """Return the observation of a step from its measurements and the memory; ``given``:
         keypoints of a detector.
         """
         carried: tuple[np.ndarray, ...] = (self._previous, self._history, self._fresh)

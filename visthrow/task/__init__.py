@@ -44,7 +44,7 @@ class ActionParams(Bounded):
 
 @dataclass(frozen=True)
 class ObservationParams(Bounded):
-    """What the actor sees; see :mod:`visthrow.onboard.observations`."""
+    """The actor's observations; see :mod:`visthrow.onboard.observations`."""
 
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
@@ -308,7 +308,7 @@ class DistillationParams(Bounded):
 
 @dataclass(frozen=True)
 class DiagnosedParams(Bounded):
-    """What a diagnosis leaves uncertain about the plant (``visthrow diagnose apply`` writes it).
+    """The uncertainty of the plant after a diagnosis (``visthrow diagnose apply`` writes it).
 
     Training draws ``plants`` plants from the joint posterior: deviations theta of the effects,
     normal with this covariance about the configuration as it stands, so that what is pinned
@@ -384,7 +384,7 @@ class Experiment:
 
 
 def _out_of_place(e: Experiment) -> Iterator[str]:
-    """What of an experiment's lengths and times does not go together: a number in another unit is
+    """Return the contradiction among an experiment's lengths and times: a number in another unit is
     off by a hundred or more.
     """
     start, bounds, release = e.task.start, e.task.bounds, e.release
@@ -416,8 +416,8 @@ def _out_of_place(e: Experiment) -> Iterator[str]:
 
 
 def _no_vehicle(e: Experiment) -> Iterator[str]:
-    """Why no vehicle is as an experiment's: thrust and weight, moments of inertia and size, thrust
-    and speed of the rotors.
+    """Return the reason why an experiment's vehicle is impossible: thrust and weight, moments of
+    inertia and size, thrust and speed of the rotors.
     """
     vehicle, rotors, motor = e.vehicle, e.vehicle.rotors, e.vehicle.controller.max_thrust
     mass, asked = plant_of(e).total_mass, e.task.action.max_thrust
@@ -464,7 +464,8 @@ def plant_of(experiment: Experiment) -> PlantParams:
 
 
 def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any]:
-    """What whoever flies a policy must share with its training; see :mod:`visthrow.onboard.policy`.
+    """Return the conditions that a flight must share with a policy's training; see
+    :mod:`visthrow.onboard.policy`.
 
     The camera enters for vision policies only. Noise and randomisation are training matters and
     stay out. An entry whose field has a default enters where it differs from that: a policy from

@@ -18,7 +18,7 @@ LANDED = 0.95  # share of throws that must land before their mean error says any
 
 
 def pilots_hover() -> RandomizationParams:
-    """How starts vary in a pilot's hover, ``configs/start/hover.toml``."""
+    """The variation of starts in a pilot's hover, ``configs/start/hover.toml``."""
     return config.load(RandomizationParams, config.find("start", "hover"))
 
 

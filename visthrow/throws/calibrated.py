@@ -33,7 +33,7 @@ FEW = (
 def calibrated_start(
     experiment: Experiment, kept: list[Calibration | None] | None = None
 ) -> Callable[[ThrowEnv], TensorDict]:
-    """What :func:`visthrow.training.protocol.throw` begins with; ConfigError for another layout
+    """Return the start of :func:`visthrow.training.protocol.throw`; ConfigError for another layout
     than vision, or goals that move.
 
     ``kept`` takes the calibration of each throw; None where there was none, and keypoints stay as

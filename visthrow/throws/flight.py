@@ -54,7 +54,7 @@ class Sight(Protocol):
 
 @dataclass(frozen=True)
 class Decision:
-    """What E vehicles are to do in one period."""
+    """The commands of E vehicles for one period."""
 
     command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
     release: np.ndarray  # whether the latch is to trip, shape (E,), bool
@@ -65,7 +65,7 @@ class Decision:
 
 
 class Pilots(ABC):
-    """Who throws with E vehicles; the children decide."""
+    """The pilots of E vehicles; the children decide."""
 
     def __init__(
         self,

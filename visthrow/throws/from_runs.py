@@ -68,7 +68,7 @@ def entries(logs: list[FlightLog]) -> list[Entry]:
 
 
 def _offset(log: FlightLog) -> np.ndarray:
-    """From where the vehicle hovers to the goal [m], shape (2,)."""
+    """Offset from the hover point to the goal [m], shape (2,)."""
     return np.array(log.meta["goal_w"][:2]) - np.array(log.meta["home_w"][:2])
 
 

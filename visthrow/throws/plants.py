@@ -45,7 +45,7 @@ FALL_STEP = 0.02  # largest of RK4 in flight [s]; 1e-8 m off a tennis ball's pat
 
 
 class Plant(Protocol):
-    """What a flight needs of a plant."""
+    """A plant that can be flown."""
 
     name: str
     count: int
@@ -65,7 +65,7 @@ class Plant(Protocol):
         """The truth."""
 
     def measured(self) -> Snapshot:
-        """What the pilot is told: with noise and latency where the plant has them."""
+        """The measurements for the pilot, with the plant's noise and latency."""
 
     @property
     def exposed(self) -> Snapshot:
@@ -75,7 +75,7 @@ class Plant(Protocol):
 
     @property
     def sample(self) -> Snapshot:
-        """What motion capture and gyro took down behind the last :meth:`measured`; ``time`` is when
+        """The samples of motion capture and gyro behind the last :meth:`measured`; ``time`` is when
         it was true.
         """
 
@@ -429,7 +429,7 @@ def make_plant(
 
 
 def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
-    """What is measured, linear between states one control period apart, newest first; age: in
+    """Return measurements, linear between states one control period apart, newest first; age: in
     periods, shape (E,).
     """
     now = states[0]

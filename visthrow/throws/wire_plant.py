@@ -84,7 +84,7 @@ class WirePlant:
 
     @property
     def landing(self) -> dict[str, list[float] | float | None]:
-        """Where and when the payload came down and let go, None where it did not."""
+        """The payload's landing and separation, None before them."""
         now = self._plant.landing
         landed, apart = bool(now.landed[0]), float(now.separation_time[0])
         return {
@@ -100,7 +100,7 @@ def make(policy: str, seed: int) -> WirePlant:
 
 
 class MotorPlant(WirePlant):
-    """The same vehicle without its rate controller, for a firmware that puts out motor commands.
+    """A vehicle without its rate controller, for a firmware that outputs motor commands.
 
     Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``:
     thrust goes with the square of the command and of the battery's voltage. The reference is the
@@ -175,7 +175,7 @@ class MotorPlant(WirePlant):
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """As of `WirePlant`; a ball that hangs goes no deeper than the ground."""
+        """Return the state as `WirePlant` does; a hanging ball stays above the ground."""
         now = super().state
         ball = now["payload_pos_w"].copy()
         ball[2] = max(ball[2], self._floor)
@@ -204,7 +204,7 @@ class MotorPlant(WirePlant):
 
     @property
     def voltage(self) -> float:
-        """Of the battery under load [V]."""
+        """Voltage of the battery under load [V]."""
         return float(self._now["voltage"])
 
     @property

@@ -124,7 +124,7 @@ class ThrowEnv(VecEnv):
         self.reset()
 
     def _remembered(self) -> dict[str, Tensor]:
-        """What an episode carries from step to step beside the simulator's state."""
+        """Return the buffers that an episode carries beside the simulator's state."""
         task, E, make = (
             self.cfg.task,
             self.num_envs,

@@ -42,7 +42,7 @@ FIRST = 20.0  # time after which the first of them comes then: what it costs is 
 
 @dataclass(frozen=True)
 class Options:
-    """What ``visthrow train`` is asked for; its help says what each of them is."""
+    """The options of ``visthrow train``; its help describes each."""
 
     config: str | None = None
     seed: int | None = None
@@ -189,7 +189,7 @@ STOPPING = "\nstopping after this iteration"
 
 
 class Regularly:
-    """When to do something on the way: every so many iterations, or as often as a share of the wall
+    """The schedule of a periodic task: every so many iterations, or as often as a share of the wall
     time allows.
     """
 

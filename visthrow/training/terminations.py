@@ -41,7 +41,7 @@ def while_carrying(
     time: Array | float,
     landing_height: float,
 ) -> dict[str, Array]:
-    """What ends a throw before the latch has tripped only; the payload on the ground is not in the
+    """Ends of a throw before the latch trips; the payload on the ground is not in the
     paper, whose bounds leave it open.
 
     Args:

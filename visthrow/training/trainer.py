@@ -46,7 +46,7 @@ differ from its training's.
 
 
 class Algorithm(Protocol):
-    """What a trainer drives: one way to a better policy, an iteration at a time."""
+    """A training algorithm, driven an iteration at a time."""
 
     env: ThrowEnv  # that it learns in
     iterations: int  # of a whole training

@@ -88,7 +88,7 @@ class Recorder:
 
     @property
     def failed(self) -> str | None:
-        """Why something could not be written, or None."""
+        """Return the reason why something could not be written, or None."""
         return next((writer.why for writer in self._writers.values() if writer.why), None)
 
     def tick(

@@ -16,7 +16,7 @@ MOST_NAMED = 4  # parameters that a fault names; the table has all
 
 @dataclass(frozen=True)
 class Rule:
-    """What one parameter has to be."""
+    """The required value of one parameter."""
 
     name: str
     expected: str  # in words

@@ -27,7 +27,7 @@ ROUNDING = 1e-6  # tolerance of times that are sums [s]: a microsecond early is 
 
 @dataclass(frozen=True)
 class Status:
-    """What a back-end knows of its autopilot at a tick; recorded, so that a replay
+    """A back-end's knowledge of its autopilot at a tick; recorded, so that a replay
     decides alike.
     """
 
@@ -42,7 +42,7 @@ class Status:
 
 
 class Backend:
-    """Where commands go; no call waits or raises. What a child leaves out does nothing."""
+    """A receiver of commands; no call waits or raises. What a child leaves out does nothing."""
 
     name = ""
     holds = False  # whether the autopilot has modes of its own that hold a place and land

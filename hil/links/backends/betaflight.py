@@ -399,7 +399,7 @@ class Betaflight(OnPort):
 
 @dataclass(frozen=True)
 class Told:
-    """Where an answer tells a setting."""
+    """The place of a setting in an answer."""
 
     command: int
     at: int  # of the payload

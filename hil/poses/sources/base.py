@@ -13,7 +13,7 @@ from hil.poses.pose import Pose
 
 
 class Source:
-    """Where poses come from; polling never waits and never raises.
+    """A source of poses; polling never waits and never raises.
 
     ``rosters`` say who was heard, and count what was refused.
     """

@@ -44,7 +44,7 @@ SAME_PLACE = 0.01
 
 @dataclass(frozen=True)
 class ImageParams(Bounded):
-    """Where pictures come from, and the camera that takes them."""
+    """The source of pictures, and its camera."""
 
     kind: Literal["folder", "video", "camera"]
     path: str | None = None  # of the folder or video
@@ -67,7 +67,7 @@ class ImageParams(Bounded):
 
 @dataclass(frozen=True)
 class Hint:
-    """What the runner knows when a picture is looked at, our frames."""
+    """The runner's knowledge at the time of a picture, in our frames."""
 
     pos_w: Vector  # of the vehicle [m]
     quat: Quaternion  # body to world, xyzw

@@ -42,7 +42,7 @@ ENDING = 2.0  # that threads and processes are given to end [s]
 
 @dataclass(frozen=True)
 class RigidBody:
-    """What the motion-capture system calls a body."""
+    """The motion-capture system's name of a body."""
 
     body: Body
     name: str  # of the rigid body; for natnet its streaming id, for ros2 TYPE:TOPIC
@@ -56,7 +56,7 @@ class RigidBody:
 
 @dataclass(frozen=True)
 class MocapParams:
-    """Where the motion-capture system is."""
+    """The address of the motion-capture system."""
 
     # "natnet" through the package natnet, "ros2" through cyclonedds, all others through
     # motioncapture; "mock" is for tests.
@@ -84,7 +84,7 @@ class MocapParams:
 
     @property
     def options(self) -> dict[str, str]:
-        """Of motioncapture.connect."""
+        """Arguments of motioncapture.connect."""
         return {"hostname": self.host, **self.settings}
 
 

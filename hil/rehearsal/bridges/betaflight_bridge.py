@@ -34,7 +34,7 @@ SLOW = 0.01  # share of late periods above which the machine is too slow for rea
 
 
 class MotorPlant(WirePlant):
-    """What flies behind the firmware: steps are taken under motor commands."""
+    """The vehicle behind the firmware: it steps under motor commands."""
 
     held: bool
     quat_wb: np.ndarray

@@ -126,7 +126,10 @@ def needed(params: BetaflightParams) -> dict[str, str]:
 
 
 def line_of(name: str, value: str) -> str:
-    """What sets a value: ``serial``, ``aux`` and ``feature`` have their own commands."""
+    """Return the command that sets a value:
+
+    ``serial``, ``aux`` and ``feature`` have their own commands.
+    """
     return f"{name} {value}" if " " in name else f"set {name} = {value}"
 
 
@@ -306,7 +309,7 @@ class CommandLine:
         self._socket.close()
 
     def _heard(self, last: bytes = PROMPT) -> str:
-        """What is said up to the next prompt, or to other last words."""
+        """Return the output up to the next prompt, or to other last words."""
         data, end = b"", time.monotonic() + ANSWER
         while not data.endswith(last):
             self._socket.settimeout(max(end - time.monotonic(), 1e-3))
@@ -351,7 +354,7 @@ class CommandLine:
 
 
 def _end_with_parent() -> None:
-    """Where the system can (Linux), the firmware ends when the process that started it is gone,
+    """End the firmware, on Linux, when the process that started it is gone,
     however that ended.
     """
     if sys.platform == "linux":

@@ -74,14 +74,14 @@ def sample(
 
 
 def stood(stands: int, most: float) -> bytes:
-    """What a firmware in lock step says on its pipe once it stands still; nothing where it does not
-    within a time [s].
+    """Read what a firmware in lock step writes to its pipe once it stands still; nothing where it
+    does not within a time [s].
     """
     return os.read(stands, LARGEST_ANSWER) if select.select([stands], [], [], most)[0] else b""
 
 
 class Sensors:
-    """Where samples are sent to, and the firmware's clock."""
+    """The address of samples, and the firmware's clock."""
 
     def __init__(self, stands: int) -> None:
         """Open a socket; ``stands``: pipe on which the firmware says that it has come

@@ -48,7 +48,7 @@ SETTLING = 0.3  # in which the place, integrated from velocities, follows the la
 
 
 class Motion(NamedTuple):
-    """Where a vehicle is at a time [s]: place [m], velocity [m/s], attitude xyzw, rates [rad/s]."""
+    """A vehicle's motion at a time [s]: place [m], velocity [m/s], attitude xyzw, rates [rad/s]."""
 
     time: float
     pos: np.ndarray

@@ -29,7 +29,7 @@ from sim.params import GRAVITY, PlantParams, SensingParams
 
 @dataclass(frozen=True)
 class Replayed:
-    """What the lanes saw.
+    """The samples of all lanes.
 
     With Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro in a lane's window,
     its first ``2 Nv + Np + Ng`` rows hold: position [m] and attitude against the measured one

@@ -201,7 +201,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
     def copy_samples(
         windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)
     ):
-        """What was seen before a lane leaves another."""
+        """Copy the samples before a lane departs from another."""
         vehicles = windows.vehicle_count[w]
         for i in range(2 * at.vehicle):
             out[i, lane] = out[i, parent]

@@ -64,7 +64,7 @@ def clearance(
 
 
 def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
-    """How the payload leaves. Equations: :class:`sim.params.ReleaseParams`.
+    """Parameters of the payload's release. Equations: :class:`sim.params.ReleaseParams`.
 
     Returns a namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull
     at the latch [N], and the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the

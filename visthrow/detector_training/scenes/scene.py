@@ -94,7 +94,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Nuisances:
-    """How bad pictures are: 1 is all that a hall and a cheap camera do, 0 nothing of it."""
+    """The severity of nuisances: 1 is all that a hall and a cheap camera do, 0 none."""
 
     blur: float = 1.0
     motion: float = 1.0  # exposure and rolling shutter
@@ -331,7 +331,9 @@ def _quat(rot: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where ball and square are in the pictures, at the instants that their rows were exposed."""
+    """Return the places of ball and square in the pictures, at the instants that their rows were
+    exposed.
+    """
 
     ball_c: Tensor  # centre [m], shape (E, 3), camera frame
     corners_c: (

@@ -219,7 +219,7 @@ def _kind(axes: str) -> str:
 
 
 def _late(found: relations.Relation, both: str, figures: dict) -> Row:
-    """How late the second measurement of one motion is, and what would put it right."""
+    """Report the delay of a second measurement of one motion, and its remedy."""
     text = (
         f"the second is {1e3 * found.delay:+.1f} ms behind the first (sd"
         f" {1e3 * found.delay_sd:.1f} ms)"
@@ -598,7 +598,7 @@ def _length(middle: float, expected: float, both: str) -> list[Row]:
 def _payload_late(
     time_q: np.ndarray, q: np.ndarray, time_p: np.ndarray, p: np.ndarray, both: str
 ) -> list[Row]:
-    """By how much the payload's stream is late: a cable keeps its length, at the right delay."""
+    """Measure the delay of the payload's stream: a cable keeps its length, at the right delay."""
     delays = np.arange(-0.2, 0.2001, 0.01)
     inside = (time_p > time_q[0] + 0.2) & (time_p < time_q[-1] - 0.2)
     if np.sum(inside) < 50:

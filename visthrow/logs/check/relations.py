@@ -33,7 +33,7 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Relation:
-    """How ``second`` follows ``first``."""
+    """The relation of ``second`` to ``first``."""
 
     delay: float  # of the second behind the first [s]
     delay_sd: float  # [s]
@@ -126,7 +126,7 @@ def peak(score: np.ndarray, at: int) -> tuple[float, float]:
 
 
 def unit_hint(ratio: float) -> str:
-    """What a ratio of two measurements of one thing gives away, or nothing."""
+    """Name the unit that a ratio of two measurements suggests, or return nothing."""
     for known, words in UNITS.items():
         if ratio and abs(np.log(abs(ratio) / known)) < _NEAR:
             return words

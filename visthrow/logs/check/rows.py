@@ -26,7 +26,7 @@ def worst(rows: list[Row]) -> Verdict:
 
 @dataclass(frozen=True)
 class Known:
-    """What a model says of a vehicle, where it says it."""
+    """A model's statements about a vehicle."""
 
     cable_length: float = 0.0  # to the payload's centre [m]; 0: none
     mass: float = 0.0  # of all that flies [kg]; 0: not known

@@ -24,7 +24,7 @@ _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
 @dataclass(frozen=True)
 class Checked:
-    """What was found in one log."""
+    """The rows of one log."""
 
     name: str
     rows: tuple[Row, ...]
@@ -52,7 +52,7 @@ and clock.
 
 
 def contradictions(results: Sequence[Checked]) -> list[str]:
-    """Why no cause may be named from logs: their channels contradict each other, or
+    """Return the reason not to name causes from logs: their channels contradict each other, or
     nothing moved.
     """
     return [
@@ -114,7 +114,7 @@ def _until_landing(log: FlightLog) -> FlightLog:
 
 
 def _reader(log: FlightLog) -> list[Row]:
-    """What the reader of a binary log noted."""
+    """Return the notes of a binary log's reader."""
     rows = []
     corrupt, dropped = log.meta.get("corrupt", 0), log.meta.get("dropped", 0)
     if corrupt or dropped:

@@ -341,6 +341,6 @@ def _noise(name: str, channel: Channel) -> list[Row]:
 
 
 def notes_of(log: FlightLog, name: str) -> dict:
-    """What the reader noted on a channel, or nothing."""
+    """Return the reader's notes on a channel."""
     found = log.meta.get("ingest", {})
     return found.get(name, {}) if isinstance(found, dict) else {}

@@ -320,7 +320,7 @@ def _within(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
 def _moving(
     instances: dict[int, Fields], columns: tuple[str, ...], tap: Tap
 ) -> tuple[int, Fields] | None:
-    """Of the instances of a message with these columns the first that moves, else the first."""
+    """Return the first instance of a message with these columns that moves, else the first."""
     found = []
     for number, fields in instances.items():
         if all(column in fields for column in columns):
@@ -346,7 +346,9 @@ def _of_other_kinds(found: Messages, taps: tuple[Tap, ...]) -> list[str]:
 
 
 def _moving_motors(fields: Fields, pattern: str) -> int:
-    """How many of the motors of a message, named by a pattern such as ``control[{0}]``, move."""
+    """Count the motors of a message that move, named by a pattern such as
+    ``control[{0}]``, move.
+    """
     names = [pattern.format(number) for number in range(16)]
     return sum(np.ptp(np.nan_to_num(fields[name])) > 0.0 for name in names if name in fields)
 

@@ -44,7 +44,7 @@ _STDERR = 2
 
 @dataclass
 class Messages:
-    """What a log holds of the messages that were asked for."""
+    """The requested messages of a log."""
 
     path: Path
     kind: str  # ulog, dataflash, telemetry

@@ -55,7 +55,7 @@ X = (2, 0, 1, 3)
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What flew, as far as the log says."""
+    """The vehicle of a log, as far as the log names it."""
 
     kind: str = ""  # "": the log does not say
     # motors, from 0, that are front left, front right, rear left, rear right; () where it has

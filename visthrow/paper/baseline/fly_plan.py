@@ -64,7 +64,7 @@ class Flown(Throws):
 def _off(
     plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """How far payloads were from the planned release at separation; NaN where a throw failed."""
+    """Distances of payloads from the planned release at separation; NaN where a throw failed."""
     blank = np.where(good, 1.0, np.nan)
     return {
         "position_error": np.linalg.norm(pos_w - plan.release.pos_w, axis=1) * blank,
@@ -176,7 +176,7 @@ def pendulum_state(snapshot: Snapshot, mount_b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Delays:
-    """What the controller makes up for [s]."""
+    """Delays that the controller compensates [s]."""
 
     measurement: float = 0.0  # age of what it is told
     command: float = 0.0  # from a command to its effect

@@ -114,7 +114,7 @@ class Plan:
 
     @property
     def duration(self) -> float:
-        """From start to landing, if all goes as planned [s]."""
+        """Planned time from start to landing [s]."""
         return self.path.duration + self.release.fall_time
 
     def reference(self, begin: float, period: float, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -40,7 +40,7 @@ BOUNDS = (
 
 
 def title_of(plant: str, compensation: str) -> str:
-    """What a row is called: plant and condition never go unsaid."""
+    """Return a row's name, with plant and condition."""
     return "TO+MPC, own model (ideal)" if plant == OWN else f"TO+MPC, {MADE_UP[compensation]}"
 
 

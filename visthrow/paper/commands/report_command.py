@@ -165,7 +165,7 @@ def _say(text: str) -> None:
 
 
 def lead(found) -> str:
-    """What this page is, and what it is not."""
+    """Return the page's introduction."""
     note = f" **{found.note[0].upper() + found.note[1:]}.**" if found.note else ""
     return (
         "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no"

@@ -106,7 +106,7 @@ def _rows(found: list[Result]) -> list[tuple[str, ...]]:
 
 
 def _changes(departures: dict) -> str:
-    """What was changed, in words where the whole payload was, else keys without their tables."""
+    """Return the changes in words, or as keys without their tables."""
     values = {key.split(".")[-1]: value for key, value in departures.items()}
     if "payload_spread" in values and values["payload_spread"] > 0.0:
         drag = ", drag varied" if values.get("drag_spread", 0.0) > 0.0 else ""
@@ -192,7 +192,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
 
 
 def _bars(thrown: ResultSet) -> list[str]:
-    """What was asked for, and whether it was reached."""
+    """Return each requirement and whether it was reached."""
     said = []
     for policy, points in _speeds(
         thrown, sorted({r.unit["policy"] for r in thrown.matching(variant="moving")}), "hybrid"

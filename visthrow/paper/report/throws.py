@@ -111,7 +111,9 @@ def _scatter(thrown: ResultSet) -> Picture | None:
 
 
 def vision_section(thrown: ResultSet) -> Section:
-    """What vision costs: difference of mean landing errors at each target, on each plant."""
+    """Return the cost of vision: the difference of mean landing errors at each target, on each
+    plant.
+    """
     rows, marks, missing = [], [], []
     for i, plant in enumerate(PLANTS):
         for target in TARGETS:

@@ -48,7 +48,7 @@ class RunGroup:
 
 @dataclass(frozen=True)
 class SweepList:
-    """What is to be done, the most important first."""
+    """The work of a sweep, the most important first."""
 
     runs: dict[str, RunGroup]
     throws: dict[str, ThrowParams]

@@ -35,7 +35,7 @@ class Task:
     gpu: bool  # goes to one of the devices; else to a CPU core
 
     def log(self, out: Path) -> Path:
-        """What its process prints."""
+        """The process's output."""
         return out / "logs" / f"{self.name.replace('/', '_')}.txt"
 
 
@@ -105,7 +105,7 @@ class Local:
 
 @dataclass
 class Outcome:
-    """What a call did: units by name."""
+    """The work that a call did: units by name."""
 
     failed: dict[str, str] = field(default_factory=dict)  # task -> last line of its log
     stopped: bool = False  # before everything was done
@@ -113,8 +113,8 @@ class Outcome:
 
 
 def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
-    """What is left to do and can be done now, the most important first; ids that are found to be
-    done are added to ``done``.
+    """Return the remaining work that can start now, the most important first; ids that are found to
+    be done are added to ``done``.
     """
 
     def left(unit: Source | ThrowUnit) -> bool:

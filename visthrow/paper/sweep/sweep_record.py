@@ -41,7 +41,7 @@ def status(work: Work, out: Path) -> tuple[list[str], bool]:
 
 
 def _state(source: Source, out: Path) -> tuple[str, float]:
-    """What is to be said of one training, and its seconds so far."""
+    """Return a training's status line, and its seconds so far."""
     if not source.config:
         return "there already", 0.0
     rows = _progress(source, out)

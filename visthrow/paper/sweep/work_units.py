@@ -55,7 +55,7 @@ class Source:
         return out / "train" / self.id
 
     def policy(self, out: Path) -> Path:
-        """Where the policy lies, or will."""
+        """The policy's path, existing or not."""
         return self.folder(out) / POLICY if self.config else find_policy(self.name)
 
     def done(self, out: Path) -> bool:
@@ -63,7 +63,7 @@ class Source:
         return not self.config or (self.folder(out) / SUMMARY).is_file()
 
     def experiment(self) -> Experiment:
-        """What it is trained in."""
+        """The configuration of its training."""
         return _experiment(self.config, self.changes)
 
     @property
@@ -98,7 +98,7 @@ class ThrowUnit:
         )
 
     def unit(self, out: Path) -> dict[str, Any]:
-        """What :mod:`visthrow.throws.results` knows it by; the policy must be there."""
+        """Return the key of :mod:`visthrow.throws.results`; the policy must exist."""
         source, params = self.source, self.params
         path = source.policy(out)
         own, flown = self.experiments(out)
@@ -168,12 +168,12 @@ class Work:
 
 
 def throws_folder(out: Path) -> Path:
-    """Where results of throws lie."""
+    """The folder of results of throws."""
     return out / "throws"
 
 
 def variant_of(run: str) -> str:
-    """What a training config lacks or has more of than its layout's full one:
+    """Return the difference of a training config from its layout's full one:
 
     ``state_no_delay`` -> ``no_delay``.
     """

@@ -312,7 +312,7 @@ class FirstOrder:
 
     @torch.no_grad()
     def _back(self) -> None:
-        """From the derivatives of the cost by states and actions to whole derivatives by the
+        """Turn derivatives of the cost by states and actions into whole derivatives by the
         actions.
         """
         for k in reversed(range(self.flights.last)):

@@ -26,7 +26,7 @@ PREVIOUS_AT, GOAL_AT, LOAD_AT = (
 
 @wp.struct
 class Setting:
-    """What flights and policy are like."""
+    """The dimensions of flights and policy."""
 
     response: wp.array(dtype=wp.vec4)
     force: wp.array(dtype=float)
@@ -129,8 +129,8 @@ def seen_back(
     e: int,
     share: float,
 ):
-    """From an observation to state i, of which ``share`` is in it, and to the payload as it was up
-    to ``history`` steps before.
+    """Add an observation's derivatives to state i, of which ``share`` is in it, and to the payload
+    as it was up to ``history`` steps before.
     """
     adj.pos[i, e] += share * three(by_seen, e, 0)
     adj.vel[i, e] += share * three(by_seen, e, 3)
@@ -178,8 +178,8 @@ def backward(
 
 
 class Layers:
-    """What a network's layers made of the steps of flights, shape (T, E, N), and derivatives by it;
-    by what one step saw, shape (E, D).
+    """The activations of a network's layers over the steps of flights, shape (T, E, N), and
+    derivatives by it; by what one step saw, shape (E, D).
     """
 
     def __init__(self, network: Network, obs: Tensor):
@@ -231,7 +231,7 @@ class Layers:
         self.by_seen.zero_()
 
     def back(self, k: int, flown: Tensor) -> None:
-        """From derivatives by the actions of step k to those by its observations, of the flights
+        """Turn derivatives by the actions of step k into those by its observations, of the flights
         that flew it, shape (E,).
         """
         rows = _picked(flown)

@@ -25,7 +25,7 @@ def log_density(
     std: wp.array(dtype=float),
     i: int,
 ):
-    """Of sample i's action."""
+    """Log-probability of sample i's action."""
     total = float(0.0)
     for j in range(action.shape[1]):
         z = (action[i, j] - mean[i, j]) / std[j]
