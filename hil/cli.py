@@ -38,18 +38,30 @@ ACTIONS = {
 }
 """Name -> module and function, imported only when it was chosen, and help."""
 
-EXAMPLES = """examples:
+EXAMPLES = """
   visthrow hil run                              dry run: poses on udp port 14560, nothing is sent
   visthrow hil run --config fake --auto-arm     a throw; needs `visthrow hil fake` in a terminal
   visthrow hil run --config mine.toml --out runs/first
-  visthrow hil replay runs/first               the same actions again?
-  visthrow hil view runs/first                 a recording, a picture and a log of each throw
+  visthrow hil record --config mine.toml --seconds 60
+  visthrow hil calibrate --config mine.toml     a hover by which the camera's tilt is told
+  visthrow hil replay runs/first                the same actions again?
+  visthrow hil view runs/first                  a recording, a picture and a log of each throw
   visthrow hil check --seconds 5                what comes, how old, how often, and the checks
   visthrow hil check --hand-carry               carry the vehicle about: which axes fit?
+  visthrow hil fake --seconds 60                flies for `visthrow hil run --config fake`
+"""
+
+DURING = """
 
 During a run, type 'arm' (one throw), 'land' or 'abort' and Enter.
 Ctrl-C, SIGTERM and SIGHUP abort.
 """
+
+
+def examples(action: str = "") -> str:
+    """Return the examples of an action, or of all."""
+    lines = [line for line in EXAMPLES.splitlines() if line.startswith(f"  visthrow hil {action}")]
+    return "\n".join(["examples:", *lines]) + (DURING if action in ("", *FLIES) else "")
 
 
 FLIES = ("run", "record", "calibrate")
@@ -211,10 +223,16 @@ OPTIONS: tuple[tuple[tuple[str, ...], str, str | None, str | None, dict[str, Any
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = EXAMPLES
+    parser.epilog = examples()
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     subs = {
-        name: actions.add_parser(name, help=text, description=text)
+        name: actions.add_parser(
+            name,
+            help=text,
+            description=text,
+            epilog=examples(name),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
         for name, (_, text) in ACTIONS.items()
     }
     for names, option, metavar, text, more in OPTIONS:

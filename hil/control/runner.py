@@ -328,7 +328,8 @@ class Runner:
             self.backend.stop_release()
             self._stop_at = math.inf
         decision = Decision(now, state.value, self.machine.reason, waits=self.machine.waits(inputs))
-        decision.rivals = self._rivals or None
+        if inputs.streams:
+            decision.rivals = self._rivals or None
         detection, self._detection = self._detection, None
         if self.detections is not None and detection is not None:
             decision.seen = detection.values()

@@ -242,7 +242,8 @@ def test_by_udp():
         fake.close()
 
 
-def test_nobody_else_speaks_for_a_crazyflie():
+@pytest.mark.parametrize("ticks", [200, pytest.param(200_000, marks=pytest.mark.slow)])
+def test_nobody_else_speaks_for_a_crazyflie(ticks):
     """Packets from another address neither connect, nor arm, nor release it: each is counted, and
     their sender said once.
     """
@@ -269,16 +270,16 @@ def test_nobody_else_speaks_for_a_crazyflie():
     for name in [*MODES, params.crazyflie.release_parameter]:
         answer = bytes([FACTS["set_by_name"]]) + crtp.named(name) + b"\0"
         answers.append((FACTS["port_param"], FACTS["channel_by_name"], answer))
-    for tick in range(200):
+    for tick in range(ticks):
         backend.ask(FOLLOW, 0.02 * tick)
         backend.release(0.0)
         for answer in answers:
             stranger.sendto(crtp.Packet(*answer).pack(), address)
         backend.service(0.02 * tick)
-    status = backend.status(4.0)
+    status = backend.status(0.02 * ticks)
     assert (status.connected, status.release) == (False, FAILED)
     assert "no answer by CRTP" in status.note
-    assert backend.roster.refused == 200 * len(answers)
+    assert backend.roster.refused == ticks * len(answers)
     host, port = stranger.getsockname()
     refusal = f"refused: datagram from {host}:{port}: the device is 127.0.0.1:{number}"
     assert [text for text in said if "refused" in text] == [refusal]

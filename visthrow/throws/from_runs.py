@@ -21,6 +21,9 @@ NOTE = (
 )
 
 
+TICKS = "ticks.jsonl"  # of a run, a tick a line
+
+
 def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
     """Logs of all throws of some runs; LogError for a folder without throws, or a damaged log."""
     logs: list[FlightLog] = []
@@ -32,10 +35,13 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
                 if folder.is_dir()
                 else "no such folder"
             )
+            ticks = folder / TICKS
+            made = f"Of a run that was killed they are made by: visthrow hil view {folder}"
+            if ticks.is_file() and '"state": "throw"' not in ticks.read_text(errors="replace"):
+                made = "No throw was begun in this run"
             raise LogError(
                 f"{folder}: no {PATTERN} in it ({here or 'empty'}); expected the folder of a run"
-                " with throws. Of a run that was killed they are made by: visthrow hil view"
-                f" {folder}"
+                f" with throws. {made}"
             )
         logs += map(FlightLog.load, found)
     return logs

@@ -15,7 +15,7 @@ from hil.links.roster import Party, Roster
 from hil.links.writer import POSES_TLOG, TLOG, TlogWriter
 from hil.params import LIVE, HilParams
 from hil.poses.frames import FrameParams, Frames
-from hil.poses.pose import Pose
+from hil.poses.pose import Pose, known
 from hil.poses.sources.base import Recorded
 from hil.poses.sources.mavlink import COMPANIONS, MavlinkSource
 from hil.poses.sources.mocap import (
@@ -172,7 +172,7 @@ def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict
     ours = [
         frames.pose_from_source(p)
         for p in poses
-        if np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))
+        if not p.lost() and np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))
     ]
     # A clock may be set in between: stamps that do not ascend are left to the gate.
     ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]
@@ -187,6 +187,7 @@ def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict
     found = {}
     for name, (kind, (unit, frame)) in zip(names, _KINDS.items()):
         values = [getattr(p, kind) for p, good in zip(ours, ahead) if good]
-        if all(value is not None and np.all(np.isfinite(value)) for value in values):
+        unknown = any(value is None or not np.all(np.isfinite(value)) for value in values)
+        if not unknown and (kind != "quat" or all(map(known, values))):
             found[name] = Channel(times[ahead], np.array(values), unit, frame)
     return found

@@ -145,17 +145,18 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
     if not poses:
         known = ", ".join(names[0] for names in CHANNELS.values())
         raise LogError(
-            f"{path}: no position of a body; expected one of the channels {known}; it has"
-            f" {', '.join(logs[0].channels)}"
+            f"{path}: no row with a position of a body; expected one of the channels {known}; it"
+            f" has {', '.join(logs[0].channels)}"
         )
     return poses
 
 
 def _of_channels(log: FlightLog, body: str) -> list[Pose]:
-    """Return poses of one body; a sample that is not valid is NaN, for the gate to refuse."""
-    if CHANNELS[body][0] not in log:
+    """Return poses of one body; of a sample that is not valid the numbers are NaN."""
+    place = CHANNELS[body][0]
+    if place not in log or not len(log[place].time):
         return []
-    times, rows = log[CHANNELS[body][0]].time, []
+    times, rows = log[place].time, []
     for name in CHANNELS[body]:
         found: list[tuple | None] = [None] * len(times)
         if name in log:
@@ -165,7 +166,10 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
             found = [tuple(values[i]) if i >= 0 else None for i in _before(log[name].time, times)]
         rows.append(found)
     start = min(float(channel.time[0]) for channel in log.channels.values() if len(channel.time))
-    return [Pose(t, t - start, body, *parts) for t, *parts in zip(times.tolist(), *rows)]
+    return [
+        Pose(t, t - start, body, *parts, valid=valid)
+        for t, valid, *parts in zip(times.tolist(), log[place].valid.tolist(), *rows)
+    ]
 
 
 def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:

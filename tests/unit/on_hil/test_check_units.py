@@ -1,9 +1,42 @@
 """`hil check` on live poses: a wrong unit shows as a failed check."""
 
+import math
+
+import pytest
+
+from hil.cli import ACTIONS
 from hil.poses.pose import Pose
 from hil.poses.sources.base import Recorded
 from tests.hil_flight import OURS
 from visthrow.cli import main
+
+
+@pytest.mark.parametrize("quat", [(0.0,) * 4, (math.nan,) * 4])
+def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
+    """Of the vehicle it fails; no library's sentence on quaternions comes up."""
+    poses = [
+        Pose(0.01 * i, 0.01 * i, body, (1e-4 * i, 0.0, z), quat)
+        for i in range(200)
+        for body, z in (("vehicle", 1.333), ("payload", 0.95))
+    ]
+    monkeypatch.setattr("hil.check.open_source", lambda *args: (Recorded(poses), None, True))
+    settings = [word for setting in OURS for word in ("--set", setting)]
+    assert main(["hil", "check", "--seconds", "1.9", *settings]) == 1
+    out = capsys.readouterr().out
+    fails = [line for line in out.splitlines() if line.startswith("FAIL")]
+    assert len(fails) == 2, "the vehicle's alone"
+    assert fails[0] == "FAIL  no good pose of the vehicle"
+    assert "vehicle: 100 % of the poses are refused" in fails[1]
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_each_action_has_an_example(action, capsys):
+    with pytest.raises(SystemExit):
+        main(["hil", action, "--help"])
+    shown = capsys.readouterr().out.partition("examples:\n")[2].splitlines()
+    commands = [line for line in shown if line.startswith("  visthrow")]
+    assert commands
+    assert all(line.startswith(f"  visthrow hil {action}") for line in commands)
 
 
 def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):

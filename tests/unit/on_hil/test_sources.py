@@ -229,7 +229,7 @@ def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
     assert vehicle[19].quat is not None, "46 ms old"
     assert [pose.arrival for pose in poses if pose.body == "payload"] == pytest.approx(time + 0.003)
     FlightLog({"rate_b": Channel(time, place, "rad/s", "body")}).save(tmp_path / "b.npz")
-    with pytest.raises(SourceError, match="no position of a body"):
+    with pytest.raises(SourceError, match="no row with a position of a body"):
         read_table(tmp_path / "b.npz", None)
 
 
