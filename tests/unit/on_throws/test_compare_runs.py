@@ -117,6 +117,9 @@ def test_what_holds_no_throws(tmp_path, capsys):
         LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"
     ):
         from_runs.logs_of([tmp_path])
+    (tmp_path / "ticks.jsonl").write_text('{"n": 0, "state": "ready"}\n')
+    with pytest.raises(LogError, match="No throw was begun in this run"):
+        from_runs.logs_of([tmp_path])
     bare = FlightLog({}, {"policy": "x"})
     with pytest.raises(LogError, match="holds no throw of a run"):
         from_runs.entries([bare])
