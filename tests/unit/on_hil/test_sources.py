@@ -240,6 +240,7 @@ def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
         (CSV.replace("1.5", "one"), "column 'x' holds text such as 'one' in row 2"),
         (CSV.replace("1010,1.5", "1010"), "line 3 has 6 cells; the header has 7"),
         ("", "no header line with the columns' names"),
+        (CSV.partition("\n")[0] + "\n" + "nan,nan,nan,nan,0,0,0\n" * 9, "no row with a position"),
     ],
 )
 def test_wrong_csv(tmp_path, text, message):
