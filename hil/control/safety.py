@@ -111,7 +111,7 @@ def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | N
 
 @dataclass(frozen=True)
 class CheckParams:
-    """List the conditions for arming that fail; each catches a mistake that no single
+    """Limits of the checks before arming; each catches a mistake that no single
     pose betrays.
     """
 
