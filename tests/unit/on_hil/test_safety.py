@@ -1,0 +1,102 @@
+"""The guard's limits and the fence: each axis, both directions, just inside and just outside."""
+
+import math
+
+import pytest
+
+from hil.control.safety import FenceParams, Guard, GuardParams, fence_broken, outside
+from hil.poses.track import BodyState
+
+DECELERATION = 12.0  # m/s^2
+FENCE = FenceParams(
+    vehicle_low=(-2.5, -2.0, 0.3),
+    vehicle_high=(2.4, 2.2, 2.8),
+    payload_low=(-3.0, -3.0, -0.05),
+    payload_high=(3.0, 3.0, 3.0),
+    deceleration=DECELERATION,
+)
+MIDDLE = (0.0, 0.0, 1.5)
+NEAR = 0.01  # m or N beside a limit
+
+
+def body(pos=MIDDLE, vel=(0.0, 0.0, 0.0)) -> BodyState:
+    return BodyState(pos, (0.0, 0.0, 0.0, 1.0), vel, (0.0, 0.0, 0.0), 0.0)
+
+
+def moved(axis: int, value: float, start=MIDDLE) -> tuple[float, ...]:
+    return tuple(value if i == axis else x for i, x in enumerate(start))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_vehicle_is_stopped_where_it_could_not_brake(axis, side):
+    limit = (FENCE.vehicle_low if side < 0 else FENCE.vehicle_high)[axis]
+    distance = 0.4
+    speed = math.sqrt(2.0 * DECELERATION * distance)  # stops within the distance exactly
+    still = moved(axis, limit - side * distance)
+    for factor, broken in ((0.99, False), (1.01, True)):
+        vehicle = body(still, moved(axis, side * speed * factor, (0.0, 0.0, 0.0)))
+        reason = fence_broken(FENCE, vehicle, None)
+        assert bool(reason) is broken, (axis, side, factor)
+        assert not broken or "braking point" in reason
+    away = body(still, moved(axis, -side * speed * 1.01, (0.0, 0.0, 0.0)))
+    assert fence_broken(FENCE, away, None) is None, "moving away from the wall is no danger"
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_vehicle_and_payload_have_boxes_of_their_own(axis, side):
+    for name, low, high in (
+        ("vehicle", FENCE.vehicle_low, FENCE.vehicle_high),
+        ("payload", FENCE.payload_low, FENCE.payload_high),
+    ):
+        limit = (low if side < 0 else high)[axis]
+        for shift, broken in ((-NEAR, False), (NEAR, True)):
+            place = body(moved(axis, limit + side * shift))
+            vehicle, payload = (place, None) if name == "vehicle" else (body(), place)
+            reason = fence_broken(FENCE, vehicle, payload)
+            assert bool(reason) is broken, (name, axis, side, shift)
+            assert not broken or reason.startswith(f"{name} {'xyz'[axis]}")
+
+
+def test_a_payload_that_flies_is_not_watched():
+    assert fence_broken(FENCE, body(), None) is None
+    assert outside((0.0, 0.0, 0.0), (-1.0,) * 3, (1.0,) * 3) is None
+
+
+@pytest.mark.parametrize("axis", range(4))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_guard_limits_each_command_and_its_change(axis, side):
+    guard = Guard(GuardParams(slew_thrust=3.0, slew_rate=(4.0, 5.0, 6.0)), 14.0, (10.0, 9.0, 8.0))
+    slew, high = (3.0, 4.0, 5.0, 6.0)[axis], (14.0, 10.0, 9.0, 8.0)[axis]
+    low = 0.0 if axis == 0 else -high
+    start = [7.0, 0.0, 0.0, 0.0]
+    assert guard.check(tuple(start)) == tuple(start)
+    limit = high if side > 0 else low
+    wanted = list(start)
+    wanted[axis] = limit + side * 5.0
+    sent, steps = guard.check(tuple(wanted)), 1
+    assert sent[axis] == pytest.approx(start[axis] + side * slew), "one step of the slew limit"
+    while sent[axis] != limit:
+        sent, steps = guard.check(tuple(wanted)), steps + 1
+        assert steps < 10
+    assert guard.clipped == steps
+    assert guard.slewed == steps - 1 or abs(limit - start[axis]) % slew == 0.0
+    assert sent[:axis] + sent[axis + 1 :] == tuple(start[:axis] + start[axis + 1 :])
+
+
+def test_after_a_reset_any_command_within_the_limits_passes():
+    guard = Guard(GuardParams(slew_thrust=1.0, slew_rate=(1.0, 1.0, 1.0)), 14.0, (10.0, 9.0, 8.0))
+    guard.check((0.0, 0.0, 0.0, 0.0))
+    guard.reset()
+    assert guard.check((14.0, 10.0, 9.0, 8.0)) == (14.0, 10.0, 9.0, 8.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("axis", range(4))
+def test_what_is_not_finite_is_refused_and_counted(bad, axis):
+    guard = Guard(GuardParams(slew_thrust=1.0, slew_rate=(1.0, 1.0, 1.0)), 14.0, (10.0, 9.0, 8.0))
+    command = [7.0, 0.0, 0.0, 0.0]
+    command[axis] = bad
+    assert guard.check(tuple(command)) is None
+    assert guard.refused == 1
