@@ -111,9 +111,7 @@ def _scatter(thrown: ResultSet) -> Picture | None:
 
 
 def vision_section(thrown: ResultSet) -> Section:
-    """Return the cost of vision: the difference of mean landing errors at each target, on each
-    plant.
-    """
+    """Return the mean landing error of vision minus state, at each target on each plant."""
     rows, marks, missing = [], [], []
     for i, plant in enumerate(PLANTS):
         for target in TARGETS:
