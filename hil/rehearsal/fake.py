@@ -260,7 +260,8 @@ class Fake(ABC):
         self.question_lag = 0.5 * plant.period
         self.events: list[tuple[float, str]] = []
         self._going_on: dict[str, float] = {}
-        self.taken = self._open = False
+        self.taken = False
+        self._open: bool | None = None  # the mechanism's output; None before it was seen closed
 
     @staticmethod
     def open_port(number: int) -> Port | None:
@@ -334,10 +335,13 @@ class Fake(ABC):
 
     def output(self, is_open: bool, when: float) -> bool:
         """Take the mechanism's output, or its channel, as seen at a time [s]; whether it has opened
-        now, which releases.
+        now, which releases. One that was never seen closed holds what was hung on.
         """
-        opens = is_open and not self._open
-        self._open = is_open
+        opens = is_open and self._open is False
+        if is_open and self._open is None:
+            self.happened("the mechanism's output is open: nothing is released before it closes")
+            return False
+        self._open = bool(is_open)
         if opens:
             self.heard = when
             self.note_release()

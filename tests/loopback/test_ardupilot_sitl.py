@@ -48,7 +48,7 @@ class OtherSide(threading.Thread):
                 self.states.append(json.loads(link.recv(4096)))
 
 
-def servos(*motors, hook=1100):
+def servos(*motors, hook=1900):
     return (*motors, 1000, 1000, 1000, 1000, hook, *[1000] * 7)
 
 
@@ -109,7 +109,7 @@ def test_motors_turn_the_vehicle_as_ardupilot_means_them(bridge, change, axis):
 
 def test_the_mechanisms_output_lets_the_ball_go(bridge):
     fly(bridge, [(n, servos(*[HOVER + 20] * 4)) for n in range(1, 101)])
-    fly(bridge, [(101 + n, servos(*[HOVER + 20] * 4, hook=1900)) for n in range(60)])
+    fly(bridge, [(101 + n, servos(*[HOVER + 20] * 4, hook=1100)) for n in range(60)])
     report = bridge.report()
     assert report["releases"] == 1
     assert report["separation_time"] == pytest.approx(report["release_time"] + 0.06, abs=0.005)

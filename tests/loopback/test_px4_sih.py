@@ -208,3 +208,15 @@ def test_the_place_is_smooth_though_px4_cuts_it_to_centimetres():
         track.append(place.update(n * step, message)[0][0] - north)
     assert np.abs(track).max() < 0.012
     assert np.abs(np.diff(track)).max() < 2e-4
+
+
+def test_an_output_that_was_open_before_releases_nothing(bridge):
+    """After a throw PX4's gripper stays open until it is told to close; then it may open again."""
+    opens = bridge.params.servo_open_us
+    for n in range(300):
+        output = opens if n < 100 or n >= 200 else 2000
+        bridge.other.say(7.0 + 0.005 * n, (0.0, 0.0, -1.333), 0.0, output)
+        bridge.step()
+        if n == 150:
+            assert bridge.report()["releases"] == 0
+    assert bridge.report()["releases"] == 1
