@@ -454,3 +454,36 @@ def test_rounding_leaves_no_negative_information(fitted):
     )
     assert np.linalg.eigvalsh(1e6 * nearly).min() < 0.0
     assert np.linalg.eigvalsh(found.information.sum(0)).min() >= 0.0
+
+
+def test_an_effect_that_the_initial_state_explains_but_for_rounding_says_nothing(fitted):
+    """The difference of two numbers of 1e13 is rounding of either sign: beside an effect that is
+    seen it made an eigenvalue of -1e-4, and the diagnosis ended.
+    """
+    *_, levels, grams = fitted
+    part, size = alone(grams[0], levels, 0), 2
+    squares = grams[0].inner[:, : grams[0].nuisances + grams[0].latents + size].copy()
+    squares = squares[:, :, : squares.shape[1]]
+    squares[:, -1, -1] = 1e13
+    gram = replace(grams[0], inner=squares, cross=grams[0].cross[:, : squares.shape[1]])
+    left = np.array([[1e6, 10.0], [10.0, 1e-6]])
+    assert np.linalg.eigvalsh(left).min() < 0.0
+    found = marginal.gather(
+        [gram], [replace(part, information=left, score=np.array([5.0, 7.0]))], np.zeros(size)
+    )
+    np.testing.assert_array_equal(found.information[0], [[1e6, 0.0], [0.0, 0.0]])
+    np.testing.assert_array_equal(found.score[0], [5.0, 0.0])
+    again = marginal.rescored(
+        found, [gram], [replace(part, score=np.array([6.0, 7.0]))], np.zeros(2)
+    )
+    np.testing.assert_array_equal(again.score[0], [6.0, 0.0])
+
+
+def test_information_that_is_negative_beyond_rounding_is_an_error(fitted):
+    *_, levels, grams = fitted
+    part = alone(grams[0], levels, 0)
+    wrong = 1e6 * np.array([[1.0, 1.01], [1.01, 1.0]])
+    with pytest.raises(DiagnoseError, match="eigenvalue -1.0e-02 relative to its diagonal"):
+        marginal.gather(
+            grams[:1], [replace(part, information=wrong, score=np.zeros(2))], np.zeros(2)
+        )

@@ -33,6 +33,18 @@ price of 11 nats.
 """
 
 
+ROUNDING = 1e-10
+"""Share of an effect's squares that has to be left once initial states and latent forces took
+theirs: what is less is the difference of numbers that are equal to their last digits, and says
+nothing.
+"""
+
+NEGATIVE = 1e-3
+"""Largest negative eigenvalue of the information, relative to its diagonal, that rounding leaves:
+some 1e-13 of an effect's squares, of which `ROUNDING` are left at least.
+"""
+
+
 class There(NamedTuple):
     """An array on a GPU, where it was calculated."""
 
@@ -396,24 +408,26 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
     information, score, square, samples = (
         np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ())
     )
+    own = np.zeros(size)
     for i, gram, part in zip(row, grams, parts):
         information[i] += part.information
         score[i] += part.score
         square[i] += part.square
         samples[i] += gram.count.sum()
+        own += np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.cross.shape[1] - size :].sum(0)
+    silent = np.diagonal(information.sum(0)) < ROUNDING * own
+    information[:, silent], information[:, :, silent], score[:, silent] = 0.0, 0.0, 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
     lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
-    if lowest < -1e-5:
+    if lowest < -NEGATIVE:
         raise DiagnoseError(
             f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives"
             " are broken"
         )
-    if (
-        lowest < 0.0
-    ):  # rounding, which wide priors of several named effects would turn into evidence
-        information -= (
-            2.0 * lowest * information * np.eye(size)
-        )  # what says nothing of an effect stays silent
+    if lowest < 0.0:
+        # rounding, which wide priors of several named effects would turn into evidence; what says
+        # nothing of an effect stays silent
+        information -= 2.0 * lowest * information * np.eye(size)
     return Statistics(flights, information, score, square, samples, np.array(theta, dtype=float))
 
 
@@ -429,4 +443,5 @@ def rescored(
     score, square = np.zeros_like(known.score), np.zeros_like(known.square)
     np.add.at(score, which, [part.score for part in parts])
     np.add.at(square, which, [part.square for part in parts])
+    score[:, np.diagonal(known.information.sum(0)) == 0.0] = 0.0
     return replace(known, score=score, square=square, theta=np.array(theta, dtype=float))
