@@ -483,7 +483,7 @@ def test_information_that_is_negative_beyond_rounding_is_an_error(fitted):
     *_, levels, grams = fitted
     part = alone(grams[0], levels, 0)
     wrong = 1e6 * np.array([[1.0, 1.01], [1.01, 1.0]])
-    with pytest.raises(DiagnoseError, match="eigenvalue -1.0e-02 relative to its diagonal"):
+    with pytest.raises(DiagnoseError, match=r"eigenvalue -1\.0e-02 relative to its diagonal"):
         marginal.gather(
             grams[:1], [replace(part, information=wrong, score=np.zeros(2))], np.zeros(2)
         )
