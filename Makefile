@@ -14,7 +14,7 @@ JOBS ?= 2
 # Containers often forbid it; then each process compiles anew what it imports: torch and tensordict for 5 s of a core.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo docs firmware test test-all test-sitl test-site lint clean install
+.PHONY: demo docs firmware physx test test-all test-physx test-sitl test-site lint clean install
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -39,6 +39,21 @@ $(FIRMWARE)/.built: pyproject.toml
 	$(FIRMWARE)/venv/bin/python -m pip install --quiet "pip>=25.1"
 	$(FIRMWARE)/venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir $(FIRMWARE) --group sitl
 	touch $@
+
+# PhysX in an environment of its own, which takes all else from .venv: ovphysx asks for packaging<24, what tests and builds for a newer one.
+# It runs with the newer one. Then: .venv-physx/bin/python -m visthrow.cli compare state --solver physx
+physx: .venv-physx/.installed
+.venv-physx/.installed: $(STAMP)
+	@echo "make: PhysX (ovphysx, ovstage, physx-usd-schemas; 200 MB) comes under NVIDIA's Software License and Omniverse terms, not under"
+	@echo "make: visthrow's licence: by installing it you agree to them. It needs glibc 2.35 or newer."
+	$(BIN)/python -m venv .venv-physx
+	.venv-physx/bin/python -m pip install --quiet --no-deps -c constraints.txt ovphysx ovstage physx-usd-schemas newton-usd-schemas
+	.venv-physx/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))" > .venv-physx/.site
+	{ $(BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))"; echo "$(CURDIR)"; } > "$$(cat .venv-physx/.site)/visthrow.pth"
+	touch $@
+
+test-physx: physx
+	OMP_NUM_THREADS=1 .venv-physx/bin/python -m pytest tests/oracle/test_solvers.py
 
 # The documentation, to be read from its folder, offline: out/site/index.html. A broken link or name fails.
 docs: $(STAMP)
@@ -67,5 +82,5 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist out .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) .venv-physx build dist out .pytest_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
