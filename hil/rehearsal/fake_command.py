@@ -24,7 +24,7 @@ from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
 from hil.rehearsal.fake_mocap import MocapParams
 from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, make_fake, serve
 from visthrow import config
-from visthrow.common.arguments import ABOVE_ZERO, PORT, WHOLE
+from visthrow.common.arguments import ABOVE_ZERO, PORT, SOLVER, WHOLE
 from visthrow.common.errors import suggest
 from visthrow.common.storage import writable
 from visthrow.onboard.policy import Policy, find_policy
@@ -58,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--plant", metavar="MODULE:FUNCTION", help=maker)
     add("--policy", metavar="POLICY", default="vision", help="whose plant is flown")
     add("--seed", type=WHOLE, default=0, help="of start, noise and loss")
+    add("--solver", **{**SOLVER, "dest": "changes"})
     add("--rate", metavar="HZ", type=ABOVE_ZERO, default=100.0, help="poses a second of each body")
     add("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     add("--sign", metavar="KEYFILE", help="sign messages, as of `hil run`")
@@ -99,7 +100,8 @@ def run(args: argparse.Namespace) -> int:
     kinds = {*FAKES, *SITL}
     if ":" not in args.kind and args.kind not in kinds:
         raise RunError(f"--kind {args.kind}; {suggest(args.kind, kinds)}, or module:class")
-    plant = load_plant(args.plant or SITL.get(args.kind, PLANT), args.policy, args.seed)
+    maker = args.plant or SITL.get(args.kind, PLANT)
+    plant = load_plant(maker, args.policy, args.seed, args.changes)
     if out is not None:
         writable(out.parent)
     link = Link(

@@ -6,6 +6,7 @@ import inspect
 import json
 import math
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +24,22 @@ FAKES = {"ardupilot": "hil.rehearsal.fake_ardupilot:FakeArduPilot"}
 AFTER_LANDING = 10.0
 
 
-def load_plant(target: str, policy: str, seed: int) -> WirePlant:
-    """Call ``module:function`` with policy and seed; raises `RunError` where there is none, or one
+def load_plant(target: str, policy: str, seed: int, changes: Sequence[str] = ()) -> WirePlant:
+    """Call ``module:function`` with policy and seed, and with changes of the policy's configuration
+    where there are any; raises `RunError` where there is none, or one
     that makes no plant of these two.
     """
     module, _, name = target.partition(":")
     try:
         make = getattr(importlib.import_module(module), name)
-        inspect.signature(make).bind(policy, seed)
+        given = (policy, seed, *([changes] if changes else []))
+        inspect.signature(make).bind(*given)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise RunError(
             f"plant '{target}': {error}; expected module:function, as"
             " visthrow.throws.wire_plant:make, called with policy and seed"
         ) from error
-    return make(policy, seed)
+    return make(*given)
 
 
 def load_fake(kind: str) -> type[Fake]:

@@ -187,6 +187,8 @@ class HybridPlant:
         self._state = None
         for name, value in (names or {}).items():
             getattr(self._sim.state, name).assign(value)
+        if names:
+            self._sim.adopt()
         return names or {name: getattr(self._sim.state, name).numpy().copy() for name in BODIES}
 
     def look(self, *names: str) -> list[np.ndarray]:

@@ -4,6 +4,7 @@ its plant from outside.
 ``hil`` imports no simulator; it is given ``"visthrow.throws.wire_plant:make"``.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -94,9 +95,11 @@ class WirePlant:
         }
 
 
-def make(policy: str, seed: int) -> WirePlant:
-    """The plant that a policy, a shipped name or a file, was trained on."""
-    return WirePlant(load_policy(policy).experiment, seed)
+def make(policy: str, seed: int, changes: Sequence[str] = ()) -> WirePlant:
+    """The plant that a policy, a shipped name or a file, was trained on, with ``key=value`` changes
+    of its configuration.
+    """
+    return WirePlant(load_policy(policy, None, changes).experiment, seed)
 
 
 class MotorPlant(WirePlant):
@@ -228,6 +231,6 @@ class MotorPlant(WirePlant):
         self._look()
 
 
-def make_motors(policy: str, seed: int) -> MotorPlant:
-    """The plant that a policy was trained on, flown by motor commands."""
-    return MotorPlant(load_policy(policy).experiment, seed)
+def make_motors(policy: str, seed: int, changes: Sequence[str] = ()) -> MotorPlant:
+    """As :func:`make`, flown by motor commands."""
+    return MotorPlant(load_policy(policy, None, changes).experiment, seed)
