@@ -20,7 +20,11 @@ def thrown(policy: str, solver: str | None, args) -> list[dict]:
     rows = []
     for target in args.targets:
         found = throw(item.experiment, actor, target, args.throws, args.device, args.seed)
-        row = {"policy": policy, "solver": solver, "substep": item.experiment.sim.substep}
+        row = {
+            "policy": Path(policy).stem,
+            "solver": solver,
+            "substep": item.experiment.sim.substep,
+        }
         landed = np.where(np.isfinite(found.landing_w), found.landing_w, 0.0).round(5)
         rows.append({**row, **found.summary(), "landing_w": landed.tolist()})
     return rows
@@ -55,7 +59,7 @@ def run(args) -> int:
         name = f"{row['solver'] or 'its own'}, {1e3 * row['substep']:g} ms"
         off = f"{1e3 * middle:.2f} / {1e3 * most:.1f}"
         row["moved_median"], row["moved_most"] = middle, most
-        cells.append((Path(row["policy"]).stem, f"{row['target']:g} m", name, landed, error, off))
+        cells.append((row["policy"], f"{row['target']:g} m", name, landed, error, off))
     header = ("policy", "target", "solver", "landed", "mean error [m]", "moved [mm]")
     title = f"Landings by solver, {device_name(args.device)}"
     notes = (
