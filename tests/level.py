@@ -1,5 +1,5 @@
-"""A plant of a few lines: it stands in the air whatever it is told, and drops the payload at its
-feet.
+"""A plant of a few lines: it stands in the air whatever it is told, turns a little as it is told,
+and drops the payload at its feet.
 
 For what concerns protocol, faults and time alone: no simulator is needed for it.
 """
@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 
 from visthrow.onboard.hover import GRAVITY
+
+MOST_LEAN = 0.1
+"""Of the vehicle [rad]."""
 
 MOST_KEPT = 10_000
 """Commands that are remembered."""
@@ -34,12 +37,15 @@ class LevelPlant:
         self.time, self.lag = 0.0, lag
         self.released: float | None = None
         self.commands: deque[tuple[float, ...]] = deque(maxlen=MOST_KEPT)
+        self.lean = np.zeros(3)
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """See `WirePlant`."""
         self.commands.append(tuple(command))
         if release and self.released is None:
             self.released = self.time + after
+        turned = self.lean + self.period * np.array(command)[1:]
+        self.lean = np.clip(turned, -MOST_LEAN, MOST_LEAN)
         self.time += self.period
 
     @property
@@ -48,10 +54,10 @@ class LevelPlant:
         hangs = self.released is None or self.time < self.released + self.lag
         fall = 0.0 if hangs else 0.5 * GRAVITY * (self.time - self.released - self.lag) ** 2
         ball = np.array([0.0, 0.0, max(self.home_w[2] - 0.383 - fall, 0.04)])
-        level = np.array([0.0, 0.0, 0.0, 1.0])
+        quat = np.array([*(0.5 * self.lean), 1.0])
         return {
             "pos_w": self.home_w,
-            "quat_wb": level,
+            "quat_wb": quat / np.linalg.norm(quat),
             "vel_w": np.zeros(3),
             "rate_b": np.zeros(3),
             "payload_pos_w": ball,

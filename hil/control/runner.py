@@ -8,6 +8,7 @@ on nothing else; these are recorded, so that a replay decides alike to the last 
 import copy
 import math
 import traceback
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from time import perf_counter
@@ -19,6 +20,7 @@ from hil.control.aim import Aim
 from hil.control.calibrating import Calibrating
 from hil.control.hovering import Hovering
 from hil.control.latch import Latch
+from hil.control.response import Response
 from hil.control.safety import Guard, failed_checks, fence_broken, outside
 from hil.control.states import FLYING, Decision, Inputs, Machine, OperatorInput, State
 from hil.links.backends.base import FAILED, FOLLOW, LAND, PENDING, Backend, Status
@@ -57,6 +59,9 @@ LEVEL_TIME = 0.5
 # and data at hand
 WARM_CALLS = 3
 MOST_ERRORS = 100  # tracebacks that are kept
+# ticks over which the thrust is taken that an autopilot hovers with by itself, and share of the
+# weight below which it stands on the ground
+HOVERED, STANDS = 25, 0.3
 
 
 @dataclass(frozen=True)
@@ -141,6 +146,14 @@ class Runner:
         self.hovering = Hovering(
             params.home_w, heading, float(action["max_thrust"]), self.pilot.period
         )
+        tolerance = (
+            math.inf
+            if params.backend == "dry-run"
+            else getattr(params, params.backend).thrust.tolerance
+        )
+        self.response = Response(self.pilot.period, self.mass, tolerance, params.check.probe)
+        self._thrusts: deque[float] = deque(maxlen=2 * HOVERED)  # of the autopilot's own hover
+        self._tolerance = tolerance
         self._aged = 0.5 * sum(contract["observation"]["latency"])
         self.aim = Aim(params.aim, self._aged + self.latch.lag, height, rope)
         self._acted = State.IDLE
@@ -287,6 +300,7 @@ class Runner:
         wanted = self._command(now, state, seen, decision)
         if self.calibrating is not None:
             wanted = self._calibrated(now, state, seen, status, wanted, decision)
+        wanted = self._probed(state, status, wanted)
         self._ask(now, state, seen.vehicle, status)
         if self.params.observe and decision.action is None and seen.known and seen.vehicle.quat:
             self._show(seen, decision)
@@ -348,6 +362,8 @@ class Runner:
         was never ours.
         """
         if status.mode in (HELD, LAND) and state not in (State.READY, State.ARMED):
+            return False
+        if self.machine.handed_back:
             return False
         return state is not State.ABORT or (status.connected and self.machine.flown)
 
@@ -421,10 +437,28 @@ class Runner:
             and decision.command is not None
         )
         self.hovering.note(decision.command[0] / (self.mass * GRAVITY) if hovers else None)
+        real = self.params.backend != "dry-run"
+        if hovers and real and seen.vehicle is not None and seen.vehicle.quat is not None:
+            self.response.note(decision.command, seen.vehicle)
+        else:
+            self.response.pause()
         if decision.release:
             self.backend.release(self.latch.trip(now, seen.goal_w))
         if state is State.ABORT and self.machine.flown:
-            self.backend.abort(now)
+            if self.machine.handed_back:
+                self.backend.hand_back(now)
+            else:
+                self.backend.abort(now)
+
+    def _probed(
+        self, state: State, status: Status, wanted: tuple[float, ...] | None
+    ) -> tuple[float, ...] | None:
+        """Return the command with the doublet of the first hover that is ours."""
+        ours = state in (State.READY, State.ARMED) and status.mode == FOLLOW
+        if not ours or wanted is None or self.params.backend == "dry-run":
+            return wanted
+        added = (0.0, *self.response.rates())
+        return tuple(value + more for value, more in zip(wanted, added))
 
     def _tether(self, pose: Pose) -> Tether | None:
         """Return the cable's other end for a pose of vehicle or payload while the payload hangs;
@@ -494,6 +528,7 @@ class Runner:
             checks = failed_checks(p.check, p.fence, vehicle, payload, goal_w, p.home_w, self.hang)
             if GOAL in self.tracks and self.tracks[GOAL].gate.level(now) >= HOLD:
                 checks.append("the goal's pose is stale")
+            self._weigh(status)
             checks += self._thrust_off()
             if self.detections is not None and state in (State.READY, State.ARMED):
                 checks += self.detections.problems(now)
@@ -531,6 +566,7 @@ class Runner:
             status.note,
             words.why,
             tuple(self._streams(now)) if state in (State.IDLE, State.CHECK) else (),
+            self.response.problem,
         )
 
     def _streams(self, now: float) -> list[str]:
@@ -543,18 +579,31 @@ class Runner:
         ]
         return judged + self._rivals
 
+    def _weigh(self, status: Status) -> None:
+        """Note the thrust that the autopilot hovers with by itself, until it is taken."""
+        if status.thrust is None or self.machine.flown:
+            self._thrusts.clear()
+        else:
+            self._thrusts.append(status.thrust / (self.mass * GRAVITY))
+
     def _thrust_off(self) -> list[str]:
-        """Return whether hovering takes another thrust than the weight: then the calibration is
-        wrong, or the battery low.
+        """Return whether hovering takes another thrust than the weight, the autopilot's own before
+        it is taken, then ours: the calibration is wrong, the vehicle another, or the battery low.
         """
-        p, ratio = self.params, self.hovering.share()
-        allowed = math.inf if p.backend == "dry-run" else getattr(p, p.backend).thrust.tolerance
-        if ratio is None or abs(ratio - 1.0) <= allowed:
-            return []
-        return [
-            f"hovering takes {ratio:.2f} times the weight, within {allowed:g} of 1 expected:"
-            " calibrate the thrust"
-        ]
+        ours, allowed = self.machine.flown, self._tolerance
+        ratio = self.hovering.share()
+        if len(self._thrusts) >= HOVERED:
+            ratio = sum(self._thrusts) / len(self._thrusts)
+        told = []
+        if ratio is not None and abs(ratio - 1.0) > allowed and (ours or ratio > STANDS):
+            who = "hovering takes" if ours else "its own hover takes"
+            told.append(
+                f"{who} {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate"
+                " the thrust, or weigh the vehicle"
+            )
+        if ours and self.response.running and self.params.backend != "dry-run":
+            told.append("it is being judged how it turns")
+        return told
 
     def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
         """Return whether all is quiet, at the hover point or where the autopilot holds

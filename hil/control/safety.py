@@ -7,7 +7,7 @@ from hil.poses.pose import Vector
 from hil.poses.track import BodyState
 from visthrow.common.errors import ConfigError
 from visthrow.common.rotations import tilt_and_heading
-from visthrow.config.bounds import Bounded, Positive
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,8 @@ class CheckParams:
     rope_tolerance: float
     home_radius: float  # of the vehicle from its hover point [m]
     speed: float  # of the vehicle, noise included [m/s]
+    # body rates of a doublet in the first hover, by which signs are seen [rad/s]; 0: none
+    probe: NotNegative = 0.0
 
 
 def failed_checks(

@@ -79,6 +79,7 @@ class Inputs:
     note: str = ""  # of the autopilot: what is wrong, or what it waits for
     why: str = ""  # of the abort, where it was no word
     streams: tuple[str, ...] = ()  # what is wrong with how the poses come, before the take-over
+    disagrees: str | None = None  # how the first hover is not the policy's vehicle's
 
     def missing(self) -> list[str]:
         """Return what has to be there before anything is checked, and is not."""
@@ -102,6 +103,7 @@ class Machine:
         throws: throws begun. cancelled: throws that ended without a release.
         flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an
             abort.
+        handed_back: whether the vehicle went back to the autopilot's own hold, or to the pilot.
         left_fence: how the vehicle left its fence after a throw; that ends the run by a landing,
             and is no abort.
     """
@@ -123,6 +125,7 @@ class Machine:
         self.throws = self.cancelled = 0
         self.flown = self.aborted = False
         self.left_fence: str | None = None
+        self.handed_back = False
         self._held: float | None = None  # since when what must last has lasted
 
     def step(self, now: float, seen: Inputs) -> State:
@@ -135,7 +138,10 @@ class Machine:
             if not self.flown or now - self.since > self.params.abort:
                 self._go(now, State.DONE, self.reason)
         elif self.state is not State.DONE:
-            if urgent is not None:
+            if seen.disagrees is not None and self.state in (State.READY, State.ARMED):
+                self.handed_back = True
+                self._go(now, State.ABORT, f"handed back: {seen.disagrees}")
+            elif urgent is not None:
                 self._go(now, State.ABORT, urgent)
             else:
                 _STEPS[self.state](self, now, seen)

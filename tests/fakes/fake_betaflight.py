@@ -56,6 +56,8 @@ SIZES = {
 class FakeBetaflight(PortFake):
     """See the head of this module."""
 
+    ends = (LOW, HIGH)  # of the mechanism's output, closed and open [us]
+
     @staticmethod
     def open_port(number: int) -> ListeningPort:
         return ListeningPort(number)
@@ -218,7 +220,7 @@ class FakeBetaflight(PortFake):
         return struct.pack(f"<{len(channels)}H", *channels)
 
     def _servo(self) -> bytes:
-        shown = MIDDLE if self.parameters["channel_forwarding"] else HIGH if self.moved else LOW
+        shown = MIDDLE if self.parameters["channel_forwarding"] else self.ends[self.moved]
         return struct.pack("<8H", shown, *([MIDDLE] * 7))
 
     def _ranges(self) -> bytes:

@@ -19,6 +19,7 @@ from hil.links.backends.rates import Sticks
 from hil.links.crtp import open_crtp
 from hil.links.device import check_device, open_port
 from hil.links.writer import MSP_LOG, LoggedPort
+from visthrow.onboard.hover import GRAVITY
 
 AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {
     "ardupilot": ArduPilot,
@@ -78,12 +79,21 @@ def make_backend(
 
 
 def require_reach(params: Any, contract: dict[str, Any]) -> None:
-    """Raise `RunError` for a vehicle that by its calibration and rate profile cannot do what the
-    policy was trained to command.
+    """Raise `RunError` for a vehicle that by its configuration is not the policy's: another weight,
+    or a calibration and rate profile that do not reach what the policy was trained to command.
     """
     if params.backend == "dry-run":
         return
     vehicle, action = getattr(params, params.backend), contract["action"]
+    rope = contract["rope"]
+    mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]
+    ratio = vehicle.thrust.weight / (mass * GRAVITY)
+    if abs(ratio - 1.0) > vehicle.thrust.tolerance:
+        raise RunError(
+            f"{params.backend}.thrust.weight {vehicle.thrust.weight:g} N is {ratio:.2f} times the"
+            f" weight that the policy was trained with, {mass * GRAVITY:.3f} N; expected it within"
+            f" {vehicle.thrust.tolerance:g}: train a policy for this vehicle"
+        )
     most, wanted = vehicle.thrust.most, float(action["max_thrust"])
     if most < THRUST_SHORT * wanted:
         raise RunError(

@@ -246,6 +246,10 @@ class MavlinkAutopilot(Autopilot, ABC):
             return self._arm_refused or "disarmed", WAIT
         return "", WAIT
 
+    def _flies_itself(self) -> bool:
+        beat = self._heartbeat
+        return self._wanted is None and beat is not None and bool(beat.base_mode & ARMED)
+
     def _mode_text(self, mode: int) -> str:
         return str(mode)
 

@@ -39,6 +39,8 @@ class Status:
     fault: str | None = (
         None  # what ends the run, whatever else is well: a parameter audit that failed
     )
+    # that it hovers with by itself, by its own report and the calibration [N]; None: not known
+    thrust: float | None = None
 
 
 class Backend:
@@ -81,6 +83,12 @@ class Backend:
 
         A pilot who has taken over is left alone.
         """
+
+    def hand_back(self, now: float) -> None:
+        """Give the vehicle to its own hold, or to the pilot; called at every tick of a run that
+        ended so.
+        """
+        self.ask(HOLD, now)
 
     def finish(self, now: float) -> None:
         """Put the autopilot at rest, as far as that is ours: the run is over."""
@@ -133,6 +141,7 @@ class Release:
         """
         self.timeout, self.read_back = timeout, read_back
         self.answers: list[float] = []
+        self.open_at_rest = self._begun = False  # the output, before the first release
         self.reset()
 
     def reset(self) -> None:
@@ -146,7 +155,8 @@ class Release:
     def start(self, when: float) -> None:
         """Open at a time [s]."""
         if self.state == IDLE:
-            self.state, self.at, self._first = PENDING, when, when
+            self.state, self.at, self._first, self._begun = PENDING, when, when, True
+            self.open_at_rest = False
 
     def stop(self) -> None:
         """Send no more; what was never sent never happened."""
@@ -173,6 +183,7 @@ class Release:
         in this throw before.
         """
         self._closed |= not is_open
+        self.open_at_rest = is_open and not self._begun
         if is_open and self._closed and self.state == PENDING and self.sends:
             self._moved = True
             self._judge()
@@ -215,6 +226,7 @@ class Autopilot(Backend):
 
     audit = Audit()
     release_record: Release
+    params: Any
     share: float | None = None
     voltage: float | None = None
 
@@ -225,15 +237,24 @@ class Autopilot(Backend):
         """Return what is wrong, or nothing; and what the autopilot does."""
         raise NotImplementedError
 
+    def _flies_itself(self) -> bool:
+        """Return whether it flies, and nothing of ours is followed."""
+        return False
+
     def _hint(self) -> str:
         """Return what it waits for, though nothing is wrong."""
         return ""
 
     def status(self, now: float) -> Status:
         note, mode = self._note(now)
-        fault = self.audit.fault()
+        fault, thrust = self.audit.fault(), None
+        if not note and self.release_record.open_at_rest:
+            note = "the mechanism's output is at its open end: open and closed are exchanged"
+        if self.share is not None and self._flies_itself():
+            thrust = self.params.thrust.thrust(self.share, self.voltage)
         said = note or self._hint() or self.release_record.note
-        return Status(not note and fault is None, said, self.release_record.state, mode, fault)
+        good = not note and fault is None
+        return Status(good, said, self.release_record.state, mode, fault, thrust)
 
     def release(self, when: float) -> None:
         self.release_record.start(when)

@@ -196,6 +196,9 @@ class Betaflight(OnPort):
             )
         return "" if self._box(BOX_OVERRIDE) else "MSP OVERRIDE is off: switch it on to hand over"
 
+    def _flies_itself(self) -> bool:
+        return not self._taken and self._box(BOX_ARM) and not self._box(BOX_OVERRIDE)
+
     def _known(self) -> tuple[str, str]:
         p = self.params
         if not (self.audit.done and self._boxes and self._order):

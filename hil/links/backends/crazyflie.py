@@ -30,6 +30,8 @@ FACTS = values("crazyflie")
 MODES = tuple(name for name in FACTS if "." in name)  # parameters that are set before it is armed
 
 ASK, SET_AGAIN = 0.1, 0.2  # between two questions for its state, two requests to arm [s]
+# a vehicle that is handed back holds its place so long [s], then sinks so fast [m/s]
+HOLDS, DESCENT = 2.0, 0.3
 SHORTEST = 0.02  # that a change of the yaw rate is spread over, at least [s]: a period
 
 BLOCKS = {
@@ -84,6 +86,7 @@ class Crazyflie(OnPort):
         self.audit = Audit(self._rules(), self._ask, None, tell)
         self._state, self._speaks = 0, False
         self._place: tuple[tuple[float, ...], float] | None = None  # position [m], heading [deg]
+        self._returned: tuple[float, tuple[float, ...], float] | None = None  # when, and where
         self._yaw = 0.0, -1e9  # rate of yaw that was wanted last [rad/s], when [s]
         self._asked = self._armed_at = -1e9
 
@@ -154,11 +157,16 @@ class Crazyflie(OnPort):
         return rate + error / max(now - when, SHORTEST)
 
     def hand_back(self, now: float) -> None:
-        """Let it hold the place of its last pose by its own controller; without poses fall silent:
-        its supervisor acts.
+        """Let it hold the place of its last pose by its own controller, and sink to the ground from
+        there; without poses fall silent: its supervisor acts.
         """
-        if self._place is not None:
-            self._put(crtp.position(*self._place))
+        if self._place is None:
+            return
+        if self._returned is None:
+            self._returned = now, *self._place
+        since, (x, y, z), yaw = self._returned
+        lower = DESCENT * max(now - since - HOLDS, 0.0)
+        self._put(crtp.position((x, y, max(z - lower, 0.0)), yaw))
 
     def rearm(self) -> None:
         """Forget the last release; the mechanism closes, so that the next payload can

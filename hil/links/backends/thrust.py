@@ -56,16 +56,23 @@ class ThrustParams(Bounded):
             1.0 / self.exponent
         )
         share = (relative * self._command(self.hover) - self.idle) / (1.0 - self.idle)
-        if self.voltage > 0.0 and voltage is not None:
-            low, high = VOLTAGE_RANGE
-            # Thrust goes with the square of the rotor's speed, and that with the voltage.
-            share *= min(max(self.voltage / max(voltage, 1e-6), low), high) ** 2
-        return min(max(share, 0.0), 1.0)
+        return min(max(share * self._sag(voltage), 0.0), 1.0)
 
-    def thrust(self, share: float) -> float:
-        """Return the thrust [N] at a share, at the calibration's voltage; 0 or more."""
+    def thrust(self, share: float, voltage: float | None = None) -> float:
+        """Return the thrust [N] at a share, 0 or more, at the battery's voltage [V] where it is
+        known.
+        """
+        share /= self._sag(voltage)
         relative = (self._command(share) / self._command(self.hover)) ** self.exponent
         return max(0.0, self.weight * (1.0 + self.slope * (relative - 1.0)))
+
+    def _sag(self, voltage: float | None) -> float:
+        """Return how much more share a battery's voltage [V] takes."""
+        if self.voltage == 0.0 or voltage is None:
+            return 1.0
+        low, high = VOLTAGE_RANGE
+        # Thrust goes with the square of the rotor's speed, and that with the voltage.
+        return min(max(self.voltage / max(voltage, 1e-6), low), high) ** 2
 
     def _command(self, share: float) -> float:
         return self.idle + (1.0 - self.idle) * share

@@ -1,0 +1,137 @@
+"""A vehicle that is not the policy's is refused on the ground, or handed back before it has sunk
+0.1 m: of another weight or thrust line, with a rate's sign turned, with its mechanism reversed.
+"""
+
+from dataclasses import replace
+
+import pytest
+
+from hil.control.loop import Loop
+from hil.control.response import AXES
+from hil.control.states import State
+from hil.errors import RunError
+from hil.links.backends import require_reach
+from hil.links.backends.base import FOLLOW
+from hil.params import HilParams
+from tests.hil_flight import AutoOperator, simple_policy
+from tests.loopback.test_endings import NEVER
+from tests.loopback.wire import CONFIGS, peers
+from tests.point import PointPlant
+from visthrow import config
+
+KINDS = tuple(CONFIGS)
+QUICK = ("states.idle=3.0", "states.check=3.0", "states.abort=0.5")
+SUNK = 0.1  # [m]
+LONGEST = 9.0  # a vehicle that is the policy's has thrown by then [s]
+
+
+def fly(kind, times=1.0, spoil=lambda fake: None):
+    """Fly until a run is refused, given back or thrown.
+
+    Returns the runner, what it said, and how far the vehicle had sunk while it was ours [m].
+    """
+    taken = () if kind in ("betaflight", "crazyflie") else (f"{kind}.take=true",)
+    plant, waits = PointPlant(times), []
+    runner, source, clock, fake = peers(
+        plant, kind=kind, loaded=NEVER, seed=3, overrides=(*QUICK, *taken)
+    )
+    spoil(fake)
+    tell = lambda decision: waits.append(decision.waits)  # noqa: E731
+    loop, start, sunk = Loop(runner, source, clock, AutoOperator(), None, tell), None, 0.0
+    ends = (State.THROW, State.DONE)
+    while clock.now() < LONGEST and runner.machine.state not in ends:
+        loop.turn(False)
+        height = plant.state["pos_w"][2]
+        followed = runner.backend.status(clock.now()).mode == FOLLOW
+        if not runner.machine.handed_back and runner.machine.flown and followed:
+            start = height if start is None else start
+            sunk = max(sunk, start - height)
+    return runner, f"{runner.machine.reason}; {waits}", sunk
+
+
+def turn(axis):
+    """Spoil a fake: turn the sign of a rate that it follows."""
+
+    def spoil(fake):
+        add = fake._set_points.add
+
+        def turned(when, target):
+            target[1 + axis] *= -1.0
+            add(when, target)
+
+        fake._set_points.add = turned
+
+    return spoil
+
+
+def bend(share):
+    """Spoil a fake: its hover takes another share of thrust."""
+
+    def spoil(fake):
+        fake.thrust_map = replace(fake.thrust_map, hover=share * fake.thrust_map.hover)
+
+    return spoil
+
+
+def reverse(fake):
+    """Spoil a fake: its mechanism is open where it was closed."""
+    fake.hook_opens = 0
+    ends = {"ends": fake.ends[::-1]} if hasattr(fake, "ends") else {}
+    fake.__class__ = type("Reversed", (type(fake),), ends)
+
+
+def require_refused(runner, said, sunk):
+    """Fail where a run went on, or ended when something was lost."""
+    assert (runner.machine.state, runner.machine.throws) == (State.DONE, 0), said
+    if runner.machine.flown:
+        assert runner.machine.handed_back, said
+        assert sunk < SUNK, said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_policys_own_vehicle_throws(kind):
+    runner, said, sunk = fly(kind)
+    assert runner.machine.state is State.THROW, said
+    assert sunk < SUNK
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
+def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, times):
+    weight = 2.668 * times
+    over = [f"{kind}.thrust.weight={weight}", f"{kind}.thrust.hover={min(0.1906 * times, 0.9)}"]
+    params = config.load(HilParams, config.find("hil", CONFIGS[kind]), over)
+    with pytest.raises(RunError, match=r"times the weight that the policy was trained with"):
+        require_reach(params, simple_policy().contract)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
+def test_another_weight_than_the_configuration_says(kind, times):
+    runner, said, sunk = fly(kind, times)
+    require_refused(runner, said, sunk)
+    assert "times the weight" in said or "thrust: it" in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.8, 1.2])
+def test_another_thrust_line(kind, share):
+    runner, said, sunk = fly(kind, spoil=bend(share))
+    require_refused(runner, said, sunk)
+    assert "times the weight" in said or "thrust: it" in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("axis", range(3))
+def test_the_sign_of_a_rate(kind, axis):
+    runner, said, sunk = fly(kind, spoil=turn(axis))
+    require_refused(runner, said, sunk)
+    assert f"handed back: {AXES[axis]}: it turns against its commands" in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mechanism_that_opens_the_other_way(kind):
+    runner, said, sunk = fly(kind, spoil=reverse)
+    require_refused(runner, said, sunk)
+    assert not runner.machine.flown
+    assert "open and closed are exchanged" in said or "where it should hang" in said
