@@ -20,6 +20,7 @@ from visthrow.common import storage
 from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
+from visthrow.training import trainer
 from visthrow.training.ppo.algorithm import PPOTraining
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -334,3 +335,19 @@ def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, capsys):
     assert "state" in capsys.readouterr().err
     assert train(tmp_path / "b", "--set", "ppo.minibatches=7") == 2
     assert "minibatches" in capsys.readouterr().err
+
+
+def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
+    folder = tmp_path / "run"
+    changes = [
+        f"--set={change}"
+        for change in ("ppo.environments=32", 'flown=["task.noise.observation_step=0.0"]')
+    ]
+    words = ["train", "state", "--iterations", "1", "--device", "cpu", "--out", str(folder)]
+    assert cli.main([*words, *changes, "--json", str(tmp_path / "figures.json")]) == 0
+    printed = capsys.readouterr().out
+    assert "under the faults of its training:" in printed
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    flown, trained = figures["throws"], figures["throws_under_faults"]
+    assert [row["throws"] for row in flown] == [5 * trainer.EVALUATED] * 3
+    assert flown != trained, "the conditions must differ"

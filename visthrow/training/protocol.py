@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from visthrow import config
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.training.env import ThrowEnv
@@ -23,6 +24,14 @@ def hover_start(experiment: Experiment) -> Experiment:
         pilots_hover(), **{name: getattr(experiment.task.start, name) for name in kept}
     )
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
+
+
+def as_flown(experiment: Experiment) -> Experiment:
+    """Return the experiment as its policies are flown and measured: without training's faults."""
+    if not experiment.flown:
+        return experiment
+    text, name = config.dumps(experiment), "the configuration of the training"
+    return config.loads(Experiment, text, list(experiment.flown), name=name)
 
 
 def throw(

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from visthrow import config
-from visthrow.common import provenance
+from visthrow.common import provenance, statistics
 from visthrow.common.arguments import EXIT_INTERRUPTED, StopRequest
 from visthrow.common.errors import CheckpointError, StorageError, TrainError
 from visthrow.common.storage import write_json
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment
-from visthrow.task.measurement import TARGETS
+from visthrow.task.measurement import Throws
 from visthrow.training import device
 from visthrow.training.progress import TrainLog
 from visthrow.training.ranks import Ranks
@@ -271,9 +271,22 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
     return why
 
 
+def _line(throws: Throws) -> str:
+    """Return a target's landing error with its 95 % interval, in words."""
+    row = throws.summary()
+    if not row["success"]:
+        return f"target {row['target']:.1f} m: no throw landed"
+    error = statistics.mean(throws.error[throws.success])
+    return (
+        f"target {row['target']:.1f} m: error {error.text()} m, duration"
+        f" {row['duration_mean']:.3f} s, landed {100 * row['success']:.1f} % of {row['throws']}"
+    )
+
+
 def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -> None:
     """Throw at all targets, write the policy with what came of it, and print it."""
-    rows = [trainer.throw(target).summary() for target in TARGETS]
+    throws = trainer.final_throws()
+    rows = [one.summary() for one in throws["flown"]]
     steps = trainer.iteration * trainer.algorithm.samples
     spent = {
         "wall_s": wall,
@@ -282,17 +295,16 @@ def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -
         "seconds": dict(trainer.seconds),
     }
     figures = {"throws": rows, **spent}
+    if "trained" in throws:
+        figures["throws_under_faults"] = [one.summary() for one in throws["trained"]]
     finish(trainer, folder, figures, finished)
     print(f"\n{trainer.iteration} iterations, {steps / 1e6:.1f} M environment steps, {wall:.1f} s")
-    for row in rows:
-        if row["success"] > 0:
-            print(
-                f"target {row['target']:.1f} m: error {row['error_mean']:.3f} +-"
-                f" {row['error_std']:.3f} m, duration {row['duration_mean']:.3f} s, landed"
-                f" {100 * row['success']:.1f} %"
-            )
-        else:
-            print(f"target {row['target']:.1f} m: no throw landed")
+    for one in throws["flown"]:
+        print(_line(one))
+    if "trained" in throws:
+        print("under the faults of its training:")
+        for one in throws["trained"]:
+            print(_line(one))
     print(f"policy: {folder / 'policy.npz'}")
     if args.json:
         write_json(args.json, figures)

@@ -17,7 +17,7 @@ from visthrow.common.errors import CheckpointError, MismatchError, TrainError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
-from visthrow.task.measurement import Throws
+from visthrow.task.measurement import TARGETS, Throws
 from visthrow.training import protocol
 from visthrow.training.device import rounded_products
 from visthrow.training.env import ThrowEnv
@@ -38,6 +38,7 @@ end, and of one that did not.
 ADAPTATION = 'ppo="ppo/adapt.toml"'
 
 EVALUATED = 200  # throws of an evaluation
+FINAL = 5  # times as many at the end of a training
 
 TASK = ("observation", "action", "control_period")
 """Parts of a policy's contract that its network cannot do without; plant, camera and release may
@@ -186,15 +187,39 @@ class Trainer:
                 " last checkpoint is from before"
             )
 
-    def throw(self, target: float, count: int | None = None, seed: int = 12345) -> Throws:
-        """Throws from hover with the current policy, :data:`EVALUATED` if not said; see
-        :mod:`visthrow.training.protocol`.
+    def throw(
+        self,
+        target: float,
+        count: int | None = None,
+        seed: int = 12345,
+        experiment: Experiment | None = None,
+    ) -> Throws:
+        """Throw from hover with the current policy; see :mod:`visthrow.training.protocol`.
+
+        Args:
+            target: distance along x [m].
+            count: of throws (default: :data:`EVALUATED`).
+            seed: of starts and noise.
+            experiment: conditions of the throws (default: those of the training).
         """
         count = count or EVALUATED
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
-        return protocol.throw(
-            self.experiment, policy.actor(count), target, count, self.device, seed
-        )
+        conditions = experiment or self.experiment
+        return protocol.throw(conditions, policy.actor(count), target, count, self.device, seed)
+
+    def final_throws(self) -> dict[str, list[Throws]]:
+        """Throw :data:`FINAL` times :data:`EVALUATED` at each target, by conditions.
+
+        ``flown`` are the conditions that ``visthrow compare`` flies, ``trained`` those of the
+        training with its faults, where the two differ.
+        """
+        conditions = {"flown": protocol.as_flown(self.experiment)}
+        if self.experiment.flown:
+            conditions["trained"] = self.experiment
+        return {
+            name: [self.throw(target, FINAL * EVALUATED, experiment=e) for target in TARGETS]
+            for name, e in conditions.items()
+        }
 
     def save(self, path: Path) -> None:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped, all
