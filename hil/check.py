@@ -104,7 +104,7 @@ def _listen(args: argparse.Namespace) -> int:
             came = source.poll(now)
             poses += came
             runner.hear(source.rivals(now))
-            runner.tick(now, came, runner.backend.status(now), OperatorInput())
+            runner.tick(now, came, autopilot.status(now), OperatorInput())
             last = runner.problems() or last
             autopilot.tick(now, runner)
             clock.sleep_until(now + runner.pilot.period)
@@ -191,6 +191,12 @@ class AutopilotCheck:
             if params.backend == "dry-run"
             else HoverMeter(getattr(params, params.backend).thrust)
         )
+
+    def status(self, now: float) -> Status:
+        """Return what the runner is to know of it at a time [s]; what the audit found is said by
+        :meth:`results`.
+        """
+        return dataclasses.replace(self.backend.status(now), fault=None)
 
     def tick(self, now: float, runner: Any) -> None:
         """Listen; the runner knows whether the vehicle hovers."""

@@ -14,7 +14,7 @@ from hil.links.roster import Roster
 from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.opening import parties
-from tests.loopback.wire import HERE, MemoryPort
+from tests.loopback.wire import HERE, pipe
 
 SECONDS = 3.0
 SECOND_SENDER = ("127.0.0.1", 2)
@@ -101,7 +101,7 @@ class Sent(MavlinkSource):
     start = 0.0
 
     def __init__(self, params: HilParams, stream: PoseStream, seed: int = 0) -> None:
-        port = MemoryPort()
+        port, _ = pipe()
         super().__init__(
             Link(port, roster=Roster(parties(params, True, False))),
             params.source.senders,

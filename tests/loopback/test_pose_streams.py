@@ -51,3 +51,11 @@ def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
     hovers = "ready" in [state for state, _ in states]
     assert hovers == (not stream.says), states
     assert not stream.says or any(waits for _, waits in states), "a run that waits says for what"
+
+
+def test_the_check_fails_where_a_run_would_wait_for_the_autopilot(monkeypatch, capsys):
+    sent = Sent(loaded(), STREAMS["100 Hz"])
+    monkeypatch.setattr("hil.check.open_source", lambda *args: (sent, sent.links[0], True))
+    words = [word for setting in (*SETTINGS, "backend=ardupilot") for word in ("--set", setting)]
+    assert main(["hil", "check", "--seconds", f"{SECONDS - 0.1}", *words]) == 1
+    assert "FAIL  autopilot not ready (no heartbeat)" in capsys.readouterr().out

@@ -133,7 +133,7 @@ def main() -> None:
     strangers = None
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        strangers = Strangers(options["hostname"])
+        strangers = Strangers(options["hostname"]) if ":" not in options["hostname"] else None
 
     def put(value: Any) -> None:
         out.write(json.dumps(value) + "\n")

@@ -1,6 +1,7 @@
 """Opens the source that a config names."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,8 @@ def open_mocap(
     """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this
     machine without the config's leave.
     """
-    check_device(f"tcp:{params.host}:1", remote=remote)
+    device = check_device(f"tcp:{params.host}:1", remote=remote)
+    params = replace(params, host=device.host)
     return {"natnet": NatNetSource, "ros2": Ros2Source}.get(params.system, MotionCaptureSource)(
         params, bodies, clock, link, tell=tell
     )
