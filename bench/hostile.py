@@ -136,6 +136,7 @@ class MotionCapture:
         self.source._names = {name: body for body, name in NUMBERS.items()}
         self.source._ready = SimpleNamespace(is_set=lambda: False, set=lambda: None)
         self.source._module, self._system = ended, Silent()
+        self.source._process, self.source._heard = None, math.inf
 
     def _flush(self) -> None:
         listen(

@@ -6,7 +6,7 @@ import socket
 import struct
 import threading
 
-SERVER_INFO, FRAME = 1, 7
+SERVER_INFO, MODELS, FRAME = 1, 5, 7
 
 
 def message(kind: int, payload: bytes) -> bytes:
@@ -18,6 +18,15 @@ def server_info() -> bytes:
     """Return the answer to the handshake: Motive 3.1, NatNet 3.1."""
     ports = struct.pack("<QHB4B", 10**7, 1511, 0, 0, 0, 0, 0)
     return message(SERVER_INFO, b"Motive".ljust(256, b"\0") + bytes([3, 1, 0, 0] * 2) + ports)
+
+
+def models(names: dict[int, str]) -> bytes:
+    """Return the rigid bodies' definitions, without markers, by streaming id."""
+    rows = b"".join(
+        struct.pack("<I", 1) + name.encode() + b"\0" + struct.pack("<II3fI", number, 0, 0, 0, 0, 0)
+        for number, name in names.items()
+    )
+    return message(MODELS, struct.pack("<I", len(names)) + rows)
 
 
 def frame(stamp: float, *bodies: tuple[int, tuple, tuple, bool]) -> bytes:
@@ -40,23 +49,30 @@ class Motive:
     def __init__(self, host: str = "127.0.0.1") -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((host, 1510))
+        self._socket.settimeout(0.1)
         self.client: tuple[str, int] | None = None
-        threading.Thread(target=self._answer, daemon=True).start()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread.start()
 
     def _answer(self) -> None:
-        while True:
+        while not self._closed.is_set():
             try:
                 data, sender = self._socket.recvfrom(2048)
-            except OSError:
-                return
+            except TimeoutError:
+                continue
             if data[:2] == b"\0\0":
                 self._socket.sendto(server_info(), sender)
                 self.client = sender
+            elif data[:2] == b"\4\0":
+                self._socket.sendto(models({7: "quad", 8: "ball"}), sender)
 
-    def send(self, data: bytes) -> None:
-        """Send a datagram."""
-        self._socket.sendto(data, self.client)
+    def send(self, data: bytes, to: tuple[str, int] | None = None) -> None:
+        """Send a datagram, to the client where no address is given."""
+        self._socket.sendto(data, to or self.client)
 
     def close(self) -> None:
         """Stop."""
+        self._closed.set()
+        self._thread.join()
         self._socket.close()

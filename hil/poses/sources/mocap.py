@@ -10,6 +10,7 @@ Vicon and Qualisys z up, OptiTrack y up; quaternions are xyzw."""
 import functools
 import importlib.util
 import json
+import math
 import socket
 import struct
 import subprocess
@@ -37,6 +38,7 @@ MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dro
 HEADER = struct.Struct("<HH")  # of NatNet's datagrams: message and length of what follows
 SERVER_INFO, FRAME, OTHERS = 1, 7, (1, 3, 5, 8, 100)  # messages; those that are passed over
 AGAIN = 1.0  # after which a capture that has ended is started again, on the ground [s]
+QUIET = 5.0  # without a frame, after which it is started again on the ground: it may hang [s]
 ENDING = 2.0  # that threads and processes are given to end [s]
 
 
@@ -145,6 +147,7 @@ class MotionCaptureSource(MocapSource):
             load_extra("motioncapture", "motioncapture", "this source", SourceError)
         self._stop, self._ready = threading.Event(), threading.Event()
         self._process: subprocess.Popen | None = None
+        self._heard, self._said = math.inf, ""
         self._thread = threading.Thread(
             target=self._keep_listening, name="motioncapture", daemon=True
         )
@@ -168,10 +171,23 @@ class MotionCaptureSource(MocapSource):
             self._ready.set()
             if first or stopping:
                 return
-            self._tell(f"motion capture stopped: {self.failure}; it is started again on the ground")
+            self._say(f"motion capture stopped: {self.failure}; it is started again on the ground")
             self._stop.wait(AGAIN)
             while self.roster.flying and not self._stop.wait(0.1):
                 pass
+
+    def _say(self, text: str) -> None:
+        """Say a line, once where nothing else was said since."""
+        if text != self._said:
+            self._said = text
+            self._tell(text)
+
+    def poll(self, now: float) -> list[Pose]:
+        quiet = time.monotonic() - self._heard > QUIET and not self.roster.flying
+        if quiet and self._process is not None:
+            self._heard = math.inf
+            self._process.kill()
+        return super().poll(now)
 
     def _listen_here(self) -> None:
         p, stopped = self._params, self._stop.is_set
@@ -198,12 +214,14 @@ class MotionCaptureSource(MocapSource):
                 text=True,
             ) as process,
         ):
-            self._process = process
+            self._process, self._heard = process, time.monotonic()
             for line in process.stdout:
                 self._take(json.loads(line))
             status = process.wait()
             words.seek(0)
             said = words.read().strip().splitlines()
+        if self._heard == math.inf:
+            raise SourceError(f"no frame for {QUIET:g} s")
         raise SourceError(said[-1] if said and status > 0 else f"its process ended with {status}")
 
     def _take(self, value: Any) -> None:
@@ -211,7 +229,7 @@ class MotionCaptureSource(MocapSource):
         arrival, host = self._clock(), (self._params.host, 0)
         if value is None:
             if self._ready.is_set():
-                self._tell("motion capture is connected again")
+                self._say("motion capture is connected again")
             self.failure = None
             self._ready.set()
         elif isinstance(value, str):
@@ -219,6 +237,7 @@ class MotionCaptureSource(MocapSource):
         elif isinstance(value, int):
             self.roster.drop(("others", 0), "datagram", f"source.mocap.host is {host[0]}", value)
         else:
+            self._heard = time.monotonic()
             for name, (*pos, x, y, z, w) in value.items():
                 self.hand_over(Pose(arrival, arrival, self._names[name], tuple(pos), (x, y, z, w)))
 
