@@ -6,6 +6,7 @@ Tiny networks and batches.
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -338,16 +339,21 @@ def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, capsys):
 
 
 def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
-    folder = tmp_path / "run"
     changes = [
-        f"--set={change}"
-        for change in ("ppo.environments=32", 'flown=["task.noise.observation_step=0.0"]')
+        "ppo.environments=32",
+        "ppo.products=float32",
+        "task.noise.observation_step=0.04",
+        'flown=["task.noise.observation_step=0.0"]',
     ]
-    words = ["train", "state", "--iterations", "1", "--device", "cpu", "--out", str(folder)]
-    assert cli.main([*words, *changes, "--json", str(tmp_path / "figures.json")]) == 0
+    words = ["train", "state", "--from", "state", "--iterations", "1", "--device", "cpu"]
+    for change in changes:
+        words += ["--set", change]
+    figures = tmp_path / "figures.json"
+    assert cli.main([*words, "--out", str(tmp_path / "run"), "--json", str(figures)]) == 0
     printed = capsys.readouterr().out
     assert "under the faults of its training:" in printed
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    flown, trained = figures["throws"], figures["throws_under_faults"]
-    assert [row["throws"] for row in flown] == [5 * trainer.EVALUATED] * 3
-    assert flown != trained, "the conditions must differ"
+    assert re.search(r"target 2\.0 m: error 0\.\d+ \[0\.\d+, 0\.\d+\] m", printed)
+    written = json.loads(figures.read_text())
+    flown, trained = written["throws"][1], written["throws_under_faults"][1]
+    assert flown["throws"] == 5 * trainer.EVALUATED
+    assert flown["error_mean"] < 0.04 < trained["error_mean"], "four times the noise must show"
