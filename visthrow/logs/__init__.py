@@ -13,7 +13,7 @@ from visthrow.logs.mapping import TableMap
 BLACKBOX = (".bbl", ".bfl", ".bf")
 """Of Betaflight; the last is that of its software in the loop."""
 AUTOPILOTS = (".ulg", ".bin", ".tlog")
-TABLES = (".csv", ".csv.gz", ".csv.xz", ".txt", ".parquet")
+TABLES = (".csv", ".csv.gz", ".csv.xz", ".tsv", ".txt", ".parquet")
 SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
 """What says itself what it holds: no mapping is used for it."""
 RUN_LOG = "flight.npz"

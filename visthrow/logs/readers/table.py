@@ -10,15 +10,19 @@ import lzma
 import math
 import re
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
-from visthrow.common.storage import counted, require_room, unpack
+from visthrow.common.storage import require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
+from visthrow.logs.readers.layout import is_number, layout_of
 from visthrow.logs.units import to_si
 
 Table = dict[str, np.ndarray]
@@ -31,40 +35,51 @@ _EXPORTED = re.compile(
 _LARGEST = (
     1e100  # no number of a flight is as large, in whatever unit; its square is still a number
 )
-_SNIFFED = 65536  # characters in which separators are looked for
-_COMMA = re.compile(r"\d,\d")
 _WORDS = {"True": 1.0, "False": 0.0}
 _LIST = re.compile(r"[\[(].*[\])]")
 _PARTS = re.compile(r"[,;\s]+")
 _OPENERS = {".gz": gzip.open, ".xz": lzma.open}
 
 
-def read_table(path: str | Path) -> Table:
+class Columns(dict[str, np.ndarray]):
+    """Columns of a table by name, and what the file says beside them.
+
+    Attributes:
+        left_out: Parts of the file that are not among the columns, and why.
+        settings: Settings above the numbers, such as a motion capture's.
+    """
+
+    def __init__(self, columns: Mapping[str, np.ndarray] = MappingProxyType({})) -> None:
+        """Hold columns."""
+        super().__init__(columns)
+        self.left_out: list[str] = []
+        self.settings: dict[str, str] = {}
+
+
+def read_table(path: str | Path) -> Columns:
     """Read a table.
 
     Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma,
-    lists stand in a cell (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); without a header line
-    columns are called ``column 1`` and so on. Raises LogError: it cannot be read, has no rows, or a
-    row has another number of cells than the header.
+    lists stand in a cell (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); several lines may name
+    the columns (:mod:`visthrow.logs.readers.layout`), and without any they are called ``column 1``
+    and so on. Frames of a known rate get a column ``time [s]``. Raises LogError: it cannot be read,
+    has no rows, or a row has another number of cells than the header.
 
     Args:
-        path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.txt`` or ``.parquet``.
+        path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.tsv``, ``.txt`` or ``.parquet``.
     """
     path = Path(path)
     try:
         if path.suffix == ".parquet":
-            return _parquet(path)
+            return Columns(_parquet(path))
         packed = _OPENERS.get(path.suffix)
         data = unpack(path, packed, LogError) if packed else path.read_bytes()
-        comma, rows = _rows(data.decode("utf-8-sig"), str(path))
+        layout = layout_of(data.decode("utf-8-sig"), str(path))
     except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
         raise LogError(
             f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
         ) from error
-    header = [name.strip() for name in rows[0][1]] if rows else []
-    body = rows[1:]
-    if header and all(_is_number(cell, comma) for cell in header):
-        header, body = [f"column {i}" for i in range(1, len(header) + 1)], rows
+    header, body = layout.names, layout.rows
     if len(header) < 2:
         raise LogError(f"{path}: no header line with the columns' names; expected a CSV table")
     if body and len(body[-1][1]) < len(header):  # cut short while it was written
@@ -79,32 +94,21 @@ def read_table(path: str | Path) -> Table:
     twice = {name for name in header if header.count(name) > 1}
     if twice:
         raise LogError(f"{path}: column '{min(twice)}' stands twice in the header")
-    table: Table = {}
+    table = Columns()
     for name, cells in zip(header, zip(*(row for _, row in body))):
-        table |= _lists(name, cells) or {name: _column(cells, comma)}
+        if any(cells):  # a column that is blank throughout is a separator's
+            table |= _lists(name, cells) or {name: _column(cells, layout.comma)}
+    table.settings = layout.settings
+    _add_time(table, layout.rate)
     return table
 
 
-def _rows(text: str, name: str) -> tuple[bool, list[tuple[int, list[str]]]]:
-    """Return whether decimals have a comma, and each line that is not empty with its number."""
-    head = [line for line in text[:_SNIFFED].splitlines()[:20] if line.strip()] or [""]
-    mark = next((m for m in ";\t," if m in head[0]), " ")
-    comma = (
-        mark in ";\t"
-        and any(map(_COMMA.search, head[1:]))
-        and not any("." in line for line in head[1:])
-    )
-    lines = counted(io.StringIO(text, newline=""), len(text), name)
-    reader = csv.reader(lines, delimiter=mark, skipinitialspace=mark == " ")
-    return comma, [(reader.line_num, row) for row in reader if row]
-
-
-def _is_number(cell: str, comma: bool = False) -> bool:
-    try:
-        float(cell.replace(",", ".") if comma else cell)
-    except ValueError:
-        return False
-    return True
+def _add_time(table: Columns, rate: float) -> None:
+    """Stamps of frames that count at a known rate, where no column is called a time, in place."""
+    frames = next((table[name] for name in table if name.lower().startswith("frame")), None)
+    timed = any(name.lower().startswith("time") for name in table)
+    if rate > 0.0 and frames is not None and not timed and frames.dtype.kind == "f":
+        table["time [s]"] = (frames - frames[0]) / rate
 
 
 def _lists(name: str, cells: tuple[str, ...]) -> Table:
@@ -113,7 +117,7 @@ def _lists(name: str, cells: tuple[str, ...]) -> Table:
     if not _LIST.fullmatch(first):
         return {}
     rows = [
-        [float(part) if _is_number(part) else math.nan for part in _PARTS.split(c.strip("[]() \t"))]
+        [float(part) if is_number(part) else math.nan for part in _PARTS.split(c.strip("[]() \t"))]
         for c in cells
     ]
     width = max(map(len, rows))
@@ -186,7 +190,7 @@ def _numbers(table: Table, name: str, source: str) -> np.ndarray:
         row, cell = next(
             (i, c)
             for i, c in enumerate(table[name].tolist(), start=1)
-            if c.strip() and not _is_number(c)
+            if c.strip() and not is_number(c)
         )
         raise LogError(
             f"{source}: column '{name}' holds text such as '{cell}' in row {row}; expected numbers"
@@ -241,7 +245,8 @@ def _log(
     table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, source: str
 ) -> FlightLog:
     count = len(next(iter(table.values()))[rows])
-    meta = {"source": source, "part": label, "rows": count, "ingest": {}}
+    meta: dict[str, Any] = {"source": source, "part": label, "rows": count, "ingest": {}}
+    meta["left_out"] = list(getattr(table, "left_out", ()))
     channels = {}
     for entry in mapping.channels:
         clock = mapping.clocks[entry.clock] if entry.clock and mapping.clocks else mapping.time
@@ -283,15 +288,7 @@ def make_channel(
     """
     spec = STANDARD_CHANNELS.get(entry.name)
     unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
-    rows = np.flatnonzero(np.isfinite(time))
-    steps = np.diff(time[rows])
-    notes = {
-        "rows": len(time),
-        "unstamped": len(time) - len(rows),
-        "repeated": int(np.sum(steps == 0.0)),
-        "backwards": int(np.sum(steps < 0.0)),
-    }
-    rows = rows[_forward(time[rows])]
+    rows, notes = _stamped(time)
     blank = np.all(np.isnan(values[rows]), axis=1)  # such a row is of another channel
     notes["blank"] = int(np.sum(blank))
     time, values = time[rows[~blank]], values[rows[~blank]]
@@ -325,6 +322,19 @@ def _changed(values: np.ndarray) -> np.ndarray:
     """Tell the rows that differ from the row before, bool, shape (T,); the first one does."""
     same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
     return np.append(True, ~np.all(same, axis=1))
+
+
+def _stamped(time: np.ndarray) -> tuple[np.ndarray, dict]:
+    """Rows that leave a clock going on, by number, and how many others there are."""
+    rows = np.flatnonzero(np.isfinite(time))
+    steps = np.diff(time[rows])
+    notes = {
+        "rows": len(time),
+        "unstamped": len(time) - len(rows),
+        "repeated": int(np.sum(steps == 0.0)),
+        "backwards": int(np.sum(steps < 0.0)),
+    }
+    return rows[_forward(time[rows])], notes
 
 
 def _forward(time: np.ndarray) -> np.ndarray:

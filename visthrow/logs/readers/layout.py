@@ -1,0 +1,258 @@
+"""Layout of a text table: which lines hold numbers, what its columns are called, in which units.
+
+Tables of motion capture carry several lines above their numbers: settings, the name of a body, what
+is measured of it, its unit. A table's numbers begin where rows of one width, mostly of numbers,
+begin; lines of that width above them name the columns, the others are settings.
+
+Source: exports of OptiTrack Motive 1.2x and 3 (CSV), Vicon Nexus and Tracker (CSV), Qualisys Track
+Manager (TSV, 3D and 6D); trajectories of TUM (blank-separated) and EuRoC."""
+
+import csv
+import io
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+
+from visthrow.common.storage import counted
+
+MARKS = (",", ";", "\t", " ")
+SAMPLED = 60  # lines of numbers by which the separator is told
+_UNIT_WORDS = {
+    "meters": "m",
+    "metres": "m",
+    "millimeters": "mm",
+    "centimeters": "cm",
+    "seconds": "s",
+    "degrees": "deg",
+    "radians": "rad",
+    "sec": "s",
+    "hz": "Hz",
+    "mm/s^2": "mm/s^2",
+    "m/s²": "m/s^2",
+    "m/s2": "m/s^2",
+    "mm/s²": "mm/s^2",
+    "rad/s": "rad/s",
+    "deg/s": "deg/s",
+    "°": "deg",
+    "": "",
+    "-": "",
+    "1": "1",
+}
+_UNITS = {"m", "mm", "cm", "s", "ms", "us", "ns", "deg", "rad", "g", "n", "v", "a", "m/s", "mm/s"}
+_UNITS |= {"rpm", "pwm", "%", "count", "frames", "quaternion", "m s^-1", "ft", "in"}
+_NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
+_WORDS = ("true", "false")
+_FRAME = re.compile(r"sub ?frame|frame( ?(number|no\.?|#))?|time.*|timestamp.*", re.I)
+_IDS = re.compile(r"\d+|[0-9a-f]{32}", re.I)
+RATES = ("FREQUENCY", "Export Frame Rate", "Capture Frame Rate", "Frame Rate")
+UNIT_OF_LENGTH = "Length Units"
+
+
+@dataclass
+class Layout:
+    """A text table, its cells still text."""
+
+    names: list[str]  # of the columns, with their unit in brackets where it is known
+    rows: list[tuple[int, list[str]]]  # number of the line, and its cells
+    comma: bool  # whether decimals are written with a comma
+    settings: dict[str, str] = field(default_factory=dict)  # of the lines above
+    rate: float = 0.0  # of the frames, where the table says it [Hz]
+
+
+def is_number(cell: str) -> bool:
+    """Tell whether a cell holds a number, with a point or a comma."""
+    return bool(_NUMBER.fullmatch(cell.strip()))
+
+
+def unit_of(word: str) -> str | None:
+    """Our spelling of a unit, "" for what has none; None for a word that is no unit."""
+    word = word.strip().strip("[]()").strip().lower()
+    if word in _UNIT_WORDS:
+        return _UNIT_WORDS[word]
+    return word if word in _UNITS else None
+
+
+def layout_of(text: str, name: str = "") -> Layout:
+    """Lay out a text table that messages call by a name; without a line of numbers its rows are
+    empty.
+    """
+    lines = text.splitlines()
+    mark = _separator(lines)
+    blank = mark == " "
+    counted_lines = counted(io.StringIO(text, newline=""), len(text), name)
+    reader = csv.reader(counted_lines, delimiter=mark, skipinitialspace=blank)
+    rows, empty_before = [], []
+    last = 0
+    for cells in reader:
+        cells = [cell.strip() for cell in cells]
+        if blank and cells and cells[-1] == "":
+            cells.pop()
+        if any(cells):
+            empty_before.append(reader.line_num > last + 1)
+            rows.append((reader.line_num, cells))
+            last = reader.line_num
+    widths = Counter(len(cells) for _, cells in rows[-1000:] if _holds_numbers(cells))
+    if not widths:
+        return Layout(rows[0][1] if rows else [], [], False)
+    width = widths.most_common(1)[0][0]
+    good = [_holds_numbers(cells) for _, cells in rows]
+    fits = [len(cells) == width and of for (_, cells), of in zip(rows, good)]
+    # identifiers above the numbers are numbers too: three lines of them, or all that there are
+    start = next(
+        (i for i in range(len(rows)) if fits[i] and all(good[i : i + 3])), fits.index(True)
+    )
+    head, body = rows[:start], rows[start:]
+    cut = max((i + 1 for i in range(len(head)) if empty_before[i + 1]), default=0)
+    if cut == len(head):
+        cut = 0  # the empty line stands between the names and the numbers
+    named, settings, rate = _sorted_head(head, cut, width)
+    if (
+        len(body) > 1
+        and all(cells[-1] == "" for _, cells in body)
+        and width > len(named[-1] if named else [])
+    ):
+        body = [(line, cells[:-1]) for line, cells in body]  # each line ends with a separator
+        width -= 1
+    names = _names(named, width, settings)
+    return Layout(names, body, _commas(mark, body), settings, rate)
+
+
+def _separator(lines: list[str]) -> str:
+    """The mark that cuts most lines into the same number of cells, most of them numbers."""
+    sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
+    best, found = 0.0, ","
+    for mark in MARKS:
+        cells = [next(csv.reader([line.strip()], delimiter=mark)) for line in sample]
+        if mark == " ":
+            cells = [[cell for cell in row if cell] for row in cells]
+        width, count = Counter(map(len, cells)).most_common(1)[0] if cells else (0, 0)
+        if width < 2:
+            continue
+        whole = [cell for row in cells if len(row) == width for cell in row if cell.strip()]
+        numbers = sum(map(is_number, whole)) / max(len(whole), 1)
+        score = numbers * count / len(cells) + 1e-3 * (mark == ";")
+        if score > best + 1e-6:
+            best, found = score, mark
+    return found
+
+
+def _holds_numbers(cells: list[str]) -> bool:
+    """Whether at least half of a line's cells that hold something are numbers, or lists of them."""
+    filled = [cell for cell in cells if cell]
+    good = sum(
+        is_number(cell) or cell.lower() in _WORDS or (cell[:1] in "[(" and cell[-1:] in "])")
+        for cell in filled
+    )
+    return 2 * good >= len(filled) > 0 and any(
+        map(is_number, (c.strip("[]() ") or c for c in filled[:3]))
+    )
+
+
+def _commas(mark: str, body: list[tuple[int, list[str]]]) -> bool:
+    cells = [cell for _, row in body[:SAMPLED] for cell in row]
+    return (
+        mark != ","
+        and any("," in c and is_number(c) for c in cells)
+        and not any("." in c and is_number(c) for c in cells)
+    )
+
+
+def _sorted_head(
+    head: list[tuple[int, list[str]]], cut: int, width: int
+) -> tuple[list[list[str]], dict[str, str], float]:
+    """Lines above the numbers: those that name columns, the settings, and the rate."""
+    named, settings, rate = [], {}, 0.0
+    for i, (_, cells) in enumerate(head):
+        if cells[0].startswith(("#", "%")):
+            cells = [cells[0].lstrip("#% "), *cells[1:]]
+            cells = cells[1:] if not cells[0] and len(cells) > width else cells
+        filled = [cell for cell in cells if cell]
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        if len(filled) == 1 and is_number(filled[0]):
+            rate = float(filled[0])
+        elif i >= cut and len(cells) <= width and (len(filled) > width / 2 or not cells[0]):
+            named.append(cells + [""] * (width - len(cells)))
+        else:
+            settings |= dict(zip(cells[::2], cells[1::2]))
+            settings.setdefault(cells[0], "\t".join(cells[1:]))
+    for key in RATES:
+        if not rate and is_number(settings.get(key, "")):
+            rate = float(settings[key])
+    return named, settings, rate
+
+
+def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list[str]:
+    """Names of columns, of all lines that name them, unlike each other."""
+    if not named:
+        return _marker_names(width, settings) or [f"column {i}" for i in range(1, width + 1)]
+    units = [""] * width
+    parts: list[list[str]] = [[] for _ in range(width)]
+    for row in named:
+        filled = [cell for cell in row if cell]
+        if len(named) > 1 and filled and all(unit_of(cell) is not None for cell in filled):
+            units = [unit_of(cell) or "" for cell in row]
+            continue
+        if row[1:2] == ["Type"] or (len(filled) > 1 and all(_IDS.fullmatch(c) for c in filled[1:])):
+            continue
+        last = ""
+        for i, cell in enumerate(row):
+            # a body's name stands above the first of its columns alone
+            last = cell or ("" if row[0] else last)
+            if last and last not in parts[i]:
+                parts[i].append(last)
+    names = []
+    final = next(
+        (r for r in reversed(named) if not all(unit_of(c) is not None for c in r if c)), named[-1]
+    )
+    for i, of in enumerate(parts):
+        own = final[i]
+        name = own if _FRAME.fullmatch(own) or i == 0 else ".".join(of)
+        names.append(
+            _joined(name.replace(":", ".") if len(named) > 1 else name, own, units[i], settings)
+        )
+    return _prefixed(names) if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings else names
+
+
+def _joined(name: str, own: str, unit: str, settings: dict[str, str]) -> str:
+    """A name with its unit; a subject that bears the name of its body is named once."""
+    parts = name.split(".")
+    name = ".".join(p for i, p in enumerate(parts) if i == 0 or p != parts[i - 1])
+    if not unit and UNIT_OF_LENGTH in settings and "Position" in parts:
+        unit = unit_of(settings[UNIT_OF_LENGTH]) or ""
+    if (
+        not unit
+        and "Rotation" in parts
+        and settings.get("Rotation Type", "Quaternion") != "Quaternion"
+    ):
+        unit = "deg"
+    return f"{name} [{unit}]" if unit else name
+
+
+def _prefixed(names: list[str]) -> list[str]:
+    """Qualisys' columns: the body's name stands before its first, and its lengths are in mm."""
+    found, body = [], ""
+    for name in names:
+        head, _, tail = name.rpartition(" ")
+        if head and tail in ("X", "Y", "Z"):
+            body, name = head, tail
+        if body and not _FRAME.fullmatch(name):
+            unit = (
+                "mm"
+                if name in ("X", "Y", "Z")
+                else "deg"
+                if name in ("Roll", "Pitch", "Yaw")
+                else ""
+            )
+            name = f"{body}.{name}" + (f" [{unit}]" if unit else "")
+        found.append(name)
+    return found
+
+
+def _marker_names(width: int, settings: dict[str, str]) -> list[str]:
+    """Qualisys' 3D export may have no line of names, but the markers' names above it."""
+    markers = [word for word in settings.get("MARKER_NAMES", "").split("\t") if word]
+    before = ["Frame", "Time"][: width - 3 * len(markers)] if markers else []
+    if not markers or len(before) + 3 * len(markers) != width:
+        return []
+    return before + [f"{marker}.{axis} [mm]" for marker in markers for axis in "XYZ"]
