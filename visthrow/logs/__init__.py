@@ -18,6 +18,8 @@ SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
 """What says itself what it holds: no mapping is used for it."""
 RUN_LOG = "flight.npz"
 """In the folder of a run of ``visthrow hil``: its flight log."""
+BAG = "metadata.yaml"
+"""In the folder of a ROS 2 bag."""
 
 
 def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
@@ -32,7 +34,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
     """
     path, ending = Path(path), Path(path).suffix.lower()
-    if path.is_dir():
+    if path.is_dir() and not (path / BAG).is_file():
         return _of_folder(path)
     if not path.exists():
         return _named(path, mapping)
@@ -62,7 +64,10 @@ def takes_mapping(path: str | Path) -> bool:
     """
     parts = [str(path)] if Path(path).exists() else str(path).split("+")
     files = [Path(part if Path(part).exists() else part.rpartition(":")[0]) for part in parts]
-    return any(not file.is_dir() and file.suffix.lower() not in SELF_DESCRIBING for file in files)
+    return any(
+        (file / BAG).is_file() if file.is_dir() else file.suffix.lower() not in SELF_DESCRIBING
+        for file in files
+    )
 
 
 def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
@@ -119,17 +124,24 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
     from visthrow.logs.readers import recordings, table
 
     path, ending = Path(path), Path(path).suffix.lower()
-    if ending not in SELF_DESCRIBING and not path.is_file():
+    bag = (path / BAG).is_file()
+    if ending not in SELF_DESCRIBING and not path.is_file() and not bag:
         raise _missing(path)
     if path.name.lower().endswith(TABLES):
         return table.read_table(path)
-    if ending in recordings.READERS or (ending not in SELF_DESCRIBING and recordings.is_card(path)):
+    if (
+        bag
+        or ending in recordings.READERS
+        or (ending not in SELF_DESCRIBING and recordings.is_card(path))
+    ):
         return recordings.read_recording(path)
-    of_tables = ", ".join((*TABLES, *recordings.READERS))
-    raise LogError(
-        f"{path}: ending '{path.suffix}'; a mapping is for {of_tables};"
-        f" {', '.join(SELF_DESCRIBING)} say what they hold"
-    )
+    if ending in SELF_DESCRIBING:
+        raise LogError(
+            f"{path}: says itself what it holds and needs no mapping; look at it with: visthrow"
+            f" diagnose check {path}"
+        )
+    of_tables = ", ".join((*TABLES, *recordings.READERS, *SELF_DESCRIBING))
+    raise LogError(f"{path}: ending '{path.suffix}'; expected one of {of_tables}")
 
 
 def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:

@@ -13,6 +13,7 @@ import io
 import json
 import math
 import struct
+import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,21 +24,24 @@ import numpy as np
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import require_room
-from visthrow.logs.readers.table import Table
+from visthrow.logs.readers.table import Columns, Table
 
-# a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal
-WIDEST = 32
+# a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal;
+# a list of messages may hold a state of tens of numbers
+WIDEST = 64
 _CARD = 0xBC
 _CARD_TYPES = set("BbHhIiQqfdeL?")
 
 
 def read_recording(path: Path) -> Table:
-    """Read all columns of numbers from a file of one of :data:`READERS`, or of the Crazyflie's
-    card.
+    """Read all columns of numbers from a file of one of :data:`READERS`, the folder of a ROS 2 bag,
+    or of the Crazyflie's card.
 
     Raises LogError: a package is missing, or the file cannot be read or holds no numbers.
     """
     reader, what = READERS.get(path.suffix.lower(), (_card, "a recording"))
+    if path.is_dir():
+        reader, what = _bag, "a folder of a ROS 2 bag"
     try:
         table = reader(path)
     except LogError:
@@ -180,23 +184,19 @@ def _bag(path: Path) -> Table:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    def messages() -> Iterator[tuple[str, float, Any]]:
-        folder = (
-            path
-            if path.suffix == ".bag" or path.is_dir()
-            else path.parent
-            if (path.parent / "metadata.yaml").exists()
-            else path
-        )
-        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            for connection, stamp, raw in reader.messages():
-                yield (
-                    connection.topic.strip("/"),
-                    stamp * 1e-9,
-                    reader.deserialize(raw, connection.msgtype),
-                )
-
-    return _topics(messages())
+    folder = path.parent if (path.parent / "metadata.yaml").exists() else path
+    topics = Topics()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([path if path.is_dir() else folder], default_typestore=store) as reader:
+        for connection, stamp, raw in reader.messages():
+            topics.add(
+                connection.topic,
+                f"{connection.topic} ({connection.msgtype})",
+                1e-9 * stamp,
+                raw,
+                lambda raw, kind=connection.msgtype: reader.deserialize(raw, kind),
+            )
+    return topics.table()
 
 
 def _mcap(path: Path) -> Table:
@@ -206,34 +206,70 @@ def _mcap(path: Path) -> Table:
     summary = reader.get_summary()
     chunks = summary.chunk_indexes if summary is not None else []
     require_room(path, sum(chunk.uncompressed_size for chunk in chunks), LogError)
-
-    def messages() -> Iterator[tuple[str, float, Any]]:
-        for _, channel, message in reader.iter_messages():
-            if channel.message_encoding == "json":
-                yield channel.topic.strip("/"), message.log_time * 1e-9, json.loads(message.data)
-
-    table = _topics(messages())
-    return table or _bag(path)
-
-
-def _topics(messages: Iterator[tuple[str, float, Any]]) -> Table:
-    """A table a topic; a field that is missing in some messages is blank there."""
-    rows: dict[str, list[dict[str, float]]] = {}
-    for topic, arrival, message in messages:
-        row = dict(_numbers(message, ""))
-        stamp = next(
-            (at for head in ("header.stamp", "stamp", "timestamp") if (at := _stamp(row, head))),
-            0.0,
-        )
-        rows.setdefault(topic, []).append({"time": stamp or arrival, "arrival": arrival} | row)
-    start = min((row["time"] for of in rows.values() for row in of), default=0.0)
-    table: Table = {}
-    for topic, of in rows.items():
-        names = list(dict.fromkeys(name for row in of for name in row))
-        for name in names:
-            values = np.array([row.get(name, np.nan) for row in of])
-            table[f"{topic}:{name}"] = values - start if name in ("time", "arrival") else values
+    topics, encodings = Topics(), set()
+    for _, channel, message in reader.iter_messages():
+        encodings.add(channel.message_encoding)
+        if channel.message_encoding not in ("cdr", "ros1"):
+            label = f"{channel.topic} ({channel.message_encoding})"
+            decode = json.loads if channel.message_encoding == "json" else _undecodable
+            topics.add(channel.topic, label, 1e-9 * message.log_time, message.data, decode)
+    table = topics.table()
+    if not encodings or encodings & {"cdr", "ros1"}:
+        bag = _bag(path)
+        table |= bag
+        table.left_out += [part for part in bag.left_out if part.partition(" ")[0] not in encodings]
     return table
+
+
+def _undecodable(raw: bytes) -> Any:
+    raise ValueError("its encoding is not read")
+
+
+LARGEST_MESSAGE = 20_000
+"""A message of more bytes is a picture or a cloud of points, and no signal."""
+
+
+class Topics:
+    """Gathers numbers of messages, a table a topic; what cannot be read is named and left out."""
+
+    def __init__(self) -> None:
+        """Start without a topic."""
+        self._rows: dict[str, list[dict[str, float]]] = {}
+        self._left_out: dict[str, str] = {}
+
+    def add(
+        self, topic: str, label: str, arrival: float, raw: bytes, decode: Callable[[bytes], Any]
+    ) -> None:
+        """Add a message, which arrived at a time [s], by what makes an object of its bytes."""
+        topic = topic.strip("/").replace(":", ".")
+        if topic in self._left_out:
+            return
+        if len(raw) > LARGEST_MESSAGE:
+            self._left_out[topic] = f"{label}: messages of {len(raw)} bytes hold no signal"
+            return
+        try:
+            row = dict(_numbers(decode(raw), ""))
+        except Exception as error:  # readers of others raise what comes
+            self._left_out[topic] = f"{label}: cannot be decoded: {error!r}"[:200]
+            return
+        heads = ("header.stamp", "stamp", "timestamp")
+        stamp = next((at for head in heads if (at := _stamp(row, head))), 0.0)
+        row = {"time": stamp or arrival, "arrival": arrival} | row
+        self._rows.setdefault(topic, []).append(row)
+
+    def table(self) -> Columns:
+        """Columns of all topics; a field that is missing in some messages is blank there."""
+        start = min((row["time"] for of in self._rows.values() for row in of), default=0.0)
+        table = Columns()
+        for topic, of in self._rows.items():
+            for name in dict.fromkeys(name for row in of for name in row):
+                values = np.array([row.get(name, np.nan) for row in of])
+                clock = name in ("time", "arrival")
+                table[f"{topic}:{name}"] = values - start if clock else values
+        table.left_out = list(self._left_out.values())
+        if not table and self._left_out:
+            raise LogError("no topic of it can be read: " + "; ".join(self._left_out.values()))
+        return table
 
 
 def _stamp(row: dict[str, float], head: str) -> float:
@@ -261,7 +297,31 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
                 yield from _numbers(getattr(value, key), f"{name}.{key}" if name else key)
 
 
+def _c3d(path: Path) -> Table:
+    """Markers of a C3D file [m], a blank where one is hidden; frames count from its rate."""
+    c3d = load_extra("c3d", "recordings", f"{path}: a C3D file", LogError)
+    with path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reader = c3d.Reader(file)
+        labels = [label.strip() for label in reader.point_labels]
+        units = reader.get("POINT:UNITS")
+        unit = units.string_value.strip() if units is not None else "mm"
+        frames = [(number, points[:, :4].copy()) for number, points, _ in reader.read_frames()]
+    if not frames or not labels:
+        raise LogError(f"{path}: a C3D file without markers")
+    numbers = np.array([number for number, _ in frames], dtype=float)
+    points = np.array([of for _, of in frames])  # x, y, z, residual: below 0 where it is hidden
+    hidden = points[:, :, 3] < 0.0
+    table = Columns({"time [s]": (numbers - numbers[0]) / reader.point_rate})
+    for i, label in enumerate(labels):
+        for axis in range(3):
+            name = f"{label.replace(':', '.')}.{'XYZ'[axis]} [{unit}]"
+            table[name] = np.where(hidden[:, i], np.nan, points[:, i, axis])
+    return table
+
+
 READERS: dict[str, tuple[Callable[[Path], Table], str]] = {
+    ".c3d": (_c3d, "a C3D file"),
     ".mat": (_matlab, "a MATLAB file"),
     ".h5": (_hdf5, "an HDF5 file"),
     ".hdf5": (_hdf5, "an HDF5 file"),
