@@ -29,6 +29,7 @@ _VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
 BELONGS, FIRMLY, CLEARLY = 0.35, 0.7, 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN, _DELAY_BAD, _DELAY_KNOWN = 0.02, 0.05, 0.012  # between measurements of one motion [s]
+_UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
 # RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
@@ -134,9 +135,10 @@ def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
     (time_p, p), (time_v, v) = log[pos].samples(), log[vel].samples()
     if not (usable(time_p, p, 0.02) and usable(time_v, v, 0.0)):
         return []
-    return _compared(
-        relations.relate(*relations.derivative(time_p, p), time_v, v), f"d({pos})/dt", vel
-    )
+    found = relations.relate(*relations.derivative(time_p, p), time_v, v)
+    notes = [log.meta.get("ingest", {}).get(name, {}) for name in (pos, vel)]
+    message, other = (of.get("message") for of in notes)
+    return _compared(found, f"d({pos})/dt", vel, message is not None and message == other)
 
 
 def _rates(log: FlightLog, quat: str) -> list[Row]:
@@ -153,8 +155,10 @@ def _rates(log: FlightLog, quat: str) -> list[Row]:
     return _compared(relations.relate(*derived, *measured), f"rate of {quat}", "rate_b")
 
 
-def _compared(found: relations.Relation | None, first: str, second: str) -> list[Row]:
-    """Rows about a pair that should be one and the same motion."""
+def _compared(
+    found: relations.Relation | None, first: str, second: str, one_clock: bool = False
+) -> list[Row]:
+    """Rows about a pair that should be one and the same motion; ``one_clock``: of one message."""
     if found is None:
         return []
     both = f"{first}, {second}"
@@ -192,7 +196,7 @@ def _compared(found: relations.Relation | None, first: str, second: str) -> list
             f" {'noise dilutes it' if weak else hint}"
         )
         rows.append(Row("units", both, "warn" if weak else "bad", text, figures))
-    return [*rows, _late(found, both, figures)]
+    return [*rows, _late(found, both, figures, one_clock)]
 
 
 def _figures(found: relations.Relation) -> dict[str, float]:
@@ -218,8 +222,11 @@ def _kind(axes: str) -> str:
     return "a mirror image" if is_mirror(axes) else "axes exchanged or turned"
 
 
-def _late(found: relations.Relation, both: str, figures: dict) -> Row:
+def _late(found: relations.Relation, both: str, figures: dict, one_clock: bool) -> Row:
     """Report the delay of a second measurement of one motion, and its remedy."""
+    if found.delay_sd > _UNTOLD:
+        text = "how late the second is cannot be told: too slow, or too noisy"
+        return Row("delay", both, "ok", text, figures)
     text = (
         f"the second is {1e3 * found.delay:+.1f} ms behind the first (sd"
         f" {1e3 * found.delay_sd:.1f} ms)"
@@ -229,12 +236,15 @@ def _late(found: relations.Relation, both: str, figures: dict) -> Row:
         and found.delay_sd < 0.3 * abs(found.delay)
         and found.correlation > FIRMLY
     )
-    if far:
+    if far and one_clock:
+        text += ": both are of one message, so a filter makes it"
+    elif far:
         text += (
             f": streams on clocks apart; add {-found.delay:+.3f} s to the second's time (offset of"
             " its clock in the mapping)"
         )
-    verdict = "bad" if far else "warn" if abs(found.delay) > _DELAY_WARN else "ok"
+    late = abs(found.delay) > max(_DELAY_WARN, 2.0 * found.delay_sd)
+    verdict = "bad" if far and not one_clock else "warn" if late else "ok"
     return Row("delay", both, verdict, text, figures)
 
 
@@ -405,7 +415,7 @@ def _pushed(
             )
         )
     if sensed:
-        rows.append(_late(found, both, figures))
+        rows.append(_late(found, both, figures, False))
         if np.linalg.norm(off) > _OFFSET:
             text = (
                 f"the second is off by ({', '.join(f'{x:+.2f}' for x in off)}) m/s^2 in the mean:"

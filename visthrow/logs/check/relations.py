@@ -14,6 +14,15 @@ _NEAR = (
 )
 _LONGEST_GRID = 60_000  # samples; longer stretches are thinned
 
+BLOCKS = 16  # of a stretch, whose disagreement about a delay is its deviation
+_ROUNDS = 5  # of weighing blocks by their noise
+_WIDTH = 0.04  # half the width of the narrowest parabola that is laid through a peak [s]
+_NATS = 10.0  # of likelihood that a peak must have over its sides, so that noise does not make it
+# where the rest goes together by so much, a block that leaves so many times the middle one is of
+# something else, as a crash
+_TOGETHER, _TUMBLE = 0.7, 25.0
+_STUDENT = 2.131 / 1.960  # 95 % of Student's t of 15 degrees of freedom over the normal's
+
 INDEPENDENT = (
     0.1  # samples of a flight this far apart [s] count as independent where evidence is weighed
 )
@@ -76,33 +85,63 @@ def relate(
     if count < 50:
         return None
     grid = start + period * np.arange(count)
-    first = _centred(on_grid(time_a, a, grid))
     steps = int(reach / period)
+    found, follows = _related(time_a, a, time_b, b, grid, period, steps)
+    if found is not None and not np.all(follows):
+        found, _ = _related(time_a, a, time_b, b, grid[follows], period, steps)
+    return found
+
+
+def _related(
+    time_a: np.ndarray,
+    a: np.ndarray,
+    time_b: np.ndarray,
+    b: np.ndarray,
+    grid: np.ndarray,
+    period: float,
+    steps: int,
+) -> tuple[Relation | None, np.ndarray]:
+    """Relation at the times of a grid [s], and which of them go with the rest."""
+    values, count = on_grid(time_a, a, grid), len(grid)
+    first, usual_a = _centred(values), np.median(values, axis=0)
+    usual_b = np.median(on_grid(time_b, b, grid), axis=0)
+    values = values - usual_a
+    edges = np.linspace(0, count, BLOCKS, endpoint=False).astype(int)
+    sums = np.zeros((2, 2 * steps + 1, BLOCKS))
     cross, norms = np.zeros((a.shape[1], b.shape[1], 2 * steps + 1)), np.zeros(2 * steps + 1)
     power = float(np.sum(first**2))
     for lag in range(-steps, steps + 1):
-        second = _centred(on_grid(time_b, b, grid + lag * period))
+        moved = on_grid(time_b, b, grid + lag * period)
+        second = _centred(moved)
         cross[:, :, lag + steps] = first.T @ second
         norms[lag + steps] = np.sum(second**2)
+        moved = moved - usual_b
+        products = np.sum(values * moved, axis=1), np.sum(moved**2, axis=1)
+        sums[:, lag + steps] = np.add.reduceat(products, edges, axis=1)
     if power <= 0.0 or np.min(norms) <= 0.0:
-        return None
+        return None, np.ones(count, bool)
+    powers = np.add.reduceat(np.sum(values**2, axis=1), edges)
+    effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
+    narrowest = max(2, round(_WIDTH / period))
+    offset, sd, left, together = _delay(powers, *sums, narrowest, effective)
+    follows = np.ones(count, bool)
+    if together > _TOGETHER:
+        sizes = np.diff(np.append(edges, count))
+        follows = np.repeat(left < _TUMBLE * np.median(left), sizes)
     scale_of = np.sqrt(power * norms)
     own = np.trace(cross) / scale_of
     at = int(np.argmax(own))
-    offset, curve = peak(own, at)
     exchanges, matrices = (
         (EVERY, MATRICES) if a.shape[1] == 3 else (("x", "-x"), np.array([[[1.0]], [[-1.0]]]))
     )
     scores = np.einsum("kij,jil->kl", matrices, cross / scale_of)
     k, best_at = np.unravel_index(np.argmax(scores), scores.shape)
     best = float(scores[k, best_at])
-    effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
-    sd = period * np.sqrt(max(1.0 - own[at] ** 2, 1e-6) / effective / max(curve, 1e-9))
     plain, turned = (min(max(c, 0.0), 0.999) for c in (own[at], best))
     nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EVERY))
-    return Relation(
-        (at - steps + offset) * period,
-        float(sd),
+    found = Relation(
+        (offset - steps) * period,
+        min(sd, steps) * period,
         float(own[at]),
         float(np.trace(cross[:, :, at])) / power,
         exchanges[k],
@@ -110,6 +149,94 @@ def relate(
         float(best_at - steps) * period,
         float(nats),
     )
+    return found, follows
+
+
+def _delay(
+    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, half: int, independent: float
+) -> tuple[float, float, np.ndarray, float]:
+    """Lag at which the second signal follows the first best, and its standard deviation [steps].
+
+    Each block has a noise of its own: a tumble, after which nothing follows anything, weighs as
+    little as its noise is large. A parabola is laid through the peak of the correlation; how much
+    the blocks disagree about its slope is the deviation, whatever the noise is correlated with, as
+    long as a block lasts longer.
+
+    Args:
+        xx: Power of the first signal in each block, shape (K,).
+        xy: Its product with the second at each lag, shape (L, K).
+        yy: Power of the second, shape (L, K).
+        half: Half the width of the narrowest parabola [steps].
+        independent: Number of samples that count as independent.
+
+    Returns:
+        Lag, its deviation, what each block leaves, shape (K,), and the weighted correlation.
+    """
+    scale, floor = np.sum(xy, axis=1) / max(float(np.sum(xx)), 1e-300), 1e-6 * np.mean(yy)
+    for _ in range(_ROUNDS):
+        left = np.maximum(yy - 2.0 * scale[:, None] * xy + scale[:, None] ** 2 * xx, floor)
+        scale = np.sum(xy / left, axis=1) / np.maximum(np.sum(xx / left, axis=1), 1e-300)
+    likelihood = np.where(scale > 0.0, np.sum(-0.5 * np.log(left), axis=1), -np.inf)
+    at = int(np.argmax(likelihood))
+    together = _together(xx, xy[at], yy[at], left[at])
+    while 2 * half < len(likelihood):
+        # the middle of the window in which the second follows best: of a slow motion noise alone
+        # would make the peak of a narrow one
+        mean = np.convolve(likelihood, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
+        at = int(np.argmax(mean)) + half
+        inside = np.arange(max(at - half, 0), at + half + 1)
+        fits = np.polynomial.polynomial.polyfit(inside - at, np.hstack([xy, yy])[inside], 2)
+        vertex, sd = _vertex(xx, fits[:, : len(xx)], fits[:, len(xx) :], floor, half, independent)
+        if np.isfinite(sd):
+            return at + vertex, sd, left[at], together
+        half *= 2
+    return float(at), np.inf, left[at], together
+
+
+def _together(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, left: np.ndarray) -> float:
+    """Correlation in which each block weighs by its noise."""
+    both, first, second = (float(np.sum(of / left)) for of in (xy, xx, yy))
+    return both / max(np.sqrt(first * second), 1e-300)
+
+
+def _vertex(
+    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, floor: float, half: int, independent: float
+) -> tuple[float, float]:
+    """Peak of a correlation of which each block has parabolas, and its deviation [steps]; infinite
+    where noise alone may make such a peak.
+
+    The peak is that of the correlation's logarithm, so that noise of neither signal, nor one of
+    them that is larger at one end, pulls it aside.
+
+    Args:
+        xx: Power of the first signal in each block, shape (K,).
+        xy: Parabolas of its product with the second, powers 0 to 2, shape (3, K).
+        yy: Those of the second's power.
+        floor: Least that a block leaves.
+        half: Half the width of the parabolas [steps].
+        independent: Number of samples that count as independent.
+    """
+    at = 0.0
+    for _ in range(_ROUNDS):
+        powers = np.array([[1.0, at, at * at], [0.0, 1.0, 2.0 * at], [0.0, 0.0, 2.0]])
+        product, second = powers @ xy, powers @ yy  # value, slope and bend
+        scale = max(float(np.sum(product[0]) / np.sum(xx)), 0.0)
+        left = second[0] - 2.0 * scale * product[0] + scale**2 * xx
+        weight = 1.0 / np.maximum(left, floor)
+        both, power = product @ weight, second @ weight
+        if both[0] <= 0.0 or power[0] <= 0.0:
+            return at, np.inf
+        slope = both[1] / both[0] - 0.5 * power[1] / power[0]
+        bend = both[2] / both[0] - (both[1] / both[0]) ** 2
+        bend -= 0.5 * (power[2] / power[0] - (power[1] / power[0]) ** 2)
+        slopes = weight * (product[1] / both[0] - 0.5 * second[1] / power[0])
+        explained = min(float(both[0] ** 2 / (power[0] * np.sum(weight * xx))), 0.999)
+        # what the second would lose of its likelihood half the parabola's width aside
+        nats = -0.5 * independent * bend * half**2 * explained / (1.0 - explained)
+        if nats < _NATS or abs(at - slope / bend) > half:
+            return at, np.inf
+        at -= slope / bend
+    return at, _STUDENT * float(np.sqrt(np.sum(slopes**2) * BLOCKS / (BLOCKS - 1)) / -bend)
 
 
 def _centred(values: np.ndarray) -> np.ndarray:

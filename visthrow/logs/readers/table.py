@@ -4,7 +4,6 @@ one.
 
 import csv
 import gzip
-import io
 import json
 import lzma
 import math
