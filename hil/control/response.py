@@ -24,7 +24,7 @@ DEADS = 6
 FALL, FALL_DEAD = 0.4, 2  # time over which the thrust is judged [s], its dead time in ticks
 ANGLE_NOISE, HEIGHT_NOISE = 0.006, 0.002  # of an attitude, a height between poses [rad], [m]
 CERTAIN, CERTAIN_SIGN = 4.0, 5.0  # deviations of the noise beyond which something is known
-LEAST = 5  # heights that a vertical acceleration is taken from
+FEWEST_HEIGHTS = 5  # heights that a vertical acceleration is taken from
 
 
 class Response:
@@ -46,9 +46,9 @@ class Response:
         self._mass, self._allowed = mass, tolerance * GRAVITY
         self.problem: str | None = None
         self._ticks = 0
-        still = np.array([mass * GRAVITY, 0.0, 0.0, 0.0])
-        self._commands = deque([still] * DEADS, maxlen=DEADS)  # the newest first
-        self._answers = np.tile(still, (DEADS, 1))  # expected now, by dead time [N, rad/s]
+        hover = np.array([mass * GRAVITY, 0.0, 0.0, 0.0])
+        self._commands = deque([hover] * DEADS, maxlen=DEADS)  # the newest first
+        self._answers = np.tile(hover, (DEADS, 1))  # expected now, by dead time [N, rad/s]
         self._last: BodyState | None = None
         self._speed = self._height = 0.0  # expected from the commands, upwards [m/s], [m]
         self._heights: list[float] = []  # above the expected ones [m]
@@ -103,7 +103,7 @@ class Response:
         self._speed += (self._answers[FALL_DEAD, 0] / self._mass * up - GRAVITY) * self._period
         self._height += self._speed * self._period
         self._heights.append(vehicle.pos[2] - self._height)
-        if len(self._heights) < LEAST:
+        if len(self._heights) < FEWEST_HEIGHTS:
             return
         # place and speed at the beginning are as unknown as the acceleration that is looked for
         terms = np.vander(self._period * np.arange(len(self._heights)), 3)
@@ -134,10 +134,10 @@ def _named(which: np.ndarray) -> str:
     return ", ".join(axis for axis, one in zip(AXES, which) if one)
 
 
-def turn_between(first: tuple[float, ...], then: tuple[float, ...]) -> np.ndarray:
+def turn_between(first: tuple[float, ...], second: tuple[float, ...]) -> np.ndarray:
     """Return the small turn from one attitude to another [rad], body axes, shape (3,)."""
     x0, y0, z0, w0 = first
-    x, y, z, w = then
+    x, y, z, w = second
     turn = np.array(
         [
             w0 * x - x0 * w - y0 * z + z0 * y,

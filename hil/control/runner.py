@@ -446,7 +446,7 @@ class Runner:
             self.backend.release(self.latch.trip(now, seen.goal_w))
         if state is State.ABORT and self.machine.flown:
             if self.machine.handed_back:
-                self.backend.hand_back(now)
+                self.backend.surrender(now)
             else:
                 self.backend.abort(now)
 
@@ -594,16 +594,16 @@ class Runner:
         ratio = self.hovering.share()
         if len(self._thrusts) >= HOVERED:
             ratio = sum(self._thrusts) / len(self._thrusts)
-        told = []
+        reasons = []
         if ratio is not None and abs(ratio - 1.0) > allowed and (ours or ratio > STANDS):
             who = "hovering takes" if ours else "its own hover takes"
-            told.append(
+            reasons.append(
                 f"{who} {ratio:.2f} times the weight, within {allowed:g} of 1 expected: calibrate"
                 " the thrust, or weigh the vehicle"
             )
         if ours and self.response.running and self.params.backend != "dry-run":
-            told.append("it is being judged how it turns")
-        return told
+            reasons.append("it is being judged how it turns")
+        return reasons
 
     def _still(self, vehicle: BodyState, payload: BodyState | None, held: bool) -> bool:
         """Return whether all is quiet, at the hover point or where the autopilot holds

@@ -229,7 +229,7 @@ def test_betaflight_that_is_handed_back_is_level_with_the_pilots_throttle():
         came = desk.fake.witness.commands
         for _ in range(50):
             desk.turn(0.02)
-            desk.backend.hand_back(desk.now)
+            desk.backend.surrender(desk.now)
         assert (desk.fake.witness.commands > came + 5) == frames
         np.testing.assert_allclose(desk.fake.plant.commands[-1], HOVER, rtol=0.01, atol=0.05)
 

@@ -162,7 +162,7 @@ def test_a_vehicle_that_is_handed_back_holds_its_place():
     for seconds, z in ((1.9, place[2]), (2.1, place[2] - 0.6)):
         for _ in range(round(50 * seconds)):
             one.turn(0.02)
-            one.backend.hand_back(one.now)
+            one.backend.surrender(one.now)
         assert one.fake.supervisor == FLYING, "set-points of a place keep its watchdog quiet"
         assert one.fake.held.place_w == pytest.approx((*place[:2], z), abs=0.02)
 

@@ -232,5 +232,5 @@ class MotorPlant(WirePlant):
 
 
 def make_motors(policy: str, seed: int, changes: Sequence[str] = ()) -> MotorPlant:
-    """As :func:`make`, flown by motor commands."""
+    """Make the plant as :func:`make`, flown by motor commands."""
     return MotorPlant(load_policy(policy, None, changes).experiment, seed)

@@ -84,7 +84,7 @@ class Backend:
         A pilot who has taken over is left alone.
         """
 
-    def hand_back(self, now: float) -> None:
+    def surrender(self, now: float) -> None:
         """Give the vehicle to its own hold, or to the pilot; called at every tick of a run that
         ended so.
         """
@@ -252,9 +252,9 @@ class Autopilot(Backend):
             note = "the mechanism's output is at its open end: open and closed are exchanged"
         if self.share is not None and self._flies_itself():
             thrust = self.params.thrust.thrust(self.share, self.voltage)
-        said = note or self._hint() or self.release_record.note
+        reason = note or self._hint() or self.release_record.note
         good = not note and fault is None
-        return Status(good, said, self.release_record.state, mode, fault, thrust)
+        return Status(good, reason, self.release_record.state, mode, fault, thrust)
 
     def release(self, when: float) -> None:
         self.release_record.start(when)

@@ -317,7 +317,7 @@ class Betaflight(OnPort):
         """Whether the last sticks cease to count when nothing follows."""
         return self.audit.found.get("fc_version", 0.0) >= EXPIRES - 1e-6
 
-    def hand_back(self, now: float) -> None:
+    def surrender(self, now: float) -> None:
         """Give the vehicle to the pilot: fall silent where the receiver's channels then count
         again; else hold level with the throttle that the pilot hovered with, until the switch.
 
@@ -390,18 +390,22 @@ class Betaflight(OnPort):
 
     def _write_setting(self, name: str, value: float) -> None:
         """Write a number of the rate profile, and keep it; never while armed."""
-        told = SETTINGS[name]
-        if told.command != msp.RC_TUNING or len(self._tuning) <= told.at or self._box(BOX_ARM):
+        setting = SETTINGS[name]
+        if (
+            setting.command != msp.RC_TUNING
+            or len(self._tuning) <= setting.at
+            or self._box(BOX_ARM)
+        ):
             return
         changed = bytearray(self._tuning)
-        changed[told.at] = int(value)
+        changed[setting.at] = int(value)
         self._tuning = bytes(changed)
         self._write(msp.SET_RC_TUNING, self._tuning)
         self._write(msp.EEPROM_WRITE)
 
 
 @dataclass(frozen=True)
-class Told:
+class Setting:
     """The place of a setting in an answer."""
 
     command: int
@@ -411,8 +415,8 @@ class Told:
 
 
 SETTINGS = {
-    name.removeprefix("tells_"): Told(FACTS[told[0]], *told[1:])
-    for name, told in FACTS.items()
+    name.removeprefix("tells_"): Setting(FACTS[row[0]], *row[1:])
+    for name, row in FACTS.items()
     if name.startswith("tells_")
 }
 """Which answer tells which setting. Some hold more than a number: see :func:`settings`."""
@@ -448,11 +452,11 @@ def blocked(flags: int) -> str:
 
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     """Return settings that an answer tells; what is cut short tells nothing."""
-    mine = {name: told for name, told in SETTINGS.items() if told.command == frame.command}
+    mine = {name: setting for name, setting in SETTINGS.items() if setting.command == frame.command}
     found = {
-        name: float(told.scale * n)
-        for name, told in mine.items()
-        if (n := frame.number(told.code, told.at)) is not None
+        name: float(setting.scale * n)
+        for name, setting in mine.items()
+        if (n := frame.number(setting.code, setting.at)) is not None
     }
     for name in {"api_version", "fc_version"} & found.keys():
         minor = frame.number("B", SETTINGS[name].at + 1)

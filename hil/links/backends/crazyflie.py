@@ -29,7 +29,7 @@ from visthrow.config.bounds import Bounded, NotNegative, Positive
 FACTS = values("crazyflie")
 MODES = tuple(name for name in FACTS if "." in name)  # parameters that are set before it is armed
 
-ASK, SET_AGAIN = 0.1, 0.2  # between two questions for its state, two requests to arm [s]
+ASK, ARM_PERIOD = 0.1, 0.2  # between two questions for its state, two requests to arm [s]
 # a vehicle that is handed back holds its place so long [s], then sinks so fast [m/s]
 HOLDS, DESCENT = 2.0, 0.3
 SHORTEST = 0.02  # that a change of the yaw rate is spread over, at least [s]: a period
@@ -156,7 +156,7 @@ class Crazyflie(OnPort):
         error = (1.0 + FACTS["yaw_d"]) / FACTS["yaw_p"] * (rate - last)
         return rate + error / max(now - when, SHORTEST)
 
-    def hand_back(self, now: float) -> None:
+    def surrender(self, now: float) -> None:
         """Let it hold the place of its last pose by its own controller, and sink to the ground from
         there; without poses fall silent: its supervisor acts.
         """
@@ -191,7 +191,7 @@ class Crazyflie(OnPort):
             self.audit.service(now)
         ready = self._taken and not self._over and self.audit.done and not self.audit.problems
         armed = self._raised or bool(self._state & FACTS["armed"])
-        if ready and not armed and now - self._armed_at >= SET_AGAIN:
+        if ready and not armed and now - self._armed_at >= ARM_PERIOD:
             self._armed_at = now
             self._put(crtp.arm(True))
         if self.release_record.due(now):

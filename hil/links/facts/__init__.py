@@ -35,8 +35,8 @@ def facts(firmware: str) -> dict[str, Fact]:
     """Return the facts of a firmware by name; raises `ConfigError` for one without a file."""
     path = FOLDER / f"{firmware}.toml"
     if not path.exists():
-        known = [file.stem for file in FOLDER.glob("*.toml")]
-        raise ConfigError(f"no facts of firmware '{firmware}'; {suggest(firmware, known)}")
+        firmwares = [file.stem for file in FOLDER.glob("*.toml")]
+        raise ConfigError(f"no facts of firmware '{firmware}'; {suggest(firmware, firmwares)}")
     rows = tomllib.loads(path.read_text(encoding="utf-8"))
     head = {name: rows.pop(name) for name in HEAD}
     return {name: Fact(**{**head, **row}) for name, row in rows.items()}
