@@ -33,7 +33,7 @@ class Packet:
 
     def pack(self) -> bytes:
         """Return its bytes as they go out."""
-        return bytes([(self.port & 0xF) << FACTS["header_shift"] | self.channel & 3]) + self.data
+        return bytes([self.port << FACTS["header_shift"] | self.channel & 3]) + self.data
 
 
 def unpack(data: bytes) -> Packet | None:

@@ -27,6 +27,7 @@ from visthrow.onboard.hover import GRAVITY
 
 FACTS = values("crazyflie")
 HOOK = "hook.open"  # parameter of the app that moves the mechanism
+ANGLES = ("flightmode.stabModeRoll", "flightmode.stabModePitch", "flightmode.stabModeYaw")
 DEFAULTS = {"flightmode.stabModeRoll": 1, "flightmode.stabModePitch": 1, "stabilizer.controller": 0}
 """Parameters that the firmware starts with, where these are not what they have to be."""
 
@@ -126,9 +127,7 @@ class FakeCrazyflie(PortFake):
         if mode["althold"] or mode["poshold"] or self.parameters["flightmode.posSet"]:
             self.happened("legacy set-point in another mode")
             none = True
-        rates = tuple(
-            self.parameters[f"flightmode.stabMode{axis}"] == 0 for axis in ("Roll", "Pitch", "Yaw")
-        )
+        rates = tuple(self.parameters[name] == 0 for name in ANGLES)
         yaw = FACTS["legacy_yaw_sign"] * yaw if rates[2] else yaw
         thrust = 0 if none else min(thrust, FACTS["legacy_most"])
         self._commanded(SetPoint(self.plant.time, roll, pitch, yaw, thrust, rates))

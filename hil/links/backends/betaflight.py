@@ -42,6 +42,8 @@ switch itself, which is raised while another one is set.
 EXPIRES = FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
 """First version, as of :func:`version_text`, in which the sticks of MSP OVERRIDE expire."""
 
+FEWEST_AUX = 4  # channels of a frame beside the sticks
+LONGEST_DELAY = 1.5  # of the failsafe [s]
 NEAR = 50  # a channel or output this near to its target has arrived [us]
 # between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
 KEEP_ALIVE = 0.02
@@ -140,7 +142,7 @@ class Betaflight(OnPort):
                 "api_version",
                 "1.43 or newer",
                 "older ones do not tell their rates type",
-                lambda v: v >= 1.43,
+                lambda v: v >= FACTS["api_oldest"],
             ),
             equal("rates_type", RATES_TYPES[p.rates.type], "the curve that sticks are computed by"),
         ]
@@ -161,7 +163,7 @@ class Betaflight(OnPort):
                 "failsafe_delay",
                 "above 0, at most 1.5 s",
                 "motors stop so late when the runner is gone",
-                lambda v: 0.0 < v <= 1.5,
+                lambda v: 0.0 < v <= LONGEST_DELAY,
             ),
         ]
         if p.servo_output:
@@ -241,7 +243,7 @@ class Betaflight(OnPort):
         p = self.params
         if not self._order:  # a stick in another's place is worse than none
             return False
-        channels = [LOW] * (STICKS + max(4, p.arm_channel, p.release_channel))
+        channels = [LOW] * (STICKS + max(FEWEST_AUX, p.arm_channel, p.release_channel))
         for i, value in enumerate(self._sticks_us):
             channels[self._order[i]] = value
         if p.arm_channel:
@@ -348,7 +350,7 @@ class Betaflight(OnPort):
             )
         elif frame.command == msp.RC:
             self._hear_channels(frame.words())
-        elif frame.command == msp.ANALOG and (volts := frame.number("<H", 7)):
+        elif frame.command == msp.ANALOG and (volts := frame.number("<H", FACTS["analog_volts"])):
             self.voltage = 0.01 * volts
         elif frame.command == msp.SERVO and 1 <= p.servo_output <= len(outputs := frame.words()):
             self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
@@ -366,15 +368,15 @@ class Betaflight(OnPort):
                 self.release_record.read_back = False
 
     def _hear_status(self, frame: msp.Frame) -> None:
-        flags, count = (
-            frame.number("<I", 6),
-            frame.number("B", 15),
-        )  # bytes of further flags, in the low half
+        flags = frame.number("<I", FACTS["status_flags"])
+        count = frame.number("B", FACTS["status_more"])
         if flags is None or count is None:
             return
-        more = frame.payload[16 : 16 + (count & 15)]
-        self._flags = flags | int.from_bytes(more, "little") << 32
-        self._blocks = frame.number("<I", 17 + (count & 15)) or 0
+        start = FACTS["status_more"] + 1
+        end = start + (count & FACTS["status_more_mask"])
+        further = int.from_bytes(frame.payload[start:end], "little")
+        self._flags = flags | further << FACTS["status_flag_bits"]
+        self._blocks = frame.number("<I", end + 1) or 0
 
     def _hear_channels(self, channels: tuple[int, ...]) -> None:
         """Take MSP_RC: roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
@@ -475,6 +477,8 @@ def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
     """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of
     25 us; 0: none.
     """
-    entries = [frame.payload[i : i + 4] for i in range(0, len(frame.payload) - 3, 4)]
+    size = FACTS["range_bytes"]
+    starts = range(0, len(frame.payload) - size + 1, size)
+    entries = [frame.payload[start : start + size] for start in starts]
     found = [channel + 1 for of, channel, first, last in entries if of == box and first < last]
     return float(preferred if preferred in found else found[0] if found else 0)

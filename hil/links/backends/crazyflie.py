@@ -210,9 +210,9 @@ class Crazyflie(OnPort):
         if len(data) < 3:
             return
         if (*place, data[0]) == (FACTS["port_supervisor"], FACTS["channel_info"], state):
-            self._heard, self._state = now, int.from_bytes(data[1:5], "little")
+            self._heard, self._state = now, int.from_bytes(data[1:], "little")
         elif (*place, data[0]) == (FACTS["port_platform"], FACTS["channel_version"], version):
-            self.audit.feed("protocol", int.from_bytes(data[1:5], "little"))
+            self.audit.feed("protocol", int.from_bytes(data[1:], "little"))
         elif place == (FACTS["port_param"], FACTS["channel_by_name"]):
             self._hear_set(data[1:-1], data[-1])
 
