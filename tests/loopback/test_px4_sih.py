@@ -1,11 +1,13 @@
 """The ball below PX4's own vehicle: its laws, and the bridge against a fake of the other side."""
 
 import math
+import threading
 
 import numpy as np
 import pytest
 
 from bench.processes import free_port
+from hil.links.clock import MonotonicClock
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -14,6 +16,7 @@ from hil.rehearsal.bridges.px4_bridge import ORIGIN, Motion, Place, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, Options
 from hil.rehearsal.fake_command import make_ball
 from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.process import serve
 from visthrow import config
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -128,6 +131,19 @@ class OtherSide:
             value = (values[message.param_id], mav.MAV_PARAM_TYPE_REAL32, 1, 0)
             self.link.send(mav.MAVLink_param_value_message(message.param_id.encode(), *value))
 
+    def fly(self, bridge, periods, pos, yaw=0.0, output=lambda n: 2000):
+        """Fly a vehicle that stays where it is for some periods, a state ahead of the bridge; PX4's
+        clock is its own: 100 s ahead. Yields the number of each period that was flown.
+        """
+        while bridge._place is None:  # it asks for the world's origin once it has heard somebody
+            self.say(0.0, pos, yaw, output(0))
+            bridge.step()
+        self.say(100.0, pos, yaw, output(0))
+        for n in range(periods):
+            self.say(100.0 + 0.005 * (n + 1), pos, yaw, output(n))
+            bridge.step()
+            yield n
+
     def say(self, time, pos, yaw, output):
         """Say where the vehicle is, north, east, down of the origin [m], as PX4 cuts it to whole
         units.
@@ -158,11 +174,9 @@ def bridge():
 
 
 def test_the_bridge_hears_places_and_the_mechanism(bridge):
-    """PX4's clock is its own: 100 s ahead here."""
-    for n in range(400):
-        opens = bridge.params.servo_open_us
-        bridge.other.say(100.0 + 0.005 * n, (1.0, 2.0, -3.0), 0.3, 2000 if n < 300 else opens)
-        bridge.step()
+    opens = bridge.params.servo_open_us
+    for _ in bridge.other.fly(bridge, 400, (1.0, 2.0, -3.0), 0.3, lambda n: [2000, opens][n > 300]):
+        pass
     now = bridge.plant.state
     np.testing.assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=0.01)
     np.testing.assert_allclose(
@@ -179,9 +193,7 @@ def test_the_bridge_hears_places_and_the_mechanism(bridge):
 
 def test_the_ball_is_hung_where_the_vehicle_is_first_heard(bridge):
     """Also below one that hovers elsewhere by then: it hangs still from the first pose on."""
-    for n in range(200):
-        bridge.other.say(7.0 + 0.005 * n, (5.0, -4.0, -1.333), 0.0, 2000)
-        bridge.step()
+    for _ in bridge.other.fly(bridge, 200, (5.0, -4.0, -1.333)):
         if bridge.heard_of > 1:
             off = bridge.plant.state["payload_pos_w"] - bridge.plant.state["pos_w"]
             assert np.hypot(off[0], off[1]) < 0.02
@@ -213,10 +225,30 @@ def test_the_place_is_smooth_though_px4_cuts_it_to_centimetres():
 def test_an_output_that_was_open_before_releases_nothing(bridge):
     """After a throw PX4's gripper stays open until it is told to close; then it may open again."""
     opens = bridge.params.servo_open_us
-    for n in range(300):
-        output = opens if n < 100 or n >= 200 else 2000
-        bridge.other.say(7.0 + 0.005 * n, (0.0, 0.0, -1.333), 0.0, output)
-        bridge.step()
+
+    def output(n):
+        return 2000 if 100 <= n < 200 else opens
+
+    for n in bridge.other.fly(bridge, 300, (0.0, 0.0, -1.333), output=output):
         if n == 150:
             assert bridge.report()["releases"] == 0
     assert bridge.report()["releases"] == 1
+
+
+def test_a_px4_that_is_slower_than_the_wall_keeps_the_time(bridge):
+    """On a clock of its own the bridge would run ahead of the vehicle, and show it where it was."""
+    done = threading.Event()
+
+    def speak():
+        for n in range(10_000):
+            bridge.other.say(7.0 + 0.005 * n, (0.01 * n, 0.0, -1.333), 0.0, 2000)
+            if done.wait(0.01):
+                return
+
+    thread = threading.Thread(target=speak)
+    thread.start()
+    report = serve(bridge, MonotonicClock(), 1.0)
+    done.set()
+    thread.join()
+    assert report["speed"] < 0.8
+    assert abs(bridge.plant.until - bridge.plant.time) < 0.011

@@ -279,9 +279,9 @@ class Px4Sih(Bridge):
         if self._place is None:
             return
         time = 1e-6 * message.time_usec - self._offset
-        if not self.heard_of or abs(time - self.plant.time) > PATIENCE:  # first, or after a pause
+        if not self.paced:  # the first one, or after a pause
             self._offset += time - self.plant.time
-            time = self.plant.time
+            time, self.paced = self.plant.time, True
         elif time <= self.plant.until:
             return
         self.heard_of += 1
@@ -294,11 +294,13 @@ class Px4Sih(Bridge):
     def fly(self) -> None:
         """Fly a period once PX4 has flown it; without PX4, a period as it was."""
         wanted, end = self.plant.time + self.plant.period - SLACK, monotonic() + PATIENCE
-        while self.paced and self.plant.until < wanted and monotonic() < end:
-            select.select([self.port], [], [], end - monotonic())
+        waits = self.paced
+        while waits and self.plant.until < wanted and monotonic() < end:
+            select.select([self.port], [], [], max(end - monotonic(), 0.0))
             self.hear()
         super().fly()
-        self.paced = self.plant.until >= wanted
+        if waits:
+            self.paced = self.plant.until >= wanted
 
     def deliver(self, time: float) -> None:
         """Count the poses' latency on PX4's clock, which is ahead of the ball's."""
