@@ -36,6 +36,7 @@ EXTRAS = (  # packages that an installation without extras lacks
     *("mujoco", "piqp", "pyulog", "rosbags", "h5py", "mcap", "skimage", "submitit", "serial"),
     *("cflib", "cyclonedds", "natnet", "motioncapture", "mujoco_warp", "aeroid"),
 )
+ON_THE_GROUND = ("warp", "rsl_rl", "tensordict", "kornia", "rerun", "pyarrow")  # extras train, view
 BLOCKED_ON_BOARD = ("sim", "warp", "rsl_rl", "tensordict", "mujoco")
 
 
@@ -138,6 +139,32 @@ for words in {commands!r}:
 """
     run = [sys.executable, "-c", code]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert result.returncode == 0, result.stderr
+
+
+def test_what_flies_needs_neither_train_nor_view(tmp_path):
+    """A run on recorded poses, its replay and a camera's picture; the rest names its extra."""
+    poses = ROOT / "tests" / "data" / "payload_cf_single" / "log201.csv.gz"
+    source = f"source.file={poses}"
+    flying = [
+        ["hil", "run", "--config", "crazyflie_log", "--set", source, "--out", "run"],
+        ["hil", "replay", "run"],
+    ]
+    refused = {"fly": "train", "train laptop": "train", "hil view run": "view"}
+    code = f"""
+import contextlib, io, sys
+sys.modules.update(dict.fromkeys({(*ON_THE_GROUND, *EXTRAS)!r}))
+from visthrow.cli import main
+for words in {flying!r}:
+    assert main(words) == 0, words
+for words, extra in {refused!r}.items():
+    with contextlib.redirect_stderr(io.StringIO()) as text:
+        assert main(words.split()) == 2, words
+    assert f"pip install 'visthrow[{{extra}}]'" in text.getvalue(), (words, text.getvalue())
+"""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = [sys.executable, "-c", code]
     result = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert result.returncode == 0, result.stderr
 

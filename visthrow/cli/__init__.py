@@ -58,7 +58,11 @@ COMMANDS = {
 }
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
-_EXTRAS = {"submitit": "slurm", "mujoco": "reference", "piqp": "paper"}
+_EXTRAS = {
+    **dict.fromkeys(("warp", "rsl_rl", "tensordict", "kornia"), "train"),
+    **dict.fromkeys(("rerun", "pyarrow"), "view"),
+    **{"submitit": "slurm", "mujoco": "reference", "piqp": "paper"},
+}
 """Optional packages by import name, and the extra of visthrow that installs them."""
 
 _DESCRIPTION = """\
@@ -117,12 +121,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 " 3, which mjlab, newton and Isaac Lab ask for, was installed over it; install"
                 " 'visthrow[reference]' in an environment of its own"
             )
-        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        package = (error.name or "").split(".")[0]
+        extra = _EXTRAS.get(package)
         if extra is None:
             raise
         return _refuse(
-            f"this needs the package '{error.name}'; install it with: pip install"
-            f" 'visthrow[{extra}]'"
+            f"this needs the package '{package}'; install it with: pip install 'visthrow[{extra}]'"
         )
     except (VisthrowError, ValueError, OSError) as error:
         if os.environ.get(TRACEBACK_VARIABLE):
