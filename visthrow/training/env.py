@@ -44,8 +44,7 @@ class ThrowEnv(VecEnv):
     scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of
     payload mass and cable length, where the task has them. ``mount``: the camera's rotation [rad]
     and offset [m] from its nominal pose. ``pose_age``: of what is measured [s]. ``vehicle``: of a
-    fleet, all of its set-up. The paper's critic (Sec. III-C and IV-C; 38 numbers) is told the first
-    two.
+    fleet, all of its set-up. The paper's critic, as we read it (38 numbers), receives the first two.
 
     Attributes:
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m],

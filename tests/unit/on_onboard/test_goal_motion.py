@@ -104,6 +104,28 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
         assert weight.item() == pytest.approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
 
 
+def test_a_located_state_layout_has_the_mean_goal():
+    """Ten noisy frames of one goal: their mean less the measured position, beside the offset."""
+    params = config.load(Experiment, config.find("train", "state")).task.observation
+    layout = ob.layout_of(dataclasses.replace(params, located=True))
+    assert layout.dimension == ob.layout_of(params).dimension + 2
+    rng, goal = np.random.default_rng(1), np.array([1.5, -0.5])
+    sums, fresh, seen = goal_motion.empty_sums(1), torch.ones(1, dtype=torch.bool), []
+    for step in range(10):
+        frame = torch.zeros(1, layout.frame)
+        frame[0, :2] = torch.tensor(0.1 * rng.standard_normal(2))
+        seen.append(goal + 0.05 * rng.standard_normal(2))
+        frame[0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(seen[-1]) - frame[0, :2]
+        time = torch.full((1,), step * PERIOD)
+        sums, _, places, kept, _ = goal_motion.fitted_goal(
+            layout, frame, None, None, sums, time, fresh
+        )
+        fresh = torch.zeros_like(fresh)
+        assert kept is frame
+        wanted = np.mean(seen, axis=0) - frame[0, :2].numpy()
+        np.testing.assert_allclose(places[0].numpy(), wanted, atol=1e-5)
+
+
 def test_accuracy_is_what_the_docstring_promises():
     """Four measurements of 0.01 m, 20 ms apart, leave 0.2 m/s; the fit over half a second leaves a
     tenth of it.
