@@ -20,55 +20,27 @@ from pathlib import Path
 from typing import Any
 
 from bench import start
+from bench.vision_throws import conditions
 from visthrow import config
 from visthrow.common.storage import write_json
 
-ALONE = ("task.observation.located=false", "task.observation.response=0")
+LOCATED, RESPONSE = "task.observation.located", "task.observation.response"
 SHORT = ("ppo.iterations=509",)  # 2.0e8 environment steps, the paper's number
-MEMORY = (
-    'algorithm="distillation"',
-    "ppo.environments=2048",
-    "distillation.iterations=1000",
-    *("distillation.inner=[256,256]", "distillation.hidden=512", "distillation.minibatches=8"),
-    "distillation.memory=256",
-)
-TUNED = (
-    *('ppo="ppo/adapt.toml"', "ppo.environments=16384", "ppo.iterations=300"),
-    *("ppo.hidden=[512,256,128]", "ppo.critic=[512,256,128]", 'ppo.products="bfloat16"'),
-    'ppo.privileged=["exact","payload_velocity","release_timer","time","mass","voltage","mount",'
-    '"pose_age"]',
-)
-TWICE = (
-    *("distillation.iterations=600", "distillation.epochs=2", "distillation.learning_rate=0.001"),
-)
 VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "memory": ("vision", (*ALONE, *MEMORY)),
-    "memory_twice": ("vision", (*ALONE, *MEMORY, *TWICE)),
-    "keypoints": ("vision", (*ALONE, *SHORT)),
-    "both": ("vision", SHORT),
-    "located": ("vision", (ALONE[1], *SHORT)),
-    "response": ("vision", (ALONE[0], *SHORT)),
+    "memory": ("vision", ()),
+    "keypoints": ("vision_located", (f"{LOCATED}=false", f"{RESPONSE}=0", *SHORT)),
+    "both": ("vision_located", SHORT),
+    "located": ("vision_located", (f"{RESPONSE}=0", *SHORT)),
+    "response": ("vision_located", (f"{LOCATED}=false", *SHORT)),
     "state_averaged": (
         "state_fast",
-        (
-            *("task.observation.located=true", "task.observation.response=8"),
-            *("task.start.goal_radius=2.5", *SHORT),
-        ),
+        (f"{LOCATED}=true", f"{RESPONSE}=8", "task.start.goal_radius=2.5", *SHORT),
     ),
 }
 """Variant -> configuration of ``configs/train`` and what it changes."""
 
-MEMORIES = ("memory", "memory_twice")
-"""Variants that are distilled, and tuned by PPO afterwards."""
-
-FAULTS = {
-    "20 % lost": "camera.noise.drop_probability=0.2",
-    "40 ms late": "task.observation.latency=[0.04,0.04]",
-    "2 % wrong": "camera.noise.wrong_probability=0.02",
-}
-"""One thing wrong with the camera -> the override that makes it so."""
-TARGETS, FAULT_TARGET, THROWS, SEED = (1.5, 2.0, 2.5), 2.0, 1600, 7
-LIMITS = {"memory": 230.0, "memory_twice": 230.0, "tuned": 80.0, "ppo": 200.0}
+SEED, THROWS = 7, 1600
+LIMIT = 230.0
 """Longest that a training may take [s]; a schedule that would take longer is shortened."""
 LEAST, RESERVE = 45.0, 15.0
 """Time that a training must have to be begun, and what is kept for its throws [s]."""
@@ -93,40 +65,34 @@ def trained(trainer: Any, seconds: float) -> dict[str, Any]:
     }
 
 
-def thrown(policy: Any, experiment: Any, device: str, count: int) -> dict[str, Any]:
+def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
     """Throws at all targets, and at one with each fault."""
     from visthrow.throws.loading import trained_in
     from visthrow.training import protocol
 
     policy, rows = policy.to(device), {}
-    faults = FAULTS if experiment.task.observation.layout == "vision" else {}
-    for name, change in {"": (), **{name: (value,) for name, value in faults.items()}}.items():
+    layout = policy.contract["observation"]["layout"]
+    for name, (target, change) in conditions(layout).items():
         flown = trained_in(policy, "policy", change)
-        for target in (FAULT_TARGET,) if name else TARGETS:
-            throws = protocol.throw(flown, policy.actor(count), target, count, device, SEED)
-            rows[name or f"{target} m"] = throws.summary()
+        throws = protocol.throw(flown, policy.actor(count), target, count, device, SEED)
+        rows[name] = throws.summary()
     return rows
 
 
 def job(args: argparse.Namespace) -> int:
     """Train one variant with one seed, throw, and write what came of it."""
     from visthrow.task import Experiment
-    from visthrow.training.trainer import POLICY, Trainer, finish
+    from visthrow.training.trainer import Trainer, finish
 
     name, seed, folder = args.job, args.seed, Path(args.work) / f"{args.job}-{args.seed}"
-    memory = name.removesuffix("_tuned")
-    base, changes = VARIANTS[memory]
-    if name.endswith("_tuned"):
-        start_policy = Path(args.work) / f"{memory}-{seed}" / POLICY
-        changes = (*ALONE, *TUNED, f'ppo.estimator="{start_policy}"')
-    limit = LIMITS.get(name, LIMITS["tuned" if name.endswith("_tuned") else "ppo"])
-    limit = min(limit, args.deadline - time.time() - RESERVE)
+    base, changes = VARIANTS[name]
+    limit = min(LIMIT, args.deadline - time.time() - RESERVE)
     experiment = config.load(Experiment, config.find("train", base), [*changes, *args.overrides])
     folder.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(experiment, args.devices[0], seed)
     figures = trained(trainer, limit)
     policy = finish(trainer, folder, {"training": figures})
-    figures["throws"] = thrown(policy, experiment, args.devices[0], args.throws)
+    figures["throws"] = thrown(policy, args.devices[0], args.throws)
     write_json(folder / "figures.json", {"variant": name, "seed": seed, **figures})
     return 0
 
@@ -143,10 +109,7 @@ def run(args: argparse.Namespace) -> int:
     seeds = json.loads(path.read_text(encoding="utf-8"))
     print("seeds:", *seeds, flush=True)
     chosen = [name for name in VARIANTS if not args.only or name in args.only]
-    slow = [name for name in chosen if name in MEMORIES]
-    groups = [(seeds[: args.ahead], slow), (seeds, [name for name in chosen if name not in slow])]
-    groups += [(seeds[args.ahead :], slow)]
-    jobs = [(name, seed) for those, names in groups for seed in those for name in names]
+    jobs = [(name, seed) for seed in seeds for name in chosen]
     deadline = begin + args.seconds
     _work_off(jobs, args, deadline)
     _pack(work, Path(args.out))
@@ -165,13 +128,9 @@ def _work_off(jobs: list[tuple[str, int]], args: argparse.Namespace, deadline: f
             del running[process]
             free.append(device)
             print(f"{name}-{seed}: {process.returncode}, {time.time() - begin:.0f} s", flush=True)
-            if name in MEMORIES and process.returncode == 0:
-                jobs.insert(0, (f"{name}_tuned", seed))
         while jobs and free and deadline - time.time() > LEAST + RESERVE:
             name, seed = jobs.pop(0)
             if (work / f"{name}-{seed}" / "figures.json").exists():
-                if name in MEMORIES:
-                    jobs.insert(0, (f"{name}_tuned", seed))
                 continue
             device = free.pop(0)
             running[_begun(name, seed, device, deadline, args)] = (name, seed, device, time.time())
@@ -219,7 +178,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--devices", nargs="+", default=["cuda:0"])
     parser.add_argument("--slots", type=int, default=3, help="trainings at once on a device")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--ahead", type=int, default=3, help="seeds of those with memory first")
     parser.add_argument("--seconds", type=float, default=520.0, help="of all trainings together")
     parser.add_argument("--throws", type=int, default=THROWS, help="at each target")
     parser.add_argument("--only", nargs="+", choices=VARIANTS, help="variants; default: all")

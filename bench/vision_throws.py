@@ -116,7 +116,7 @@ def thrown(
     }
 
 
-def conditions(layout: str, calibrated: bool) -> dict[str, tuple[float, tuple[str, ...]]]:
+def conditions(layout: str, calibrated: bool = False) -> dict[str, tuple[float, tuple[str, ...]]]:
     """Name of a condition -> target and overrides."""
     rows: dict[str, tuple[float, tuple[str, ...]]] = {f"{t} m": (t, ()) for t in TARGETS}
     if layout == "vision":

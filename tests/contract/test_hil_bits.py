@@ -18,7 +18,7 @@ from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from tests.contract.test_pilot import quiet
 from tests.hil_flight import TICK, Spy, params
 from tests.hil_runs import record_run, saved_policy
-from visthrow.onboard.observations import RESPONSE, layout_of
+from visthrow.onboard.observations import layout_of
 from visthrow.onboard.pilot import by_own_rule
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.training.env import ThrowEnv
@@ -133,15 +133,13 @@ def both(
     return seen, shown_by_the_environment(flown, actions, policy, device)
 
 
-def test_ten_thousand_poses_of_the_vision_policy(tmp_path):
-    seen, shown = both("vision", 100, 100, tmp_path / "a")
-    assert seen.shape[:2] == (100, 100)
+@pytest.mark.parametrize("policy", ["vision", "vision_located"])
+def test_five_thousand_poses_of_a_vision_policy(policy, tmp_path):
+    seen, shown = both(policy, 50, 100, tmp_path / "a")
+    assert seen.shape[:2] == (50, 100)
     np.testing.assert_array_equal(seen, shown)
-    layout = layout_of(
-        SimpleNamespace(**Policy.load(find_policy("vision")).contract["observation"])
-    )
-    after = layout.located + layout.response * RESPONSE
-    valid = seen[..., -after - layout.validity : -after]
+    layout = layout_of(SimpleNamespace(**Policy.load(find_policy(policy)).contract["observation"]))
+    valid = seen[..., layout.columns("validity")]
     assert 0.1 < valid.mean() < 0.95, "points inside and outside of the field of view"
 
 

@@ -13,7 +13,7 @@ from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
 from visthrow.training.distillation import Distillation
-from visthrow.training.env import EstimatedEnv, ThrowEnv
+from visthrow.training.env import ThrowEnv
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = [
@@ -146,7 +146,7 @@ def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled, number):
     signalled(Distillation, words(folder), number)
     one, two = (Policy.load(run / "policy.npz").estimator for run in (whole, folder))
     for name, value in one.parts().items():
-        np.testing.assert_array_equal(value.numpy(), getattr(two, name).numpy(), err_msg=name)
+        np.testing.assert_array_equal(value.numpy(), two.parts()[name].numpy(), err_msg=name)
 
 
 def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, capsys):
@@ -155,7 +155,7 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     trainer.algorithm.take_up(policy)
     taken = trainer.algorithm.export(policy.contract, {})
     for name, value in policy.estimator.parts().items():
-        torch.testing.assert_close(getattr(taken.estimator, name), value, rtol=0, atol=AGREES)
+        torch.testing.assert_close(taken.estimator.parts()[name], value, rtol=0, atol=AGREES)
     assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
     assert "the policy is one with a memory" in capsys.readouterr().err
     # as it was trained
@@ -164,54 +164,8 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
         "task.observation.latency_jitter=0.004",
         "task.observation.response=8",
     )
-    assert cli.main([*words(tmp_path / "b"), "--from", "vision", *overrides(*late)]) == 2
+    assert cli.main([*words(tmp_path / "b"), "--from", "vision_located", *overrides(*late)]) == 2
     assert "the policy is one without a memory" in capsys.readouterr().err
-
-
-TUNED = (
-    *('algorithm="ppo"', "ppo.environments=16", "ppo.steps=6", "ppo.minibatches=2"),
-    *("ppo.iterations=2", "ppo.hidden=[512,256,128]"),
-)
-
-
-def flown(build):
-    """Observations of steps without commands, and which throws began there."""
-    torch.manual_seed(1)
-    env = build()
-    seen, ended = [env.get_observations()["actor"]], [torch.ones(2, dtype=torch.bool)]
-    for _ in range(FLOWN):
-        observations, _, done, _ = env.step(torch.zeros(2, 5))
-        seen.append(observations["actor"])
-        ended.append(done > 0)
-    return seen, ended
-
-
-def test_ppo_goes_on_behind_the_estimator_of_a_distilled_policy(whole, tmp_path):
-    """The estimator stays as it is, the network moves; the environment's estimate is that of the
-    policy, with a memory that starts anew with each throw.
-    """
-    path = whole / "policy.npz"
-    sets = overrides(*TUNED, f'ppo.estimator="{path}"')
-    assert cli.main([*words(tmp_path / "run"), *sets, "--iterations", "2"]) == 0
-    before, after = Policy.load(path), Policy.load(tmp_path / "run" / "policy.npz")
-    for name, value in before.estimator.parts().items():
-        torch.testing.assert_close(after.estimator.parts()[name], value, rtol=0, atol=0)
-    assert any((one != two).any() for one, two in zip(before.weights, after.weights))
-    experiment = config.load(Experiment, tmp_path / "run" / "config.toml")
-    told, _ = flown(lambda: EstimatedEnv(experiment, before.estimator, "cpu", 3, 2))
-    seen, ended = flown(lambda: ThrowEnv(experiment, "cpu", 3, 2))
-    memory = before.begin(2)
-    for step, obs in enumerate(seen):
-        memory = memory * ~ended[step][:, None]
-        estimate, memory = before.estimator.step(obs, memory)
-        torch.testing.assert_close(told[step], estimate, rtol=0, atol=AGREES)
-    assert torch.stack(ended[1:]).any()
-
-
-def test_ppo_refuses_a_policy_without_an_estimator(tmp_path, capsys):
-    sets = overrides(*TUNED, 'ppo.estimator="vision_betaflight"')
-    assert cli.main([*words(tmp_path / "run"), *sets]) == 2
-    assert "ppo.estimator" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

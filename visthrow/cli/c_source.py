@@ -54,13 +54,10 @@ static float activate(float x)
 ESTIMATOR = """
 static void estimate(const float *obs, float *memory, float *features)
 {{
-    float scaled[{obs}], x[{hidden}], input[{gates}], recurrent[{gates}];
+    float scaled[{obs}], input[{gates}], recurrent[{gates}];
     for (int i = 0; i < {obs}; i++)
         scaled[i] = (obs[i] - est_mean[i]) / est_std[i];
-    linear(encoder_weight, encoder_bias, {hidden}, {obs}, scaled, x);
-    for (int i = 0; i < {hidden}; i++)
-        x[i] = x[i] > 0.0f ? x[i] : expm1f(x[i]);
-    linear(input_weight, input_bias, {gates}, {hidden}, x, input);
+{encoder}    linear(input_weight, input_bias, {gates}, {encoded}, {source}, input);
     linear(memory_weight, memory_bias, {gates}, {memory}, memory, recurrent);
     for (int i = 0; i < {memory}; i++) {{
         float reset = 1.0f / (1.0f + expf(-(input[i] + recurrent[i])));
@@ -117,11 +114,24 @@ def _estimator(estimator: Estimator) -> str:
     names = {"mean": "est_mean", "std": "est_std"}
     arrays = [
         _array(names.get(name, name), value.cpu().numpy())
-        for name, value in vars(estimator).items()
+        for name, value in estimator.parts().items()
     ]
+    lines, source, width = [], "scaled", estimator.obs_dim
+    layers = [("encoder", estimator.encoder_bias)]
+    layers += [(f"inner{i}", bias) for i, (_, bias) in enumerate(estimator.inner)]
+    for name, bias in layers:
+        lines += [
+            f"    float {name}[{len(bias)}];",
+            f"    linear({name}_weight, {name}_bias, {len(bias)}, {width}, {source}, {name});",
+            f"    for (int i = 0; i < {len(bias)}; i++)",
+            f"        {name}[i] = {name}[i] > 0.0f ? {name}[i] : expm1f({name}[i]);",
+        ]
+        source, width = name, len(bias)
     function = ESTIMATOR.format(
         obs=estimator.obs_dim,
-        hidden=estimator.encoder_weight.shape[0],
+        encoder="\n".join(lines) + "\n",
+        encoded=width,
+        source=source,
         gates=3 * estimator.memory,
         memory=estimator.memory,
         estimate=estimator.output_weight.shape[0],

@@ -110,10 +110,12 @@ def _add_network(graph: _Graph, policy: Policy, features: str) -> None:
 
 def _add_estimator(graph: _Graph, estimator: Estimator) -> str:
     """Add the recurrent estimator and return the name of its estimate."""
-    part = {name: value.cpu().numpy() for name, value in vars(estimator).items()}
+    part = {name: value.cpu().numpy() for name, value in estimator.parts().items()}
     centred = graph.node("Sub", "obs", graph.constant(part["mean"]))
     scaled = graph.node("Div", centred, graph.constant(part["std"]))
-    x = graph.node("Elu", graph.linear(scaled, part["encoder_weight"], part["encoder_bias"]))
+    x = scaled
+    for name in ("encoder", *(f"inner{i}" for i in range(len(estimator.inner)))):
+        x = graph.node("Elu", graph.linear(x, part[f"{name}_weight"], part[f"{name}_bias"]))
     gates = []
     for array in ("input", "memory"):
         source = x if array == "input" else "memory"

@@ -307,7 +307,6 @@ class Policy:
         activation: str,
         contract: dict[str, Any],
         made_by: dict[str, Any] | None = None,
-        estimator: Estimator | None = None,
     ) -> "Policy":
         """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of
         its own spread.
@@ -322,7 +321,6 @@ class Policy:
             activation: The actor's hidden activation by rsl_rl's name.
             contract: Conditions of the training.
             made_by: Where it comes from.
-            estimator: What the actor looks through, if anything.
         """
         known = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(known))
@@ -349,7 +347,6 @@ class Policy:
             take("obs_normalizer._mean").reshape(-1) if normalized else None,
             take("obs_normalizer._std").reshape(-1) if normalized else None,
             RSL_RL_EPS if normalized else 0.0,
-            estimator,
         )
 
 

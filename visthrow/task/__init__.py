@@ -224,9 +224,6 @@ class PPOParams(Bounded):
     privileged: tuple[str, ...] = PRIVILEGED[
         :8
     ]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
-    # policy with a memory, a shipped name or a file: its estimator stays as it is, its network
-    # learns on; empty for an actor that looks at the observation itself
-    estimator: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,7 +21,6 @@ from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.estimator import Estimator
 from visthrow.task import Experiment, drawn_plants, plant_of
 from visthrow.task.fleet import members
 from visthrow.training import rewards, terminations
@@ -44,7 +43,7 @@ class ThrowEnv(VecEnv):
     scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of
     payload mass and cable length, where the task has them. ``mount``: the camera's rotation [rad]
     and offset [m] from its nominal pose. ``pose_age``: of what is measured [s]. ``vehicle``: of a
-    fleet, all of its set-up. The paper's critic, as we read it (38 numbers), receives the first two.
+    fleet, all of its set-up. The paper's critic, as we read it, receives the first two, 38 numbers.
 
     Attributes:
         last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m],
@@ -556,30 +555,3 @@ class ThrowEnv(VecEnv):
                     f"environment state {name!r}; expected shape {tuple(target.shape)}, got {have}"
                 )
             target.copy_(saved[name])
-
-
-class EstimatedEnv(ThrowEnv):
-    """A ThrowEnv whose actor looks at a recurrent estimate of its observation."""
-
-    def __init__(
-        self,
-        experiment: Experiment,
-        estimator: Estimator,
-        device: str = "cpu",
-        seed: int = 0,
-        count: int | None = None,
-    ):
-        """Build as :class:`ThrowEnv`; the estimator is moved to the device."""
-        self._estimator = estimator.to(device)
-        super().__init__(experiment, device, seed, count)
-
-    def _remembered(self) -> dict[str, Tensor]:
-        memory = torch.zeros(self.num_envs, self._estimator.memory, device=self.device)
-        return super()._remembered() | {"estimator": memory}
-
-    def _observe(self, fresh: Tensor) -> TensorDict:
-        observed = super()._observe(fresh)
-        memory = self._memory["estimator"] * ~fresh[:, None]
-        observed["actor"], memory = self._estimator.step(observed["actor"], memory)
-        self._memory["estimator"].copy_(memory)
-        return observed

@@ -38,7 +38,7 @@ def drawn_views(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("given", [False, True])
 @pytest.mark.parametrize("count", [1, 3, 7])
-@pytest.mark.parametrize("name", ["state", "vision", "vision_betaflight"])
+@pytest.mark.parametrize("name", ["state", "vision", "vision_located", "vision_betaflight"])
 def test_observation_and_decision_of_shipped_policies(name, count, given):
     pilot = Pilot(
         Policy.load(find_policy(name)),
@@ -47,7 +47,7 @@ def test_observation_and_decision_of_shipped_policies(name, count, given):
     )
     rng, fits = np.random.default_rng(0), pilot.layout.fits
     history, answers, sums = pilot._history, pilot._answers, pilot._goal_fit
-    previous, memory = pilot.previous_action, np.zeros((count, 0), dtype=np.float32)
+    previous, memory = pilot.previous_action, pilot._memory
     for step in range(CALLS):
         carried = [
             previous,
@@ -63,7 +63,7 @@ def test_observation_and_decision_of_shipped_policies(name, count, given):
         )
         answers, *rest = rest if pilot.layout.response else (answers, *rest)
         sums = rest[0] if fits else sums
-        previous, *_ = equal(pilot._decide, [observation, memory])
+        previous, *_, memory = equal(pilot._decide, [observation, memory])
 
 
 def test_a_memory_that_torch_writes_in_place():

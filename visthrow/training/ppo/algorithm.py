@@ -8,9 +8,9 @@ from rsl_rl.algorithms import PPO
 
 from sim.torch_bridge import captured
 from visthrow.common.errors import ConfigError
-from visthrow.onboard.policy import Policy, find_policy
-from visthrow.task import Experiment, PPOParams, contract_of
-from visthrow.training.env import EstimatedEnv, ThrowEnv
+from visthrow.onboard.policy import Policy
+from visthrow.task import Experiment, PPOParams
+from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import CapturableGaussian, Network
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
@@ -69,40 +69,16 @@ class PPOTraining:
         self.experiment, self.device = experiment, device
         self.iterations = p.iterations
         self.samples = p.environments * p.steps * ranks.world
-        start = self._start_policy()
-        self._estimator = start and start.estimator
-        self.env = (
-            EstimatedEnv(experiment, self._estimator, device, seed)
-            if self._estimator
-            else ThrowEnv(experiment, device, seed)
-        )
+        self.env = ThrowEnv(experiment, device, seed)
         with contextlib.redirect_stdout(io.StringIO()):
             self.alg: CapturedPPO = PPO.construct_algorithm(
                 self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
             )
         self.alg.train_mode()
-        if start:
-            self.alg.actor.take_up(start)
         ranks.share(self.alg.actor, self.alg.critic)
         self._obs = self.env.get_observations()
         self._graph: torch.cuda.CUDAGraph | None = None
         self._rollouts = 0
-
-    def _start_policy(self) -> Policy | None:
-        """Load the policy that ``ppo.estimator`` names; ConfigError where it does not fit."""
-        p = self.experiment.ppo
-        if not p.estimator:
-            return None
-        policy = Policy.load(find_policy(p.estimator))
-        policy.require(contract_of(self.experiment), ("observation", "action", "control_period"))
-        hidden = tuple(len(bias) for bias in policy.biases[:-1])
-        if policy.estimator is None or hidden != p.hidden or policy.mean is None:
-            raise ConfigError(
-                f"ppo.estimator {p.estimator!r} has layers {hidden} and"
-                f" {'no' if policy.estimator is None else 'a'} memory; expected layers {p.hidden},"
-                " a memory and a normaliser"
-            )
-        return policy
 
     def _rollout(self) -> None:
         obs = self._obs
@@ -151,11 +127,7 @@ class PPOTraining:
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         return Policy.from_actor_state(
-            self.alg.actor.state_dict(),
-            self.experiment.ppo.activation,
-            contract,
-            made_by,
-            self._estimator,
+            self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by
         )
 
     def take_up(self, policy: Policy) -> None:
