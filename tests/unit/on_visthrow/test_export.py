@@ -61,8 +61,9 @@ def rollout(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
     generator = torch.Generator().manual_seed(11)
     shape = (STEPS, THROWS, policy.obs_dim)
     obs = 1.5 * torch.randn(shape, generator=generator)
-    if policy.mean is not None and policy.estimator is None:
-        obs = policy.mean + policy.std * obs
+    first = policy if policy.estimator is None else policy.estimator  # what the input meets first
+    if first.mean is not None:
+        obs = first.mean + first.std * obs
     memory, actions = policy.begin(THROWS), []
     for row in obs:
         action, memory = policy.step(row, memory)
