@@ -34,6 +34,9 @@ from tests.fakes.ports import ListeningPort
 FACTS = values("betaflight")
 # silence after which the motors idle, with all channels by MSP [s]
 IDLE_AFTER = FACTS["receiver_hold"] + FACTS["receiver_recheck"]
+# the delay counts from the last look at a receiver that was not lost yet: 1.6 s in all, as the
+# firmware in software was measured
+STILL_THERE = FACTS["receiver_lost"] - FACTS["receiver_recheck"]
 RECEIVER_LOST, LOW_FIRST = FACTS["block_receiver_lost"], FACTS["block_not_disarmed"]
 ARM_SWITCH, TILTED = FACTS["block_switch"], FACTS["block_angle"]
 REACTION = 0.5  # of the pilot, from the first stick frame to the override switch [s]
@@ -257,7 +260,7 @@ class FakeBetaflight(PortFake):
             return self.hold(self._place)
         if quiet > IDLE_AFTER:
             self.happened("failsafe: motors idle")
-        if quiet > self.parameters["failsafe_delay"] + FACTS["receiver_recheck"]:
+        if quiet > self.parameters["failsafe_delay"] + STILL_THERE:
             self.armed, self.override, self._disarmed = False, False, True
             self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target
