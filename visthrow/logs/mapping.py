@@ -11,7 +11,7 @@ from visthrow.logs.flightlog import FRAMES, STANDARD_CHANNELS
 from visthrow.logs.units import to_si
 
 _ORDERS = ("xyzw", "wxyz")
-_WIDTH = {"quaternion": (4,), "euler": (3,), "vector": None}
+_WIDTH = {"quaternion": (4,), "euler": (3,), "rotvec": (3,), "matrix": (9,), "vector": None}
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class ChannelMap:
     name: str
     columns: tuple[str, ...]
     unit: str  # of the columns
-    kind: Literal["vector", "quaternion", "euler"] = (
-        "vector"  # euler: roll, pitch, yaw; yaw is turned first
-    )
+    # euler: roll, pitch, yaw; yaw is turned first. rotvec: axis times angle. matrix: nine numbers,
+    # column after column
+    kind: Literal["vector", "quaternion", "euler", "rotvec", "matrix"] = "vector"
     order: str = "xyzw"  # of a quaternion's columns
     # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": as they come
     axes: str = ""

@@ -24,6 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=ABOVE_ZERO,
         help="of the vehicle alone, from a scale, in kilograms",
     )
+    parser.add_argument(
+        "--time-unit", choices=("s", "ms", "us", "ns"), help="of the stamps, where it is known"
+    )
     parser.add_argument("--out", metavar="FILE", help="write the mapping to this file")
 
 
@@ -33,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs.proposal import propose
     from visthrow.logs import table_of
 
-    found = propose(table_of(args.file), args.file, args.mass)
+    found = propose(table_of(args.file), args.file, args.mass, args.time_unit)
     text = toml_of(found, Path(args.file).name)
     if args.out:
         atomic_write(args.out, text)
@@ -47,6 +50,7 @@ def toml_of(found, name: str) -> str:
     """Return a proposal as the text of a file of ``configs/diagnose``."""
     lines = [f"# Proposed for {name}. Answer each question, then remove it."]
     lines += [f"# question: {question}" for question in found.questions]
+    lines += [f"# left out: {part}" for part in found.left_out]
     lines += [f'about = "{name}"']
     if found.mapping is None:
         return "\n".join(lines) + "\n"

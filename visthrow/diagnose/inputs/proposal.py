@@ -14,10 +14,13 @@ import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import unit_evidence
+from visthrow.logs.axes import turn_of
 from visthrow.logs.check import physics, relations, thrust
+from visthrow.logs.check.rows import Known
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
-from visthrow.logs.readers.table import Table, logs_of, make_channel
+from visthrow.logs.readers.layout import unit_of
+from visthrow.logs.readers.table import Table, logs_of, lost_rows, make_channel
 from visthrow.logs.units import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
@@ -47,14 +50,16 @@ _ESTIMATE = re.compile(r"est|ekf|kalman", re.IGNORECASE)
 _CAPTURE = re.compile(r"loc|mocap|vicon|opti|qualisys", re.IGNORECASE)
 _HINTS = (
     ("acc_b", r"acc|imu.*a[xyz]?$"),
-    ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$"),
+    ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$|(^|[._])r_rpy$"),
     ("velocity", r"vel|(^|[._])v$|speed"),
     ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
     (
         "position",
-        r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$",
+        r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$|(^|[._])t$|(^|[._])p_",
     ),
 )
+UPS = ("", "x,-z,y")
+"""Axes of a world whose z is up, and of one whose y is, as Motive's."""
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
 _TURN = 7.0  # above a full turn in radians: degrees
 
@@ -80,13 +85,17 @@ class Proposal:
     )
     why: dict[str, str] = field(default_factory=dict)  # by channel
     questions: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)  # columns that no channel takes, and parts
 
 
-def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
+def propose(
+    table: Table, source: str, mass: float | None = None, time_unit: str | None = None
+) -> Proposal:
     """Propose a mapping of the columns of a table, or of the tables of a recording.
 
-    ``source``: what messages call it; ``mass``: of the vehicle alone [kg], where it was weighed.
-    Raises LogError: no column holds numbers that change.
+    ``source``: what messages call it; ``mass``: of the vehicle alone [kg], where it was weighed;
+    ``time_unit``: of the stamps, where it is known. Raises LogError: no column holds numbers that
+    change.
     """
     numbers = {
         name: cells.astype(float) for name, cells in table.items() if cells.dtype.kind in "fiub"
@@ -98,13 +107,14 @@ def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
-        clock, time = _clock(part, found)
+        clock, time = _clock(part, found, time_unit)
         columns = {
             name: cells
             for name, cells in part.items()
             if name != clock.column and len(cells) == len(time)
         }
-        mine = _Chooser(time, _groups(columns), found).channels()
+        settings = getattr(table, "settings", {})
+        mine = _Chooser(time, _groups(columns), found, settings).channels()
         for entry in mine:
             if entry.name in channels:
                 found.questions.append(
@@ -114,6 +124,9 @@ def propose(table: Table, source: str, mass: float | None = None) -> Proposal:
                 channels[entry.name] = replace(entry, clock=topic)
         if mine:
             clocks[topic] = clock
+    used = {column for entry in channels.values() for column in entry.columns}
+    used |= {clock.column for clock in clocks.values()}
+    found.left_out = [name for name in table if name not in used] + getattr(table, "left_out", [])
     if not channels:
         found.questions.append(
             "no column looks like a position, an attitude, rates, forces or motors: which columns"
@@ -139,10 +152,11 @@ def _tables(numbers: Table) -> dict[str, Table]:
     return tables
 
 
-def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
+def _clock(numbers: Table, found: Proposal, told: str | None) -> tuple[TimeColumn, np.ndarray]:
     """The column of stamps and its unit, or evenly spaced rows."""
     rising = [name for name, cells in numbers.items() if _rises(cells)]
     named = [name for name in rising if _TIME.search(name)]
+    named.sort(key=lambda name: "frame" in name.lower())  # frames only where nothing is a time
     name = next(iter(named or rising), None)
     if name is None:
         count = max(map(len, numbers.values()))
@@ -152,7 +166,7 @@ def _clock(numbers: Table, found: Proposal) -> tuple[TimeColumn, np.ndarray]:
         )
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
     step = float(np.nanmedian(np.diff(numbers[name])))
-    suffix = _SUFFIX.get(_words(name)[-1], "")
+    suffix = told or _split_unit(name)[1] or _SUFFIX.get(_words(name)[-1], "")
     rate = re.search(r"(\d+) ?hz", name, re.IGNORECASE)
     if rate and f"1/{rate[1]} s" in UNITS:
         suffix = f"1/{rate[1]} s"
@@ -189,6 +203,20 @@ def _words(name: str) -> list[str]:
     )
 
 
+_BRACKETS = re.compile(r"^(.+?)\s*[\[(]\s*([^\d\[\]()][^\[\]()]*|)\s*[\])]$")
+_NUMBERED = re.compile(r"^(.*?)[._\[]?([0-8])\]?$")
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    """A name without the unit in brackets at its end, and that unit; "" where it has none."""
+    match = _BRACKETS.match(name)
+    if match is None:
+        return name, ""
+    unit = unit_of(match[2])
+    known = next((u for u in (match[2], unit or "", _SUFFIX.get(unit or "", "")) if u in UNITS), "")
+    return (match[1], known) if known or unit is not None else (name, "")
+
+
 _ENDINGS = {
     **{letter: letter for letter in "xyzw"},
     "north": "x",
@@ -218,55 +246,85 @@ def _groups(numbers: Table) -> list[Group]:
     single ones.
     """
     parts: dict[tuple[str, str], dict[str, str]] = {}
-    motors: dict[str, list[str]] = {}
+    motors: dict[tuple[str, str], list[str]] = {}
+    digits: dict[tuple[str, str], dict[int, str]] = {}
     for name in numbers:
-        motor, match = _MOTOR.match(name), _COMPONENT.match(name)
+        base, unit = _split_unit(name)
+        motor, match, digit = (r.match(base) for r in (_MOTOR, _COMPONENT, _NUMBERED))
         if motor:
-            motors.setdefault(motor[1] + (motor[3] or ""), []).append(name)
+            motors.setdefault((motor[1] + (motor[3] or ""), unit), []).append(name)
+        if digit:
+            digits.setdefault((digit[1], unit), {})[int(digit[2])] = name
         if match:
             angle = "rpy" if match[2].lower() in ("roll", "pitch", "yaw") else ""
-            parts.setdefault((match[1] + angle, (match[3] or "").lower()), {}).setdefault(
-                _ENDINGS[match[2].lower()], name
-            )
-    groups, used = [], set()
-    for names in motors.values():
-        if len(names) == 4:
-            groups.append(
-                Group("motor", tuple(names), np.column_stack([numbers[n] for n in names]))
-            )
-            used |= set(names)
-    for (stem, unit), of in parts.items():
-        for letters in ("xyzw", "xyz"):
-            columns = tuple(of[letter] for letter in letters if letter in of)
-            if len(columns) == len(letters) and not used & set(columns):
-                groups.append(
-                    Group(
-                        stem,
-                        columns,
-                        np.column_stack([numbers[n] for n in columns]),
-                        _SUFFIX.get(unit, ""),
-                    )
-                )
-                used |= set(columns)
-                break
-    singles = [name for name in numbers if name not in used]
-    return groups + [
-        Group(name, (name,), numbers[name][:, None], _SUFFIX.get(_words(name)[-1], ""))
-        for name in singles
+            key = (match[1] + angle, unit or _SUFFIX.get((match[3] or "").lower(), ""))
+            parts.setdefault(key, {}).setdefault(_ENDINGS[match[2].lower()], name)
+    found = [("motor", unit, names) for (_, unit), names in motors.items() if len(names) == 4]
+    found += [
+        (stem, unit, [of[i] for i in sorted(of)])
+        for (stem, unit), of in digits.items()
+        if sorted(of) in ([*range(9)], [1, 2, 3, 4])
     ]
+    for (stem, unit), of in parts.items():
+        letters = "xyzw" if set("xyzw") <= of.keys() else "xyz"
+        if set(letters) <= of.keys():
+            found.append((stem, unit, [of[letter] for letter in letters]))
+    found += [("", "", names) for names in _without_names(numbers)]
+    groups, used = [], set()
+    for stem, unit, names in found:
+        if not used & set(names):
+            values = np.column_stack([numbers[name] for name in names])
+            groups.append(Group(stem, tuple(names), values, unit))
+            used |= set(names)
+    return groups + [
+        Group(
+            name,
+            (name,),
+            numbers[name][:, None],
+            _split_unit(name)[1] or _SUFFIX.get(_words(name)[-1], ""),
+        )
+        for name in numbers
+        if name not in used
+    ]
+
+
+def _without_names(numbers: Table) -> list[list[str]]:
+    """Neighbours in a table without a header: four of length 1, and threes of the others."""
+    names = list(numbers)
+    if not names or not all(name.startswith("column ") for name in names):
+        return []
+    found, i, run = [], 0, []
+    while i < len(names):
+        four = np.column_stack([numbers[name] for name in names[i : i + 4]])
+        length = np.linalg.norm(four, axis=1)
+        if four.shape[1] == 4 and np.nanmax(np.abs(length - 1.0)) < 0.05:
+            found.append(names[i : i + 4])
+            i, run = i + 4, []
+            continue
+        run.append(names[i])
+        i += 1
+        if len(run) == 3:
+            found.append(run)
+            run = []
+    return found
 
 
 class _Chooser:
     """Decides which group is which channel."""
 
-    def __init__(self, time: np.ndarray, groups: list[Group], found: Proposal) -> None:
-        self.time, self.found = time, found
+    def __init__(
+        self, time: np.ndarray, groups: list[Group], found: Proposal, settings: dict[str, str]
+    ) -> None:
+        self.time, self.found, self.settings = time, found, settings
+        for group in groups:
+            group.values = np.where(lost_rows(time, group.values)[:, None], np.nan, group.values)
         self.groups = [g for g in groups if _moves(g.values)]
         self.taken: set[int] = set()
         self.attitudes: dict[
             str, Channel
         ] = {}  # the vehicle's, by the units that its angles may be in
         self.made: dict[str, tuple[ChannelMap, Channel]] = {}
+        self.unproven = ""  # angles that nothing but their name calls angles
         self.by: dict[
             tuple[str, ...], str
         ] = {}  # what says the unit of a path that no name says, by its columns
@@ -274,16 +332,22 @@ class _Chooser:
     def channels(self) -> list[ChannelMap]:
         """All that are recognised, the vehicle's path first."""
         self._quaternions()
+        self._turns()
         self._angles()
         if not self.attitudes and "quat_wb" in self.made:
             entry, channel = self.made["quat_wb"]
             self.attitudes = {entry.unit: channel}
         self._positions()
+        self._settle_turns()
         self._ask_angles()
         self._velocities()
         self._rates()
         self._forces()
         self._inputs()
+        if self.unproven and not self.made.keys() & {"pos_w", "rate_b"}:
+            self.found.questions.append(
+                f"are {self.unproven} angles, as taken, or body rates? Nothing in the motion says"
+            )
         if "pos_w" in self.made and not self.made.keys() & {
             "quat_wb",
             "rate_b",
@@ -351,12 +415,9 @@ class _Chooser:
                 name = "est_quat_wb" if name == "quat_wb" and "est" in group.stem.lower() else ""
             if not name:
                 continue
-            order = (
-                "xyzw"
-                if group.columns[0] == sorted(group.columns)[1]
-                or group.columns[-1].lower().find("w") >= 0
-                else "wxyz"
-            )
+            lettered = any("w" in _split_unit(c)[0].lower()[-3:] for c in group.columns)
+            largest = int(np.argmax(np.nanmean(np.abs(group.values), axis=0)))
+            order = "xyzw" if lettered or largest == 3 else "wxyz"
             frame = "" if name == "quat_wb" else "camera" if name == "marker_quat_c" else "world"
             self._take(
                 name,
@@ -368,9 +429,76 @@ class _Chooser:
                 frame=frame,
             )
 
+    def _turns(self) -> None:
+        """Attitudes as rotation matrices or rotation vectors, column after column."""
+        for size, kind, words in ((9, "matrix", r"rot"), (3, "rotvec", r"(^|[._])r$|helical")):
+            for group in self._open(size):
+                if "quat_wb" in self.made or not re.search(words, group.stem, re.IGNORECASE):
+                    continue
+                if _NOT_VEHICLE.search(group.stem):
+                    continue
+                unit = group.unit if group.unit in ("deg", "rad") else "rad"
+                why = "nine columns of a rotation" if size == 9 else f"three angles in {unit}"
+                self._take("quat_wb", group, "1" if size == 9 else unit, why, kind=kind)
+                if size == 3 and "quat_wb" in self.made:
+                    listed = ", ".join(group.columns)
+                    self.found.questions.append(
+                        f"are {listed} a rotation vector (Vicon's angle-axis), as taken, or roll,"
+                        ' pitch and yaw (kind = "euler")?'
+                    )
+
+    def _settle_turns(self) -> None:
+        """Order of a quaternion that no name says, and which axis is up, by what the lean does."""
+        if not {"quat_wb", "pos_w"} <= self.made.keys():
+            return
+        entry, (place, path) = self.made["quat_wb"][0], self.made["pos_w"]
+        named = entry.kind != "quaternion" or any("w" in c.lower() for c in entry.columns)
+        group = next(g for g in self.groups if g.columns == entry.columns)
+        orders = (entry.order,) if named else ("wxyz", "xyzw")
+        motive = "Format Version" in self.settings
+        ups = UPS if motive or self.settings else UPS[:1]
+        scores = {}
+        for order in orders:
+            for axes in ups:
+                tried = replace(entry, order=order, axes=axes, body_axes=axes)
+                quat = make_channel(self.time, group.values, tried, "table")[0]
+                turned = path.values @ (turn_of(axes).T if axes else np.eye(3))
+                scores[order, axes] = unit_evidence.lean_misfit(
+                    path.time, np.where(path.valid[:, None], turned, np.nan), quat
+                )
+        ranked = sorted(scores, key=lambda of: scores[of][0])
+        best = ranked[0]
+        nats = scores[best][1] * (
+            np.log(scores[ranked[1]][0] / scores[best][0]) if len(ranked) > 1 else 0.0
+        )
+        sure = len(ranked) == 1 or (np.isfinite(nats) and nats > 10.0)
+        if not sure:
+            best = (entry.order, UPS[1] if motive else "")
+        order, axes = best
+        entry = replace(entry, order=order, axes=axes, body_axes=axes)
+        self.made["quat_wb"] = entry, make_channel(self.time, group.values, entry, "table")[0]
+        points = next(g for g in self.groups if g.columns == place.columns)
+        place = replace(place, axes=axes)
+        self.made["pos_w"] = place, make_channel(self.time, points.values, place, "table")[0]
+        if len(ranked) > 1 and sure:
+            words = f"axes {axes or 'x,y,z'}" if named else f"order {order}, axes {axes or 'x,y,z'}"
+            self.found.why["quat_wb"] += f"; {words} by gravity, {nats:.0f} nats"
+        elif len(ranked) > 1:
+            asked = (
+                "" if named else f"is the order of {', '.join(entry.columns)} {order}, as taken? "
+            )
+            asked += f"which axis is up? '{axes or 'x,y,z'}' is taken; " if len(ups) > 1 else ""
+            self.found.questions.append(asked + "nothing in the motion says")
+
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g)]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
+        if not groups:  # no name speaks of a place
+            others = [of for name, of in _HINTS if name != "position"]
+            groups = [g for g in smooth if not any(re.search(of, g.stem.lower()) for of in others)]
+            self.found.questions += [
+                f"are {', '.join(g.columns)} a position? Their names do not say" for g in groups
+            ]
         moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
         groups = [
             g
@@ -575,6 +703,8 @@ class _Chooser:
                 for g in self._open(3)
                 if (r := self._relation(path, g, _BELONGS)) is not None
             ]
+            if name == "pos_w" and self._body_velocity(path, found):
+                continue
             if not found:
                 continue
             _, group, relation = max(found, key=lambda of: of[0])
@@ -586,6 +716,35 @@ class _Chooser:
                 f" {relation.scale:.3g} of its unit a second"
             )
             self._take(own, group, unit, why, frame="world" if own == "est_vel_w" else "")
+
+    def _body_velocity(self, path: Group, world: list) -> bool:
+        """Take a velocity that is the path's in the body's axes rather than in the world's."""
+        attitude = self.made.get("quat_wb", (None, None))[1]
+        if attitude is None or len(attitude.time) < 100:
+            return False
+        time, both = unit_evidence.rising(self.time, path.values)
+        at, derived = relations.derivative(time, both, 0.1)
+        if len(at) < 100:
+            return False
+        turned = relations.attitude_at(*attitude.samples(), at).inv().apply(derived)
+        best = max((correlation for correlation, *_ in world), default=0.0)
+        for group in self._open(3):
+            good = np.all(np.isfinite(group.values), axis=1)
+            if not self._hinted(group, "velocity") or np.sum(good) < 100:
+                continue
+            found = relations.relate(at, turned, self.time[good], group.values[good], reach=0.2)
+            if found is None or found.correlation < _FIRMLY:
+                continue
+            clear = 0.5 * np.ptp(at) / relations.INDEPENDENT
+            nats = clear * np.log((1.0 - best**2) / max(1.0 - found.correlation**2, 1e-6))
+            if nats > 10.0:
+                unit = group.unit if group.unit.endswith("/s") else "m/s"
+                why = (
+                    f"the derivative of pos_w in the body's axes, {nats:.0f} nats over the world's"
+                )
+                self._take("vel_b", group, unit, why, frame="body")
+                return True
+        return False
 
     def _angles(self) -> None:
         for group in self._open(3):
@@ -602,6 +761,8 @@ class _Chooser:
             self._take(
                 "quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler"
             )
+            if "quat_wb" in self.made and not group.unit:
+                self.unproven = ", ".join(group.columns)
             if "quat_wb" in self.made and largest <= _TURN and not group.unit:
                 entry, radians = self.made["quat_wb"]
                 degrees, _ = make_channel(
@@ -641,6 +802,13 @@ class _Chooser:
         if score > _BELONGS:
             unit = "deg/s" if times > 7.0 else "rad/s"
             why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
+        elif not group.unit:
+            listed = ", ".join(group.columns)
+            if group.columns == ("gyro.x", "gyro.y", "gyro.z"):
+                unit, why = "deg/s", why + "; a Crazyflie's gyro.x is in deg/s"
+            self.found.questions.append(
+                f"are the rates {listed} in rad/s or deg/s? '{unit}' is taken: no attitude says"
+            )
         self._take("rate_b", group, unit, why)
 
     def _forces(self) -> None:
@@ -663,10 +831,28 @@ class _Chooser:
                     frame="body",
                 )
 
+    def _rotor_speeds(self, group: Group, high: float) -> bool:
+        """Take four motors as speeds where their names or unit say so."""
+        words = " ".join(group.columns)
+        if group.unit not in ("rpm", "rad/s") and not re.search(
+            r"rpm|speed|omega|rad_?s", words, re.IGNORECASE
+        ):
+            return False
+        named = group.unit in ("rpm", "rad/s")
+        unit = group.unit if named else "rpm" if re.search("rpm", words, re.IGNORECASE) else "rad/s"
+        self._take("motor_speed", group, unit, f"four rotors' speeds up to {high:.5g} {unit}")
+        self.found.questions.append(
+            f"rotors {', '.join(group.columns)}: order them front left, front right, rear left,"
+            " rear right; are they electrical revolutions (divide by pole pairs)?"
+        )
+        return True
+
     def _inputs(self) -> None:
         for group in self._open(4):
             if group.stem == "motor" and "motor_command" not in self.made:
                 high = float(np.nanpercentile(group.values, 99))
+                if self._rotor_speeds(group, high):
+                    continue
                 unit = (
                     "1/65535"
                     if high > 5000.0
@@ -824,11 +1010,26 @@ def _usual(total: np.ndarray) -> float:
     return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
 
 
+def _driving(log: FlightLog, found: Proposal) -> str:
+    """The input that the force follows best, "" where that cannot be told."""
+    inputs = [name for name in thrust.INPUTS if name in log]
+    scores = {name: s for name in inputs if (s := thrust.follows(log, name)) is not None}
+    if len(inputs) < 2 or not scores:
+        return ""
+    best = max(scores, key=scores.__getitem__)
+    listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
+    found.questions.append(
+        f"which of {', '.join(inputs)} drives the vehicle? The force follows '{best}' best"
+        f" (correlations: {listed})"
+    )
+    return best
+
+
 def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | None:
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
     small quadrotor at rest air.
     """
-    applied = thrust.thrust_of(log)
+    applied = thrust.thrust_of(log, Known(thrust_input=_driving(log, found)))
     if (
         applied is None
         or "quat_wb" not in log

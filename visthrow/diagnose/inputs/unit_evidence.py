@@ -79,6 +79,28 @@ def by_lean(
     return found
 
 
+def lean_misfit(time: np.ndarray, path: np.ndarray, attitude: Channel) -> tuple[float, float]:
+    """Measure how badly the force on a path points along its vehicle's z axis.
+
+    Args:
+        time: Stamps of the path [s], shape (T,).
+        path: The path [m], z up, shape (T, 3).
+        attitude: Of the vehicle.
+
+    Returns:
+        Mean square of the force across that axis [m^2/s^4], and half the number of samples that
+        count as independent; infinite and 0 where too little is known.
+    """
+    time_q, quat = attitude.samples()
+    at, acc = physics.accelerations(*rising(time, path), "m", _SPAN)
+    if min(len(at), len(time_q)) < 50:
+        return np.inf, 0.0
+    up = relations.attitude_at(time_q, quat, at).apply([0.0, 0.0, 1.0])
+    across = np.cross(up, acc + [0.0, 0.0, GRAVITY])
+    least = 1e-4  # noise of a still path [m^2/s^4]
+    return float(np.mean(np.sum(across**2, axis=1))) + least, 0.5 * float(np.ptp(at)) / _SPAN
+
+
 def by_fall(time: np.ndarray, path: np.ndarray) -> str:
     """Find the unit in which a part of a path falls freely: gravity along one axis and nothing
     level; "" where none does.

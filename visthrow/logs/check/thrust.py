@@ -71,6 +71,16 @@ def thrust_of(log: FlightLog, known: Known = NOTHING) -> tuple[str, np.ndarray, 
     return name, time, np.sum(values, axis=1, keepdims=True)
 
 
+def follows(log: FlightLog, name: str) -> float | None:
+    """Return how well the measured force follows an input, as a correlation; None where unknown."""
+    told = thrust_of(log, Known(thrust_input=name))
+    if told is None or np.median(told[2]) <= 0.0:
+        return None
+    found = [c for felt in ("acc_b", "path") if (c := _correlations(log, *told[1:], felt))]
+    motors = (_DELAYS > -0.005) & (_DELAYS < _LATEST)
+    return max((float(np.max(curve[motors])) for curve, _ in found), default=None)
+
+
 def mass_of(log: FlightLog, known: Known = NOTHING) -> float | None:
     """Return the mass that the thrust carries by the accelerometer, in flight [kg]; None where the
     log does not tell.

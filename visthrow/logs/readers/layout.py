@@ -165,7 +165,9 @@ def _sorted_head(
     for i, (_, cells) in enumerate(head):
         if cells[0].startswith(("#", "%")):
             cells = [cells[0].lstrip("#% "), *cells[1:]]
-            cells = cells[1:] if not cells[0] and len(cells) > width else cells
+            cells = cells if cells[0] else cells[1:]
+            if not any(cells):
+                continue
         filled = [cell for cell in cells if cell]
         while len(cells) > width and not cells[-1]:
             cells.pop()

@@ -292,6 +292,7 @@ def make_channel(
     notes["blank"] = int(np.sum(blank))
     time, values = time[rows[~blank]], values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
+    valid &= ~lost_rows(time, values)
     if bad is not None:
         valid &= ~bad[rows[~blank]]
         notes["invalid by the source"] = int(np.sum(bad[rows[~blank]]))
@@ -346,6 +347,24 @@ def _forward(time: np.ndarray) -> np.ndarray:
     return earlier if np.sum(earlier) > np.sum(later) else later
 
 
+def lost_rows(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Tell rows of three or more columns that are all zero where the body jumps to and from them:
+    a capture's word for a body that it does not see. Shapes (T,) and (T, C); returns bool, (T,).
+    """
+    zero = np.all(values == 0.0, axis=1)
+    if values.shape[1] < 3 or not np.any(zero) or np.all(zero) or len(time) != len(values):
+        return np.zeros(len(values), bool)
+    size = np.linalg.norm(np.nan_to_num(values), axis=1)
+    usual = np.percentile(np.abs(np.diff(size[~zero])), 99) if np.sum(~zero) > 2 else 0.0
+    starts = np.flatnonzero(zero & ~np.append(False, zero[:-1]))
+    ends = np.flatnonzero(zero & ~np.append(zero[1:], False))
+    lost = np.zeros(len(values), bool)
+    for start, end in zip(starts, ends):
+        beside = [i for i in (start - 1, end + 1) if 0 <= i < len(size)]
+        lost[start : end + 1] = all(size[i] > 10.0 * usual for i in beside)
+    return lost
+
+
 def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray:
     values = (values * entry.scale + entry.offset) * factor
     if entry.kind == "vector":
@@ -354,7 +373,14 @@ def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarr
         return values
     from scipy.spatial.transform import Rotation
 
-    if entry.kind == "euler":
+    if entry.kind == "matrix":
+        good = np.abs(np.linalg.norm(values, axis=1) - np.sqrt(3.0)) < 0.1
+        whole = np.where(good[:, None], values, np.eye(3).ravel())
+        matrices = whole.reshape(-1, 3, 3).transpose(0, 2, 1)  # column after column
+        quat = Rotation.from_matrix(matrices).as_quat() * good[:, None]
+    elif entry.kind == "rotvec":
+        quat = Rotation.from_rotvec(values).as_quat()
+    elif entry.kind == "euler":
         quat = Rotation.from_euler("ZYX", values[:, ::-1]).as_quat()
     else:
         quat = values[:, [1, 2, 3, 0]] if entry.order == "wxyz" else values

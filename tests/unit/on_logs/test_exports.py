@@ -1,0 +1,305 @@
+"""Exports of motion capture and trajectories of data sets, each as its tool writes it."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from visthrow.common.errors import LogError
+from visthrow.diagnose.inputs.proposal import propose
+from visthrow.logs import read, table_of
+from visthrow.logs.readers.table import logs_of
+
+TIME = 0.01 * np.arange(400)
+YAW = 0.3
+
+
+def motion(time=TIME, phase=0.0):
+    """Position [m], z up, and attitude of a vehicle whose lean makes its acceleration."""
+    pos = np.column_stack(
+        [np.sin(1.2 * time + phase), 0.5 * np.cos(1.7 * time), 1.5 + 0.1 * np.sin(time)]
+    )
+    acc = np.column_stack(
+        [
+            -(1.2**2) * np.sin(1.2 * time + phase),
+            -0.5 * 1.7**2 * np.cos(1.7 * time),
+            9.81 - 0.1 * np.sin(time),
+        ]
+    )
+    up = acc / np.linalg.norm(acc, axis=1)[:, None]
+    ahead = np.cross(np.cross(up, [np.cos(YAW), np.sin(YAW), 0.0]), up)
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    return pos, Rotation.from_matrix(np.stack([ahead, np.cross(up, ahead), up], axis=-1))
+
+
+POS, TURN = motion()
+Y_UP = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # of z up
+
+
+def lines(rows, mark=",", comma=False):
+    out = io.StringIO()
+    csv.writer(out, delimiter=mark, lineterminator="\n").writerows(rows)
+    return out.getvalue().replace(".", ",") if comma else out.getvalue()
+
+
+def motive(version="1.23", pos=POS, turn=TURN, scale=1.0, units="Meters", gap=slice(0, 0)):
+    places = pos @ Y_UP.as_matrix().T * scale
+    quats = (Y_UP * turn * Y_UP.inv()).as_quat()
+    head = ["Format Version", version, "Take Name", "t", "Capture Frame Rate", "100.000000"]
+    head += ["Export Frame Rate", "100.000000", "Rotation Type", "Quaternion"]
+    head += ["Length Units", units, "Coordinate Space", "Global"]
+    count = 8
+    rows = [["", "Type"] + ["Rigid Body"] * count, ["", "Name"] + ["quad"] * count]
+    rows.append(["", "ID"] + ["1" if version < "2" else "5B1F" * 8] * count)
+    rows += [["", "Parent"] + [""] * count] if version > "2" else []
+    kinds = ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"]
+    rows += [["", "", *kinds], ["Frame", "Time (Seconds)", *"XYZWXYZ", ""]]
+    for i, t in enumerate(TIME):
+        lost = i in range(gap.start, gap.stop)
+        cells = [""] * 8 if lost else [*quats[i].round(6), *places[i].round(6), 0.0002]
+        rows.append([i, f"{t:.6f}", *cells])
+    return lines([head]) + "\n" + lines(rows)
+
+
+def vicon(kind="Objects", unit="rad", twice=False):
+    vectors = TURN.as_rotvec() * (1.0 if unit == "rad" else 180.0 / np.pi)
+    names = ["", "", "quad:quad", "", "", "", "", ""]
+    rows = [names, ["Frame", "Sub Frame", "RX", "RY", "RZ", "TX", "TY", "TZ"]]
+    rows.append(["", "", unit, unit, unit, "mm", "mm", "mm"])
+    for i in range(len(TIME)):
+        rows.append([i + 1, 0, *vectors[i].round(7), *(1e3 * POS[i]).round(4)])
+    return f"{kind}\n100\n{lines(rows)}" + ("\n" if twice else "")
+
+
+def qualisys(bodies=("quad",)):
+    head = [("NO_OF_FRAMES", len(TIME)), ("NO_OF_BODIES", len(bodies)), ("FREQUENCY", 100)]
+    head += [("DESCRIPTION", "--"), ("DATA_INCLUDED", "6D"), ("BODY_NAMES", *bodies)]
+    names = ["Frame", "Time"]
+    for body in bodies:
+        names += [f"{body} X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual"]
+        names += [f"Rot[{i}]" for i in range(9)]
+    rows = [names]
+    matrices = TURN.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
+    for i, t in enumerate(TIME):
+        row = [i + 1, f"{t:.5f}"]
+        for number, _ in enumerate(bodies):
+            place = POS[i] - [0.0, 0.0, 0.5 * number]
+            row += [*(1e3 * place).round(4), 0, 0, 0, 0.3, *matrices[i].round(7)]
+        rows.append(row)
+    return lines(head, "\t") + lines(rows, "\t")
+
+
+QUATS = TURN.as_quat()
+TUM = [[f"{1e9 + t:.4f}", *p.round(6), *q.round(7)] for t, p, q in zip(TIME, POS, QUATS)]
+WXYZ = np.column_stack([POS, QUATS[:, [3, 0, 1, 2]]]).round(7)
+EXPORTS = {
+    "motive 1.23.csv": motive(),
+    "motive 3.csv": motive("3.0", scale=1e3, units="Millimeters"),
+    "motive with a gap.csv": motive(gap=slice(100, 150)),
+    "vicon nexus.csv": vicon(),
+    "vicon tracker.csv": vicon("Objects", "deg", twice=True),
+    "qualisys.tsv": qualisys(),
+    "tum with a hash.txt": "# timestamp tx ty tz qx qy qz qw\n" + lines(TUM, " "),
+    "tum with two hashes.txt": "# ground truth\n# timestamp tx ty tz qx qy qz qw\n"
+    + lines(TUM, " "),
+    "tum without a head.txt": lines(TUM, " "),
+    "euroc.csv": "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],"
+    "q_RS_y [],q_RS_z []\n" + lines([[int(1e18 + 1e9 * t), *r] for t, r in zip(TIME, WXYZ)]),
+    "q1 to q4.csv": "time,x,y,z,q1,q2,q3,q4\n" + lines([[t, *r] for t, r in zip(TIME, WXYZ)]),
+    "q0 to q3, vector first.csv": "time,x,y,z,q0,q1,q2,q3\n"
+    + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))]),
+    "names that say nothing.csv": "time,log.x,log.y,log.z,log.qx,log.qy,log.qz,log.qw\n"
+    + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))]),
+    "units in a second line.csv": "time,x,y,z,qx,qy,qz,qw\ns,mm,mm,mm,,,,\n"
+    + lines([[t, *(1e3 * p).round(3), *q] for t, p, q in zip(TIME, POS, QUATS)]),
+    "units in brackets.csv": "t[s],x[mm],y[mm],z[mm],qx,qy,qz,qw\n"
+    + lines([[t, *(1e3 * p).round(3), *q] for t, p, q in zip(TIME, POS, QUATS)]),
+    "semicolons and commas.csv": "time;x;y;z;qx;qy;qz;qw\n"
+    + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))], ";", comma=True),
+    "line ends of windows.csv": motive().replace("\n", "\r\n"),
+}
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_export_gives_the_motion_that_it_was_made_of(name, tmp_path):
+    path = tmp_path / name
+    path.write_text(EXPORTS[name], newline="")
+    table = table_of(path)
+    found = propose(table, name)
+    log = logs_of(table, found.mapping, name)[0]
+    time = log["pos_w"].time - log["pos_w"].time[0]
+    pos, turn = motion(time)
+    good = log["pos_w"].valid
+    assert np.sum(good) >= 350
+    assert log["pos_w"].values[good] == pytest.approx(pos[good], abs=2e-3)
+    attitude = log["quat_wb"]
+    _, turn = motion(attitude.time - attitude.time[0])
+    ours = Rotation.from_quat(attitude.values[attitude.valid])
+    assert np.max((turn[attitude.valid].inv() * ours).magnitude()) < 2e-3
+    assert not any("which axis is up" in question for question in found.questions)
+
+
+@pytest.mark.parametrize("name", ["motive 3.csv", "vicon nexus.csv", "qualisys.tsv"])
+def test_every_column_that_is_left_out_is_listed(name, tmp_path):
+    path = tmp_path / name
+    path.write_text(EXPORTS[name])
+    table = table_of(path)
+    found = propose(table, name)
+    used = {column for entry in found.mapping.channels for column in entry.columns}
+    assert used | {found.mapping.time.column} | set(found.left_out) == set(table)
+    assert any("Frame" in column for column in found.left_out)
+
+
+def test_bodies_of_one_export_are_told_apart(tmp_path):
+    path = tmp_path / "two.tsv"
+    path.write_text(qualisys(("quad", "ball")))
+    table = table_of(path)
+    found = propose(table, "two.tsv")
+    log = logs_of(table, found.mapping, "two.tsv")[0]
+    gap = log["pos_w"].values - log["payload_pos_w"].values
+    assert gap == pytest.approx(np.tile([0.0, 0.0, 0.5], (len(TIME), 1)), abs=1e-6)
+
+
+def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
+    c3d = pytest.importorskip("c3d")
+    writer = c3d.Writer(point_rate=100.0, analog_rate=100.0)
+    for i, place in enumerate(1e3 * POS):
+        points = np.zeros((2, 5))
+        points[0, :3], points[0, 3] = place, -1.0 if 100 <= i < 150 else 0.5
+        writer.add_frames([(points, np.zeros((1, 1)))])
+    writer.set_point_labels(["ball", "tip"])
+    path = tmp_path / "a.c3d"
+    with path.open("wb") as file:
+        writer.write(file)
+    table = table_of(path)
+    assert np.sum(np.isnan(table["ball.X [mm]"])) == 50
+    assert table["ball.Z [mm]"][0] == pytest.approx(1500.0, abs=0.1)
+    assert table["time [s]"][-1] == pytest.approx(3.99)
+
+
+@pytest.mark.parametrize("mode", ["all zero", "position zero", "held"])
+def test_a_body_that_the_capture_lost_is_a_gap(mode, tmp_path):
+    pos, quat = POS.copy(), QUATS.copy()
+    pos[200:260] = pos[199] if mode == "held" else 0.0
+    quat[200:260] = {"all zero": [0, 0, 0, 0], "position zero": [0, 0, 0, 1]}.get(mode, quat[199])
+    rows = [[t, *p, *q, *(b - [0, 0, 0.5])] for t, p, q, b in zip(TIME, pos, quat, POS)]
+    path = tmp_path / "a.csv"
+    path.write_text("time,x,y,z,qx,qy,qz,qw,px,py,pz\n" + lines(rows))
+    table = table_of(path)
+    found = propose(table, "a.csv")
+    log = logs_of(table, found.mapping, "a.csv")[0]
+    assert "pos_w" in log
+    if mode != "held":
+        assert "payload_pos_w" in log
+        assert np.array_equal(np.flatnonzero(~log["pos_w"].valid), np.arange(200, 260))
+    assert not any("mirror" in question for question in found.questions)
+
+
+def test_zeros_of_a_body_that_stands_at_the_origin_are_no_gap(tmp_path):
+    pos = np.concatenate([np.zeros((100, 3)), POS - POS[0]])
+    rows = [[0.01 * i, *p, 0, 0, 0, 1] for i, p in enumerate(pos)]
+    path = tmp_path / "a.csv"
+    path.write_text("time,x,y,z,qx,qy,qz,qw\n" + lines(rows))
+    table = table_of(path)
+    log = logs_of(table, propose(table, "a.csv").mapping, "a.csv")[0]
+    assert np.all(log["pos_w"].valid)
+
+
+ASKED = {
+    "gyro.x,gyro.y,gyro.z,acc.x,acc.y,acc.z": "rad/s or deg/s",
+    "omega_x,omega_y,omega_z,acc_x,acc_y,acc_z": "rad/s or deg/s",
+    "controller.r_roll,controller.r_pitch,controller.r_yaw,a,b,c": "body rates",
+    "ctrl.roll,ctrl.pitch,ctrl.yaw,a,b,c": "angles, as taken, or body rates",
+}
+
+
+@pytest.mark.parametrize("head", ASKED)
+def test_what_nothing_checks_is_asked(head, tmp_path):
+    rng = np.random.default_rng(0)
+    rates = 0.5 * np.column_stack([np.sin(3 * TIME), np.cos(2 * TIME), np.sin(TIME)])
+    acc = [0.0, 0.0, 1.0] + rng.normal(0.0, 0.01, (len(TIME), 3))
+    path = tmp_path / "a.csv"
+    path.write_text(f"time,{head}\n" + lines([[t, *r, *a] for t, r, a in zip(TIME, rates, acc)]))
+    found = propose(table_of(path), "a.csv")
+    assert any(ASKED[head] in question for question in found.questions)
+
+
+@pytest.mark.parametrize("frame", ["world", "body"])
+def test_velocities_of_the_world_and_of_the_body_are_told_apart(frame, tmp_path):
+    turn = (
+        Rotation.from_euler("z", 0.8 * TIME[:, None]) * TURN
+    )  # it turns about itself all the while
+    vel = np.gradient(POS, TIME, axis=0)
+    vel = vel if frame == "world" else turn.inv().apply(vel)
+    rows = [[t, *p, *q, *v] for t, p, q, v in zip(TIME, POS, turn.as_quat(), vel)]
+    path = tmp_path / "a.csv"
+    path.write_text("time,x,y,z,qx,qy,qz,qw,vx,vy,vz\n" + lines(rows))
+    found = propose(table_of(path), "a.csv")
+    names = {entry.name for entry in found.mapping.channels}
+    assert ("vel_b" in names, "vel_w" in names) == (frame == "body", frame == "world")
+
+
+def test_rotor_speeds_are_proposed_as_speeds(tmp_path):
+    speeds = 6000.0 + 100.0 * np.sin(np.outer(TIME, [1.0, 1.1, 1.2, 1.3]))
+    for head, unit in (
+        ("rpm1,rpm2,rpm3,rpm4", "rpm"),
+        ("m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]", "rad/s"),
+    ):
+        path = tmp_path / "a.csv"
+        rows = [[t, *p, *s] for t, p, s in zip(TIME, POS, speeds)]
+        path.write_text(f"time,x,y,z,{head}\n" + lines(rows))
+        found = propose(table_of(path), "a.csv")
+        (entry,) = [e for e in found.mapping.channels if e.name == "motor_speed"]
+        assert entry.unit == unit
+
+
+def test_the_unit_of_time_can_be_told(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,x,y,z\n" + lines([[1e3 * t, *p] for t, p in zip(TIME, POS)]))
+    assert propose(table_of(path), "a.csv", time_unit="ms").mapping.time.unit == "ms"
+
+
+def test_a_log_that_needs_no_mapping_is_sent_to_check(tmp_path):
+    path = tmp_path / "a.ulg"
+    path.write_bytes(b"ULog")
+    with pytest.raises(LogError, match="visthrow diagnose check"):
+        table_of(path)
+
+
+def write_mcap(path, encodings):
+    """An MCAP file with a topic of each encoding, two messages each."""
+    writer_of = pytest.importorskip("mcap.writer").Writer
+    with path.open("wb") as file:
+        writer = writer_of(file)
+        writer.start()
+        schema = writer.register_schema("a", "jsonschema", b"{}")
+        for encoding in encodings:
+            topic = writer.register_channel(f"/{encoding}", encoding, schema)
+            for i in range(60):
+                data = (
+                    json.dumps({"values": [i, 2 * i]}).encode() if encoding == "json" else b"\xff"
+                )
+                writer.add_message(topic, int(1e7 * i), data, int(1e7 * i))
+        writer.finish()
+
+
+@pytest.mark.parametrize("others", [["protobuf"], ["cbor", "protobuf"], []])
+def test_topics_that_cannot_be_decoded_are_named_and_the_rest_is_read(others, tmp_path):
+    path = tmp_path / "a.mcap"
+    write_mcap(path, ["json", *others])
+    table = table_of(path)
+    assert table["json:values[1]"].tolist() == [2.0 * i for i in range(60)]
+    assert len(table.left_out) == len(others)
+    assert all(any(other in part for part in table.left_out) for other in others)
+
+
+def test_a_mapping_reads_a_table_as_map_proposed_it(tmp_path):
+    """One reader feeds map, the runner's recorded poses and check."""
+    path = tmp_path / "a.tsv"
+    path.write_text(qualisys())
+    mapping = propose(table_of(path), "a.tsv").mapping
+    (log,) = read(path, mapping)
+    assert log["pos_w"].values == pytest.approx(POS, abs=1e-6)
