@@ -94,7 +94,6 @@ class MavlinkAutopilot(Autopilot, ABC):
         )
         self._begin_audit()
         self._exact = False  # of the share
-        self._open = False  # whether the mechanism's output is
         link.listen(self._hear)
         link.roster.moved.append(self._came_back)
 
@@ -163,8 +162,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         elif kind == "SERVO_OUTPUT_RAW" and 1 <= p.servo_output <= 16:
             value = getattr(message, self._servo, 0)
             if value:
-                self._open = abs(value - p.servo_open_us) <= SERVO_NEAR
-                self.release_record.output(self._open)
+                self.release_record.output(abs(value - p.servo_open_us) <= SERVO_NEAR)
         elif kind == "PARAM_VALUE":
             self._kinds[message.param_id] = message.param_type
             self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
@@ -218,8 +216,6 @@ class MavlinkAutopilot(Autopilot, ABC):
         if self._wanted is None:
             if not armed and not p.arm:
                 return "disarmed", WAIT
-            if self._open:
-                return "the mechanism's output is open: close it, or mend servo_open_us", WAIT
             ready = role == FOLLOW or (p.take and role == HOLD)
             return (
                 ("", role)

@@ -249,7 +249,7 @@ class Autopilot(Backend):
         note, mode = self._note(now)
         fault, thrust = self.audit.fault(), None
         if not note and self.release_record.open_at_rest:
-            note = "the mechanism's output is at its open end: open and closed are exchanged"
+            note = "the mechanism's output is at its open end: close it; or its ends are exchanged"
         if self.share is not None and self._flies_itself():
             thrust = self.params.thrust.thrust(self.share, self.voltage)
         reason = note or self._hint() or self.release_record.note
