@@ -26,7 +26,7 @@ from hil.poses.frames import FrameParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from hil.poses.track import BodyState, Track
 from hil.rehearsal.fake import SetPoints, WirePlant
-from hil.rehearsal.fake_mocap import SLACK, Mocap, MocapParams
+from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams, Mocap
 from hil.rehearsal.process import load_fake, load_plant
 from tests.fakes import KINDS
 from visthrow import config
@@ -48,7 +48,7 @@ class Direct:
     """One vehicle, from poses to commands in one loop."""
 
     def __init__(
-        self, plant: WirePlant, policy: Policy, params: HilParams, mocap: MocapParams, seed: int
+        self, plant: WirePlant, policy: Policy, params: HilParams, mocap: FakeMocapParams, seed: int
     ) -> None:
         """Begin at the plant's start, with a policy on the CPU and the run's estimator, autopilot
         and goal; ``seed``: of noise and loss.
@@ -163,7 +163,7 @@ def run(args: argparse.Namespace) -> None:
     policy = Policy.load(find_policy(params.policy))
     for seed in args.seeds:
         flown = load_plant(args.plant, args.policy or params.policy, seed)
-        report = Direct(flown, policy, params, MocapParams(), seed).throw()
+        report = Direct(flown, policy, params, FakeMocapParams(), seed).throw()
         print(
             json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}),
             flush=True,

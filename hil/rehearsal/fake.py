@@ -19,7 +19,7 @@ from hil.links.pymav import mav
 from hil.links.roster import SIMULATED
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import PAYLOAD, Pose
-from hil.rehearsal.fake_mocap import SLACK, Mocap, MocapParams
+from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams, Mocap
 from visthrow.config.bounds import Bounded, NotNegative
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 
@@ -66,7 +66,7 @@ class WirePlant(Protocol):
 
 
 @dataclass(frozen=True)
-class Options(Bounded):
+class FakeOptions(Bounded):
     """Options of a fake's behaviour."""
 
     # To a release; "stuck" says accepted and moves nothing, and nobody but "accepted" moves
@@ -222,17 +222,17 @@ class Fake(ABC):
         self,
         plant: WirePlant,
         link: Link,
-        mocap: MocapParams | None = None,
+        mocap: FakeMocapParams | None = None,
         seed: int = 0,
-        options: Options | None = None,
+        options: FakeOptions | None = None,
         port: Port | None = None,
     ) -> None:
         """Begin in the hands of a pilot; poses go out on the link, with the vehicle's ids, commands
         come by the port, or on the link.
         """
-        self.plant, self.link, self.options = plant, link, options or Options()
+        self.plant, self.link, self.options = plant, link, options or FakeOptions()
         self.port: Any = port or link.port
-        self.mocap = Mocap(mocap or MocapParams(), seed)
+        self.mocap = Mocap(mocap or FakeMocapParams(), seed)
         self.spoil: Callable[[list[Pose], float], list[Pose]] = lambda poses, time: poses
         self.witness = Witness((plant.max_thrust, *MAX_RATES))
         # Out there the world is x north, y east, z down, the body forward, right, down, quaternions

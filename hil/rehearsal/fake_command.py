@@ -20,8 +20,8 @@ from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl
 from hil.rehearsal.bridges.betaflight_bridge import SLOW, BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.bridges.px4_bridge import HangingBall, Px4Sih
-from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, make_fake, serve
 from visthrow import config
 from visthrow.common.arguments import ABOVE_ZERO, PORT, SOLVER, WHOLE
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--speed", type=ABOVE_ZERO, default=1.0, help="of the clock")
     answers = "to the release: accepted, in-progress, denied, silent, stuck"
     add("--answer", default="accepted", help=answers)
-    option = "of hil.rehearsal.fake.Options: silent_after=12, parameters.GUID_OPTIONS=0, ..."
+    option = "of hil.rehearsal.fake.FakeOptions: silent_after=12, parameters.GUID_OPTIONS=0, ..."
     add(
         "--option",
         dest="overrides",
@@ -94,9 +94,9 @@ def run(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, or a bridge to a firmware in software, and print its report."""
     out = None if args.out is None else Path(args.out)
     options = config.loads(
-        Options, "", [*args.overrides, f"answer={args.answer}"], "options of the fake"
+        FakeOptions, "", [*args.overrides, f"answer={args.answer}"], "options of the fake"
     )
-    mocap = MocapParams(rate=args.rate)
+    mocap = FakeMocapParams(rate=args.rate)
     kinds = {*FAKES, *SITL}
     if ":" not in args.kind and args.kind not in kinds:
         raise RunError(f"--kind {args.kind}; {suggest(args.kind, kinds)}, or module:class")

@@ -17,7 +17,7 @@ SLACK = 1e-9  # tolerance of times that are sums of periods [s]
 
 
 @dataclass(frozen=True)
-class MocapParams(Bounded):
+class FakeMocapParams(Bounded):
     """The motion capture's measurement of the true poses."""
 
     rate: Positive = 100.0  # poses a second of each body [Hz]
@@ -30,7 +30,7 @@ class MocapParams(Bounded):
 class Mocap:
     """Measures vehicle and payload."""
 
-    def __init__(self, params: MocapParams, seed: int = 0) -> None:
+    def __init__(self, params: FakeMocapParams, seed: int = 0) -> None:
         """Begin with a measurement at time 0; ``seed``: of noise and loss."""
         self.params = params
         self._rng = np.random.default_rng(seed)

@@ -14,8 +14,8 @@ from hil.control.realtime import collected
 from hil.errors import RunError
 from hil.links.clock import Clock
 from hil.links.mavlink_link import Link
-from hil.rehearsal.fake import Fake, Options, WirePlant
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import Fake, FakeOptions, WirePlant
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from visthrow.common.arguments import StopRequest
 from visthrow.common.errors import suggest
 
@@ -60,9 +60,9 @@ def make_fake(
     kind: str,
     plant: WirePlant,
     link: Link,
-    mocap: MocapParams | None = None,
+    mocap: FakeMocapParams | None = None,
     seed: int = 0,
-    options: Options | None = None,
+    options: FakeOptions | None = None,
     port: Any = None,
 ) -> Fake:
     """Return a fake of a kind; ``port``: where its commands come by another port than the link's.

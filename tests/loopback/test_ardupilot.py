@@ -11,9 +11,9 @@ from hil.errors import RunError
 from hil.links.backends.ardupilot import GUIDED, LAND_MODE, ArduPilot
 from hil.links.mavlink_link import Link, attitude_target
 from hil.params import HilParams
-from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_ardupilot import FakeArduPilot
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import load_plant
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
@@ -29,9 +29,9 @@ def pair(answer="accepted", **options):
     fake = FakeArduPilot(
         LevelPlant(),
         Link(there, *VEHICLE_ID),
-        MocapParams(loss=0.0),
+        FakeMocapParams(loss=0.0),
         0,
-        Options(answer=answer, **options),
+        FakeOptions(answer=answer, **options),
     )
     link = Link(here)
     return ArduPilot(link, PARAMS), link, fake

@@ -18,8 +18,8 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.rehearsal.bridges import ardupilot_bridge as ardupilot
 from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl, outputs
-from hil.rehearsal.fake import VEHICLE_ID, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import serve
 from visthrow import config
 from visthrow.throws.wire_plant import make_motors
@@ -58,7 +58,9 @@ def bridge(monkeypatch):
     monkeypatch.setattr(ardupilot, "PATIENCE", PATIENCE)
     params = config.load(HilParams, config.find("hil", "ardupilot_sitl")).ardupilot
     link = Link(UdpPort(Device("udpout", "127.0.0.1", 14998)), *VEHICLE_ID)
-    made = ArduPilotSitl(make_motors("vision", 0), link, MocapParams(), 0, Options(), params)
+    made = ArduPilotSitl(
+        make_motors("vision", 0), link, FakeMocapParams(), 0, FakeOptions(), params
+    )
     yield made
     made.close()
 

@@ -13,9 +13,9 @@ from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.params import HilParams
 from hil.rehearsal.bridges.px4_bridge import ORIGIN, Motion, Place, Px4Sih
-from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_command import make_ball
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import serve
 from visthrow import config
 
@@ -167,7 +167,7 @@ def bridge():
     port, params = free_port(), config.load(HilParams, config.find("hil", "px4")).px4
     own = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
     poses = Link(UdpPort(Device("udpout", "127.0.0.1", free_port())), *VEHICLE_ID)
-    made = Px4Sih(make_ball("vision", 0), poses, MocapParams(), 0, Options(), params, own)
+    made = Px4Sih(make_ball("vision", 0), poses, FakeMocapParams(), 0, FakeOptions(), params, own)
     made.other = OtherSide(port)
     yield made
     made.close()

@@ -14,8 +14,8 @@ from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.opening import parties
-from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import make_fake
 from tests.fakes import KINDS
 from tests.hil_flight import AutoOperator
@@ -130,9 +130,9 @@ def peers(
     here, there = pipe()
     mine, its = pipe()
     mine.whole = its.whole = kind == "crazyflie"
-    more = Options(answer=answer, **options)
+    more = FakeOptions(answer=answer, **options)
     far = Link(there, *VEHICLE_ID, key=key)
-    fake = make_fake(KINDS[kind], plant, far, mocap or MocapParams(), seed, more, its)
+    fake = make_fake(KINDS[kind], plant, far, mocap or FakeMocapParams(), seed, more, its)
     fake.spoil = MocapFault(*mocap_fault, seed).spoil
     roster = Roster(parties(params, True, True))
     clock, link = (

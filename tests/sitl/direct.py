@@ -34,9 +34,9 @@ from hil.poses.sources.base import Source
 from hil.poses.sources.opening import open_source
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl, MotorPlant
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
-from hil.rehearsal.fake import VEHICLE_ID, Fake, Options
+from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_command import MOTORS
-from hil.rehearsal.fake_mocap import SLACK, MocapParams
+from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams
 from hil.rehearsal.process import load_plant
 from tests.hil_flight import AutoOperator
 from visthrow import config
@@ -93,7 +93,7 @@ def opened(
     params: HilParams,
     policy: Policy,
     plant: MotorPlant,
-    mocap: MocapParams,
+    mocap: FakeMocapParams,
     seed: int,
     bridge: type[BetaflightSitl] = BetaflightSitl,
 ) -> Iterator[tuple[Runner, Source, FlightClock, BetaflightSitl]]:
@@ -108,7 +108,7 @@ def opened(
         firmware.start()
         port = check_device(params.source.device or params.link.device).port
         link = Link(open_port(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
-        fake = bridge(plant, link, mocap, seed, Options(), params.betaflight, firmware.stands)
+        fake = bridge(plant, link, mocap, seed, FakeOptions(), params.betaflight, firmware.stands)
         clock = FlightClock(fake)
         source, link, _ = open_source(params, folder / "run", clock)
         backend = make_backend(params, link, folder=folder / "run")
@@ -128,7 +128,7 @@ def throw(
     params: HilParams,
     policy: Policy,
     plant: MotorPlant,
-    mocap: MocapParams,
+    mocap: FakeMocapParams,
     seed: int,
 ) -> dict[str, Any]:
     """Fly one throw; returns the bridge's report, with the runner's summary under ``run``; raises
@@ -211,7 +211,13 @@ def main() -> None:
     for seed in args.seeds:
         flown = load_plant(args.plant, args.policy or params.policy, seed)
         report = throw(
-            args.firmware, args.folder / f"{seed:03d}", params, policy, flown, MocapParams(), seed
+            args.firmware,
+            args.folder / f"{seed:03d}",
+            params,
+            policy,
+            flown,
+            FakeMocapParams(),
+            seed,
         )
         summary, landed = report.pop("run"), report["landing_w"]
         error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])

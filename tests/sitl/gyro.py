@@ -20,7 +20,7 @@ import numpy as np
 from hil.params import HilParams
 from hil.rehearsal.bridges.betaflight_bridge import SAMPLE
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.sitl.direct import SETTINGS, throw
 from tests.sitl.landings import BASE, DELAY
 from tests.sitl.test_betaflight import program
@@ -35,7 +35,7 @@ from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy
-from visthrow.throws.wire_plant import MotorPlant
+from visthrow.throws.wire_plant import HybridMotorPlant
 
 EVERY = 1e-3
 """Of the recorded rates those so far apart are used [s]."""
@@ -55,8 +55,12 @@ def flown(folder: Path, step: float, seed: int) -> Path:
             Firmware(program(), settings).set_up(
                 needed(params.betaflight) | {"blackbox_sample_rate": "1/1"}
             )
-        plant = type("Stepped", (MotorPlant,), {"period": step})(load_policy(BASE).experiment, seed)
-        throw(program(), where, params, Policy.load(find_policy(BASE)), plant, MocapParams(), seed)
+        plant = type("Stepped", (HybridMotorPlant,), {"period": step})(
+            load_policy(BASE).experiment, seed
+        )
+        throw(
+            program(), where, params, Policy.load(find_policy(BASE)), plant, FakeMocapParams(), seed
+        )
     return where
 
 

@@ -22,7 +22,7 @@ from scipy.signal import lfilter
 from hil.links.backends.base import Held
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD
-from hil.rehearsal.fake_mocap import SLACK, Mocap, MocapParams
+from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams, Mocap
 from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, VehicleParams
@@ -34,7 +34,7 @@ from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import plant_of
 from visthrow.throws.loading import load_policy
-from visthrow.throws.wire_plant import WirePlant
+from visthrow.throws.wire_plant import HybridWirePlant
 
 PERIOD = 0.002
 BEFORE, LENGTH = 0.02, 0.36
@@ -72,7 +72,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     backend, seen, mocap = (
         Held(desk.backend, params.delay.hold),
         FlightRecorder({"source": "doublets"}),
-        Mocap(MocapParams(), seed),
+        Mocap(FakeMocapParams(), seed),
     )
     rng, plant = np.random.default_rng(seed), desk.plant
     hover = HoverController(HoverParams(max_thrust=plant.max_thrust), bench.TICK)
@@ -324,11 +324,11 @@ def draw(
     figure.savefig(path, dpi=110)
 
 
-def make_fitted(policy: str, seed: int) -> WirePlant:
+def make_fitted(policy: str, seed: int) -> HybridWirePlant:
     """The training's plant with the fitted vehicle of ``VISTHROW_FITTED``."""
     experiment = load_policy(policy).experiment
     vehicle = config.load(VehicleParams, os.environ["VISTHROW_FITTED"])
-    return WirePlant(dataclasses.replace(experiment, vehicle=vehicle), seed)
+    return HybridWirePlant(dataclasses.replace(experiment, vehicle=vehicle), seed)
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from bench.direct import Direct
 from hil.params import HilParams
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.sitl.direct import throw
 from tests.sitl.test_betaflight import program
 from visthrow import config
@@ -41,7 +41,7 @@ def flown(where: str, distance: float, seed: int, policy: str, plant: str, folde
     )
     loaded = Policy.load(find_policy(policy))
     if where == "own":
-        report = Direct(make(policy, seed), loaded, params, MocapParams(), seed).throw()
+        report = Direct(make(policy, seed), loaded, params, FakeMocapParams(), seed).throw()
     else:
         report = throw(
             program(),
@@ -49,7 +49,7 @@ def flown(where: str, distance: float, seed: int, policy: str, plant: str, folde
             params,
             loaded,
             make_motors(plant, seed),
-            MocapParams(),
+            FakeMocapParams(),
             seed,
         )
     landing = report["landing_w"]

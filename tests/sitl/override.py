@@ -15,7 +15,7 @@ from hil.control.loop import Loop
 from hil.control.states import State
 from hil.links.backends.betaflight import STICKS
 from hil.params import HilParams
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.hil_flight import AutoOperator
 from tests.loopback import test_endings as endings
 from tests.sitl.direct import opened
@@ -53,7 +53,7 @@ def fly(
     )
     policy = policy or Policy.load(find_policy(params.policy))
     plant = make_motors(params.policy, seed)
-    with opened(program, folder, params, policy, plant, MocapParams(), seed, Piloted) as parts:
+    with opened(program, folder, params, policy, plant, FakeMocapParams(), seed, Piloted) as parts:
         runner, source, clock, fake = parts
         loop = Loop(runner, source, clock, AutoOperator())
         killed = None

@@ -26,8 +26,8 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
-from hil.rehearsal.fake import VEHICLE_ID, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.loopback import test_endings as endings
 from tests.sitl import override
 from tests.sitl.direct import opened, throw
@@ -122,7 +122,13 @@ class Bench:
         self.plant = make_motors("vision", 0)
         nobody = Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID)
         self.fake = BetaflightSitl(
-            self.plant, nobody, MocapParams(), 0, Options(), self.params, self.firmware.stands
+            self.plant,
+            nobody,
+            FakeMocapParams(),
+            0,
+            FakeOptions(),
+            self.params,
+            self.firmware.stands,
         )
         self.backend = Betaflight(open_port(check_device(self.params.device)), self.params)
         self.fake.sensors.start()
@@ -276,7 +282,9 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
     policy, reports = Policy.load(find_policy(params.policy)), []
     for name in ("first", "again"):
         plant = make_motors(params.policy, 1)
-        reports.append(throw(program(), tmp_path / name, params, policy, plant, MocapParams(), 1))
+        reports.append(
+            throw(program(), tmp_path / name, params, policy, plant, FakeMocapParams(), 1)
+        )
     one, again = reports
     error = float(np.hypot(one["landing_w"][0] - 2.0, one["landing_w"][1]))
     print(f"\nlanding error {error:.3f} m, loop {one['loop_us']:.0f} us")
@@ -341,7 +349,9 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
         "SIGINT twice": endings.REASONS["SIGINT"],
     } | endings.REASONS
     plant = make_motors("vision", 0)
-    with opened(program(), tmp_path / way, params, endings.NEVER, plant, MocapParams(), 0) as parts:
+    with opened(
+        program(), tmp_path / way, params, endings.NEVER, plant, FakeMocapParams(), 0
+    ) as parts:
         run = endings.Told(way.split(" twice")[0], state, parts, monkeypatch)
         fake, clock = run.fake, run.clock
         assert fake.armed, "up to the end of the run"

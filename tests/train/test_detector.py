@@ -15,7 +15,7 @@ from camera.params import CameraParams
 from sim.params import RopeParams
 from visthrow import cli, config
 from visthrow.detector_training import detector_command as detector
-from visthrow.detector_training.eyes import HANGING, Eyes
+from visthrow.detector_training.eyes import HANGING, RenderedEyes
 from visthrow.detector_training.scenes.scene import Nuisances, Truth
 from visthrow.throws.flight import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
@@ -55,7 +55,7 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
     rope = config.load(RopeParams, config.find("rope", "paper"))
-    eyes = Eyes(
+    eyes = RenderedEyes(
         camera,
         rope.mount,
         rope.length + rope.payload_offset,
@@ -92,7 +92,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
-        Eyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, by="magic")
+        RenderedEyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, by="magic")
 
 
 class Blind:

@@ -157,7 +157,7 @@ def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
     changes = ("runs.tiny.seeds=[1]", 'runs.tiny.changes=["ppo.iterations=3"]')
     work, out, said = load_list(path, changes), tmp_path / "jobs", []
     cluster = Cluster(path, out, "local", 1, 1, minutes=0.001, changes=changes)
-    outcome = pool.Pool(work, out, cluster, said.append).run()
+    outcome = pool.ProcessPool(work, out, cluster, said.append).run()
     assert outcome == pool.Outcome()
     assert status(work, out)[1]
     pieces = list((work.sources[0].folder(out) / "pieces").iterdir())

@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError(
                 f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
             )
-        eyes = rendered.Eyes(
+        eyes = rendered.RenderedEyes(
             loaded.experiment.camera,
             rope.mount,
             rope.length + rope.payload_offset,

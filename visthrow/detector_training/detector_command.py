@@ -226,7 +226,7 @@ def _thrown(
     loaded, plant: str, looks: dict[str, Any], job
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Throws of one batch, in halls of their own, and what was found in how many frames."""
-    from visthrow.detector_training.eyes import Eyes
+    from visthrow.detector_training.eyes import RenderedEyes
     from visthrow.detector_training.scenes.scene import Nuisances
     from visthrow.throws.reference_protocol import fly_batch
 
@@ -236,7 +236,7 @@ def _thrown(
         loaded.experiment.rope,
         1000 * job.seed + job.batch,
     )
-    eyes = Eyes(
+    eyes = RenderedEyes(
         camera,
         rope.mount,
         rope.length + rope.payload_offset,

@@ -53,7 +53,7 @@ def render_hall(
     return np.ascontiguousarray(picture[..., ::-1])
 
 
-class Eyes:
+class RenderedEyes:
     """A camera, a hall and a detector for each of E vehicles; the halls were not seen in the
     detector's training.
 

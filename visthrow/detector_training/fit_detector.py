@@ -131,7 +131,7 @@ def other_lens(lens, generator: torch.Generator):
     )
 
 
-class Pool:
+class FramePool:
     """Rendered frames and their labels, of one lens a block of frames."""
 
     def __init__(self, params: FitParams, camera: CameraParams, renderer: Renderer) -> None:
@@ -341,7 +341,7 @@ class Fit:
         self.params, self.camera, self.device = params, camera, device
         self.networks = Networks().to(device)
         self.renderer = Renderer(camera.fisheye, device, files, params.samples)
-        self.pool = Pool(params, camera, self.renderer)
+        self.pool = FramePool(params, camera, self.renderer)
         self.optimizer = torch.optim.AdamW(
             self.networks.parameters(), params.learning_rate, weight_decay=1e-4
         )

@@ -25,7 +25,7 @@ firmware's own delay has room within the lag that the policies were trained with
 CARRIED = 0.8
 
 
-class WirePlant:
+class HybridWirePlant:
     """One vehicle with its payload; NumPy in and out, batch axis left out.
 
     Attributes:
@@ -95,14 +95,14 @@ class WirePlant:
         }
 
 
-def make(policy: str, seed: int, changes: Sequence[str] = ()) -> WirePlant:
+def make(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridWirePlant:
     """The plant that a policy, a shipped name or a file, was trained on, with ``key=value`` changes
     of its configuration.
     """
-    return WirePlant(load_policy(policy, None, changes).experiment, seed)
+    return HybridWirePlant(load_policy(policy, None, changes).experiment, seed)
 
 
-class MotorPlant(WirePlant):
+class HybridMotorPlant(HybridWirePlant):
     """A vehicle without its rate controller, for a firmware that outputs motor commands.
 
     Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``:
@@ -231,6 +231,6 @@ class MotorPlant(WirePlant):
         self._look()
 
 
-def make_motors(policy: str, seed: int, changes: Sequence[str] = ()) -> MotorPlant:
+def make_motors(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridMotorPlant:
     """Make the plant as :func:`make`, flown by motor commands."""
-    return MotorPlant(load_policy(policy, None, changes).experiment, seed)
+    return HybridMotorPlant(load_policy(policy, None, changes).experiment, seed)

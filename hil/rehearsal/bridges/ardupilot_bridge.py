@@ -27,8 +27,8 @@ from hil.links.device import LARGEST_DATAGRAM
 from hil.links.facts import values
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_bridge import MotorPlant
-from hil.rehearsal.fake import Bridge, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import Bridge, FakeOptions
+from hil.rehearsal.fake_mocap import FakeMocapParams
 
 FACTS = values("ardupilot")
 SERVOS = FACTS["json_port"]  # UDP port on which ArduPilot finds the simulation
@@ -94,9 +94,9 @@ class ArduPilotSitl(Bridge):
         self,
         plant: MotorPlant,
         link: Link,
-        mocap: MocapParams | None,
+        mocap: FakeMocapParams | None,
         seed: int,
-        options: Options,
+        options: FakeOptions,
         params: ArduPilotParams,
     ) -> None:
         """Listen for ArduPilot; ``params`` of the back-end say which output opens the mechanism.

@@ -18,8 +18,8 @@ from hil.links.device import Device, TcpPort, chunks
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_firmware import PORTS
 from hil.rehearsal.bridges.packets import Sensors
-from hil.rehearsal.fake import Bridge, Options, WirePlant
-from hil.rehearsal.fake_mocap import SLACK, MocapParams
+from hil.rehearsal.fake import Bridge, FakeOptions, WirePlant
+from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams
 
 ASK = {msp.RC: 0.002, msp.STATUS: 0.1}  # what the firmware is asked for, and how often [s]
 
@@ -53,9 +53,9 @@ class BetaflightSitl(Bridge):
         self,
         plant: MotorPlant,
         link: Link,
-        mocap: MocapParams | None,
+        mocap: FakeMocapParams | None,
         seed: int,
-        options: Options,
+        options: FakeOptions,
         params: BetaflightParams,
         stands: int,
     ) -> None:

@@ -21,8 +21,8 @@ import numpy as np
 from hil.links.backends.px4 import Px4Params, parameter_value
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
-from hil.rehearsal.fake import Bridge, Options
-from hil.rehearsal.fake_mocap import SLACK, MocapParams
+from hil.rehearsal.fake import Bridge, FakeOptions
+from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
@@ -235,9 +235,9 @@ class Px4Sih(Bridge):
         self,
         plant: HangingBall,
         link: Link,
-        mocap: MocapParams | None,
+        mocap: FakeMocapParams | None,
         seed: int,
-        options: Options,
+        options: FakeOptions,
         params: Px4Params,
         autopilot: Link,
     ) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from bench.direct import Direct, scored
 from hil.params import HilParams
-from hil.rehearsal.fake_mocap import Mocap, MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams, Mocap
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from visthrow import config
@@ -32,7 +32,7 @@ class Landing(LevelPlant):
 
 def made(seed: int, action=(HOVER, 0.0, 0.0, 0.0, 1.0)) -> Direct:
     params = config.load(HilParams, config.find("hil", "fake"), ["policy=state"])
-    return Direct(Landing(), simple_policy(action), params, MocapParams(), seed)
+    return Direct(Landing(), simple_policy(action), params, FakeMocapParams(), seed)
 
 
 def flown(seed: int, action=(HOVER, 0.0, 0.0, 0.0, 1.0)):
@@ -88,7 +88,7 @@ def test_a_policy_that_never_releases_ends():
 
 def test_motion_capture_of_a_seed():
     plant, out = LevelPlant(), []
-    mocap = Mocap(MocapParams(loss=0.2), 5)
+    mocap = Mocap(FakeMocapParams(loss=0.2), 5)
     for _ in range(400):
         if mocap.due(plant.time):
             out += mocap.measure(plant.time, plant.state)
@@ -101,4 +101,4 @@ def test_motion_capture_of_a_seed():
     assert all(p.arrival == pytest.approx(p.stamp + 0.01) for p in out)
     for wrong in ({"rate": 0.0}, {"loss": 1.0}, {"latency": -0.1}):
         with pytest.raises(ConfigError, match=f"{next(iter(wrong))} is"):
-            MocapParams(**wrong)
+            FakeMocapParams(**wrong)

@@ -26,7 +26,7 @@ from visthrow.onboard.calibration import Calibration, Hovered, Spreads, solved
 from visthrow.onboard.observations import rotation_from_quat
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.loading import load_policy
-from visthrow.throws.wire_plant import WirePlant
+from visthrow.throws.wire_plant import HybridWirePlant
 
 TILT_DEG, LATENCY = (1.6, -2.3, 1.1), 0.024
 DELAY = 0.03
@@ -54,7 +54,7 @@ class Hall:
         experiment = load_policy(runner.params.policy).experiment
         self.runner, self.plant, self.rng = (
             runner,
-            WirePlant(experiment, 1),
+            HybridWirePlant(experiment, 1),
             np.random.default_rng(3),
         )
         self.camera = KeypointCamera(runner.params.camera, dtype=torch.float64)

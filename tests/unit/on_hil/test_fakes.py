@@ -12,7 +12,7 @@ from hil.errors import LinkError, RunError
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
-from hil.rehearsal.fake import Options, Witness
+from hil.rehearsal.fake import FakeOptions, Witness
 from hil.rehearsal.process import make_fake
 from tests.fakes.ports import ListeningPort
 from tests.level import LevelPlant
@@ -23,7 +23,7 @@ from visthrow.common.errors import ConfigError
 
 def read_options(overrides):
     """Options as `hil fake` reads them."""
-    return config.loads(Options, "", overrides, "options of the fake")
+    return config.loads(FakeOptions, "", overrides, "options of the fake")
 
 
 LIMITS = (14.0, 10.0, 10.0, 4.0)

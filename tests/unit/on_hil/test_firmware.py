@@ -24,8 +24,8 @@ from hil.rehearsal.bridges import betaflight_firmware as firmware
 from hil.rehearsal.bridges import packets
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
-from hil.rehearsal.fake import VEHICLE_ID, Options
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.fakes.ports import ListeningPort
 from visthrow import config
 from visthrow.throws.wire_plant import make_motors
@@ -262,9 +262,9 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
     fake = BetaflightSitl(
         make_motors("vision", 0),
         Link(UdpPort(Device("udpout", "127.0.0.1", 14999)), *VEHICLE_ID),
-        MocapParams(),
+        FakeMocapParams(),
         0,
-        Options(),
+        FakeOptions(),
         params,
         -1,
     )

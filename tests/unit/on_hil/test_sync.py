@@ -9,9 +9,9 @@ from hil.links.clock import TimeSync
 from hil.links.mavlink_link import LATE, Link, LinkSync
 from hil.links.pymav import mav
 from hil.poses.sources.mavlink import BodyIds, MavlinkSource
-from hil.rehearsal.fake import VEHICLE_ID, Options
+from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_ardupilot import FakeArduPilot
-from hil.rehearsal.fake_mocap import MocapParams
+from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.level import LevelPlant
 from tests.loopback.wire import HERE, pipe
 
@@ -74,9 +74,9 @@ def dated(offset, seconds=2.0, stamp_offset=None):
     fake = FakeArduPilot(
         LevelPlant(),
         Link(there, *VEHICLE_ID),
-        MocapParams(loss=0.0),
+        FakeMocapParams(loss=0.0),
         0,
-        Options(clock_offset=offset),
+        FakeOptions(clock_offset=offset),
     )
     if stamp_offset is not None:
         plain = fake.wall

@@ -251,7 +251,7 @@ def fast(monkeypatch):
 def run(path, out, minutes=None, **told):
     work = load_list(path)
     starter = FakeStarter(work, out, told.pop("devices", ["a", "b"]), 3, **told)
-    return starter, pool.Pool(work, out, starter, lambda text: None).run(minutes)
+    return starter, pool.ProcessPool(work, out, starter, lambda text: None).run(minutes)
 
 
 def test_everything_is_done_once_and_no_more_at_once_than_there_is_room(path, tmp_path):
@@ -444,11 +444,11 @@ def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
             return self.outcome
 
     lost = Counter()
-    assert cluster.Job(Ended(None), "a", lost).poll() is None
-    assert cluster.Job(Ended(0), "a", lost).poll() == 0
-    assert cluster.Job(Ended(utils.FailedJobError("raised")), "a", lost).poll() == 1
+    assert cluster.ClusterJob(Ended(None), "a", lost).poll() is None
+    assert cluster.ClusterJob(Ended(0), "a", lost).poll() == 0
+    assert cluster.ClusterJob(Ended(utils.FailedJobError("raised")), "a", lost).poll() == 1
     gone = [
-        cluster.Job(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll()
+        cluster.ClusterJob(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll()
         for _ in range(4)
     ]
     assert gone == [pool.EXIT_STOPPED] * cluster.LOST_AT_MOST + [1]

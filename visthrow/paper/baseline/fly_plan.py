@@ -19,7 +19,7 @@ from visthrow.common.rotations import matrix_of_quat
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline.mpc import MPC, MPCParams, SolverError
 from visthrow.paper.baseline.pendulum_model import Pendulum
-from visthrow.paper.baseline.throw_plan import Plan, landing_point
+from visthrow.paper.baseline.throw_plan import ThrowPlan, landing_point
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.throws.flight import (
@@ -62,7 +62,7 @@ class Flown(Throws):
 
 
 def _off(
-    plan: Plan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray
+    plan: ThrowPlan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Distances of payloads from the planned release at separation; NaN where a throw failed."""
     blank = np.where(good, 1.0, np.nan)
@@ -78,7 +78,7 @@ def _normalised(params: MPCParams, command: np.ndarray) -> np.ndarray:
     return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / np.array(params.max_rate)])
 
 
-def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
+def random_starts(plan: ThrowPlan, count: int, seed: int) -> np.ndarray:
     """Hover with the rest of a pilot's hover, by ``configs/start/hover.toml``: states, shape (N,
     16).
 
@@ -102,7 +102,9 @@ def random_starts(plan: Plan, count: int, seed: int) -> np.ndarray:
     return state
 
 
-def fly_pendulum(plan: Plan, count: int = 10, seed: int = 0, landing_height: float = 0.04) -> Flown:
+def fly_pendulum(
+    plan: ThrowPlan, count: int = 10, seed: int = 0, landing_height: float = 0.04
+) -> Flown:
     """Fly a plan so many times in the pendulum that the controller believes in; the landing's
     height [m] is the payload's centre's.
 
@@ -256,7 +258,7 @@ class Controllers(Pilots):
     throw, ``times`` of all steps [s]."""
 
     def __init__(
-        self, plan: Plan, experiment: Experiment, period: float, delays: Delays, count: int
+        self, plan: ThrowPlan, experiment: Experiment, period: float, delays: Delays, count: int
     ) -> None:
         """Begin in hover, with the experiment's limits, mount and release; commands come each
         period [s].
@@ -367,7 +369,7 @@ class _Tracking(Scores):
 
 
 def fly_plant(
-    plan: Plan,
+    plan: ThrowPlan,
     plant_name: str,
     experiment: Experiment,
     delays: Delays,

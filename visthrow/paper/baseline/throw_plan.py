@@ -23,7 +23,7 @@ training simulator; mean of five flights. :func:`measure` reads them off any pol
 
 
 @dataclass(frozen=True)
-class Release:
+class ReleaseState:
     """State at which the payload is let go, and what follows."""
 
     pos_w: np.ndarray  # [m], shape (3,)
@@ -49,7 +49,7 @@ def landing_point(
     return pos_w[..., :2] + time[..., None] * vel_w[..., :2], time
 
 
-def release_for(target: float, height: float, speed: float, landing_height: float) -> Release:
+def release_for(target: float, height: float, speed: float, landing_height: float) -> ReleaseState:
     """Release state of a throw along x to a target [m], at a height [m] with a horizontal speed
     [m/s]; landing is the payload's centre's.
 
@@ -61,7 +61,7 @@ def release_for(target: float, height: float, speed: float, landing_height: floa
             f" {landing_height:g} m and above 0"
         )
     fall = float(fall_time(np.float64(height), np.float64(0.0), landing_height))
-    return Release(
+    return ReleaseState(
         np.array([target - speed * fall, 0.0, height]), np.array([speed, 0.0, 0.0]), fall
     )
 
@@ -103,12 +103,12 @@ def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[floa
 
 
 @dataclass(frozen=True)
-class Plan:
+class ThrowPlan:
     """One planned throw."""
 
     model: Pendulum
     target: float  # [m] along x
-    release: Release
+    release: ReleaseState
     path: Spline
     params: PlanParams
 
@@ -136,7 +136,7 @@ def plan_throw(
     landing_height: float,
     period: float = 0.02,
     lag: float = 0.0,
-) -> Plan:
+) -> ThrowPlan:
     """Plan a throw along x from hover at the origin; the first arguments as of :func:`release_for`.
 
     The release falls on a whole number of the controller's periods [s] and the lag [s] from the
@@ -144,4 +144,4 @@ def plan_throw(
     release = release_for(target, height, speed, landing_height)
     start = np.array([0.0, 0.0, START_HEIGHT])
     path = optimise(model, start, release.pos_w, release.vel_w, params, (period, lag % period))
-    return Plan(model, target, release, path, params)
+    return ThrowPlan(model, target, release, path, params)

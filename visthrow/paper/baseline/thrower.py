@@ -15,7 +15,7 @@ from visthrow.paper.baseline import NAME
 from visthrow.paper.baseline.fly_plan import delays_of, fly_pendulum, fly_plant
 from visthrow.paper.baseline.pendulum_model import pendulum_of
 from visthrow.paper.baseline.spline import PlanParams, payload_bounds_only
-from visthrow.paper.baseline.throw_plan import Plan, default_release, plan_throw
+from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_throw
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
@@ -122,7 +122,7 @@ def plan_of(
     w_t: float,
     rho: float,
     bounds: str,
-) -> Plan:
+) -> ThrowPlan:
     """The plan of a unit, whose entries the arguments are."""
     params = replace(PlanParams(), duration=w_t, energy=rho)
     params = params if bounds == BOUNDS[0] else payload_bounds_only(params)

@@ -121,7 +121,7 @@ def quick(out: Path, jobs: int) -> None:
     """
     from importlib.util import find_spec
 
-    from visthrow.paper.sweep.pool import Local, Pool
+    from visthrow.paper.sweep.pool import Local, ProcessPool
     from visthrow.paper.sweep.work_units import load_list
     from visthrow.throws import results
 
@@ -130,7 +130,7 @@ def quick(out: Path, jobs: int) -> None:
         changes = NO_REFERENCE
         _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
     local = Local(QUICK_LIST, folder, ["cpu"], jobs, changes)
-    outcome = Pool(load_list(QUICK_LIST, changes), folder, local, _say).run(None)
+    outcome = ProcessPool(load_list(QUICK_LIST, changes), folder, local, _say).run(None)
     if outcome.failed:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
         raise VisthrowError(

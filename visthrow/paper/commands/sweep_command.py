@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     from visthrow.common.arguments import EXIT_INTERRUPTED
-    from visthrow.paper.sweep.pool import Local, Pool
+    from visthrow.paper.sweep.pool import Local, ProcessPool
     from visthrow.training import device
 
     changes, jobs, begin = tuple(args.overrides), args.jobs or device.cores(), time.monotonic()
@@ -113,7 +113,7 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     )  # so that a batch system's signal also ends in checkpoints
     try:
         if args.slurm is not None:
-            outcome = Pool(work, out, _cluster(args, out, jobs, changes), say).run()
+            outcome = ProcessPool(work, out, _cluster(args, out, jobs, changes), say).run()
         else:
             starter = Local(
                 args.list,
@@ -122,7 +122,7 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
                 jobs,
                 changes,
             )
-            outcome = Pool(work, out, starter, say).run(args.minutes)
+            outcome = ProcessPool(work, out, starter, say).run(args.minutes)
     finally:
         signal.signal(signal.SIGTERM, before)
     for name, reason in outcome.failed.items():

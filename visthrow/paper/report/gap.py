@@ -18,7 +18,7 @@ PLANT, TARGET = "hybrid", 2.0
 
 
 @dataclass(frozen=True)
-class Sweep:
+class GapSweep:
     """One value of the config, changed alone."""
 
     key: str
@@ -30,31 +30,35 @@ class Sweep:
 
 
 SWEEPS = (
-    Sweep("camera.noise.step_std", "keypoint noise", "per step, 1 at the edge of the image", 0.01),
-    Sweep("camera.noise.bias_std", "keypoint bias", "per throw, 1 at the edge of the image", 0.001),
-    Sweep(
+    GapSweep(
+        "camera.noise.step_std", "keypoint noise", "per step, 1 at the edge of the image", 0.01
+    ),
+    GapSweep(
+        "camera.noise.bias_std", "keypoint bias", "per throw, 1 at the edge of the image", 0.001
+    ),
+    GapSweep(
         "camera.noise.latency",
         "latency of the keypoints",
         "[ms] behind the vehicle's own pose",
         0.0,
         lambda x: 20.0 * x,
     ),
-    Sweep("camera.noise.drop_probability", "drop-out", "share of keypoints lost", 0.0),
-    Sweep(
+    GapSweep("camera.noise.drop_probability", "drop-out", "share of keypoints lost", 0.0),
+    GapSweep(
         "camera.mount.rotation_error_std",
         "camera turned",
         "[deg] per axis, standard deviation",
         0.0,
         math.degrees,
     ),
-    Sweep(
+    GapSweep(
         "camera.mount.position_error_std",
         "camera displaced",
         "[mm] per axis, standard deviation",
         0.0,
         lambda x: 1e3 * x,
     ),
-    Sweep(
+    GapSweep(
         "task.observation.latency",
         "age of all poses",
         "[ms]",
@@ -62,7 +66,7 @@ SWEEPS = (
         lambda x: 500.0 * (x[0] + x[1]),
         SHIPPED,
     ),
-    Sweep(
+    GapSweep(
         "task.noise.observation_step",
         "noise of the vehicle's pose",
         "per step, SI units",
@@ -128,7 +132,7 @@ def section(thrown: ResultSet) -> Section:
     )
 
 
-def curve(thrown: ResultSet, sweep: Sweep, policy: str) -> list[tuple[float, Result]]:
+def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> list[tuple[float, Result]]:
     """Points of a curve, the policy's own value among them: value in the axis' units and throws,
     ascending.
     """
@@ -144,14 +148,16 @@ def curve(thrown: ResultSet, sweep: Sweep, policy: str) -> list[tuple[float, Res
 
 
 def _line(
-    sweep: Sweep, policy: str, points: list[tuple[float, Result]], series: int
+    sweep: GapSweep, policy: str, points: list[tuple[float, Result]], series: int
 ) -> figures.Line:
     own = next((i for i, (value, _) in enumerate(points) if value == sweep.own), None)
     intervals = [st.mean(r.of("error")) for _, r in points]
     return figures.Line(f"{policy} policy", [value for value, _ in points], intervals, series, own)
 
 
-def _rows(sweep: Sweep, policy: str, points: list[tuple[float, Result]]) -> list[tuple[str, ...]]:
+def _rows(
+    sweep: GapSweep, policy: str, points: list[tuple[float, Result]]
+) -> list[tuple[str, ...]]:
     own = dict(points).get(sweep.own)
     rows = []
     for value, r in points:

@@ -19,7 +19,7 @@ SLACK = 5  # minutes that a job is granted beyond its piece: start of the proces
 LOST_AT_MOST = 3
 
 
-class Job:
+class ClusterJob:
     """One submitted task."""
 
     def __init__(self, job: Any, task: str, lost: Counter[str]) -> None:
@@ -80,14 +80,14 @@ class Cluster:
         except (NameError, ValueError, TypeError) as error:
             raise ConfigError(f"options of the cluster {self.options}: {error}") from error
 
-    def start(self, task: Task, device: str, minutes: float | None) -> Job:
+    def start(self, task: Task, device: str, minutes: float | None) -> ClusterJob:
         self._executor.update_parameters(
             name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0
         )
         piece = self.minutes if minutes is None else min(minutes, self.minutes)
         where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())
         job = self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece)
-        return Job(job, task.name, self._lost)
+        return ClusterJob(job, task.name, self._lost)
 
 
 def do(

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.paper.sweep.work import EXIT_BUSY, EXIT_STOPPED
-from visthrow.paper.sweep.work_units import Source, ThrowUnit, Work
+from visthrow.paper.sweep.work_units import ResultSource, SweepWork, ThrowUnit
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -112,12 +112,12 @@ class Outcome:
     interrupted: bool = False  # by Ctrl-C or SIGTERM, not by the clock
 
 
-def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
+def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
     """Return the remaining work that can start now, the most important first; ids that are found to
     be done are added to ``done``.
     """
 
-    def left(unit: Source | ThrowUnit) -> bool:
+    def left(unit: ResultSource | ThrowUnit) -> bool:
         if unit.id not in done and unit.done(out):
             done.add(unit.id)
         return unit.id not in done
@@ -135,14 +135,16 @@ def tasks(work: Work, out: Path, done: set[str]) -> Iterator[Task]:
                 yield Task(unit.id, (unit.id,), gpu=False)
 
 
-class Pool:
+class ProcessPool:
     """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop.
 
     Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU
     cores, and ``start(task, device, minutes)``. What that returns has ``poll()`` for the exit
     status, None while it runs, ``stop()`` to write what it has and end, and ``kill()``."""
 
-    def __init__(self, work: Work, out: Path, starter: Any, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, work: SweepWork, out: Path, starter: Any, say: Callable[[str], None]
+    ) -> None:
         self.work, self.out, self.starter, self.say = work, out, starter, say
         self.outcome, self._done, self._todo = Outcome(), set(), []
         self._running: dict[str, tuple[Task, str, Any]] = {}

@@ -13,8 +13,8 @@ from visthrow.paper.sweep.work import PIECES, held, lock_of
 from visthrow.paper.sweep.work_units import (
     PROGRESS,
     SUMMARY,
-    Source,
-    Work,
+    ResultSource,
+    SweepWork,
     throws_folder,
     variant_of,
 )
@@ -23,7 +23,7 @@ from visthrow.throws import results
 CURVE_POINTS = 60  # points of a run's learning curve in the record
 
 
-def status(work: Work, out: Path) -> tuple[list[str], bool]:
+def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
     """A line a run, a last one with the sum, and whether all is done."""
     lines, seconds, left = [], 0.0, 0
     width = max(len(source.name) for source in work.sources)
@@ -40,7 +40,7 @@ def status(work: Work, out: Path) -> tuple[list[str], bool]:
     return lines, left == 0
 
 
-def _state(source: Source, out: Path) -> tuple[str, float]:
+def _state(source: ResultSource, out: Path) -> tuple[str, float]:
     """Return a training's status line, and its seconds so far."""
     if not source.config:
         return "there already", 0.0
@@ -59,7 +59,7 @@ def _state(source: Source, out: Path) -> tuple[str, float]:
     ), seconds
 
 
-def collect(work: Work, out: Path, records: Path) -> list[Path]:
+def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
     """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already;
     returns their paths.
 
@@ -102,7 +102,7 @@ def _question(result: results.Result) -> str:
     return results.key_of({key: value for key, value in result.unit.items() if key != "weights"})
 
 
-def _progress(source: Source, out: Path) -> list[dict[str, str]]:
+def _progress(source: ResultSource, out: Path) -> list[dict[str, str]]:
     path = source.folder(out) / PROGRESS
     if not path.is_file():
         return []
@@ -114,11 +114,11 @@ def _seconds(rows: list[dict[str, str]]) -> float:
     return sum(float(row["rollout_s"]) + float(row["learning_s"]) for row in rows)
 
 
-def _summary(source: Source, out: Path) -> dict[str, Any]:
+def _summary(source: ResultSource, out: Path) -> dict[str, Any]:
     return json.loads((source.folder(out) / SUMMARY).read_text(encoding="utf-8"))
 
 
-def _final(source: Source, out: Path) -> dict[str, float | None]:
+def _final(source: ResultSource, out: Path) -> dict[str, float | None]:
     """Mean error and duration of the throws that end a training, at 2.0 m."""
     rows = [row for row in _summary(source, out)["figures"]["throws"] if row["target"] == 2.0]
     return {
@@ -127,7 +127,7 @@ def _final(source: Source, out: Path) -> dict[str, float | None]:
     }
 
 
-def _run(source: Source, out: Path) -> dict[str, Any]:
+def _run(source: ResultSource, out: Path) -> dict[str, Any]:
     """A finished training for the record."""
     rows, summary = _progress(source, out), _summary(source, out)
     experiment = source.experiment()

@@ -21,7 +21,7 @@ import torch
 from visthrow.common import provenance
 from visthrow.common.errors import BusyError
 from visthrow.common.storage import write_json
-from visthrow.paper.sweep.work_units import Source, ThrowUnit, Work, throws_folder
+from visthrow.paper.sweep.work_units import ResultSource, SweepWork, ThrowUnit, throws_folder
 from visthrow.throws import results
 from visthrow.throws.loading import Loaded, load_policy
 
@@ -67,7 +67,7 @@ def held(path: Path) -> bool:
     return False
 
 
-def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
+def work(work: SweepWork, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
     """Do trainings and throws of these ids one after the other; after so many minutes a training
     stops with a checkpoint.
 
@@ -82,7 +82,7 @@ def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float 
             with locked(lock_of(out, name)):
                 if unit.done(out):
                     continue
-                if isinstance(unit, Source):
+                if isinstance(unit, ResultSource):
                     status = train(unit, out, device, left, work.checkpoint_every)
                 elif unit.source.done(out):
                     fly(unit, out, device)
@@ -95,7 +95,7 @@ def work(work: Work, out: Path, ids: Sequence[str], device: str, minutes: float 
 
 
 def train(
-    source: Source, out: Path, device: str, minutes: float | None, checkpoint_every: int
+    source: ResultSource, out: Path, device: str, minutes: float | None, checkpoint_every: int
 ) -> int:
     """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow
     train``.

@@ -30,7 +30,7 @@ POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
 
 
 @dataclass(frozen=True)
-class Source:
+class ResultSource:
     """A policy: to be trained, or there already."""
 
     # <config>-<seed> where it is trained, <config>-<group>-<seed> with changes of its group
@@ -78,7 +78,7 @@ class ThrowUnit:
     reference plant.
     """
 
-    source: Source
+    source: ResultSource
     set: str  # name of the table of throws
     params: ThrowParams
     target: float  # [m]
@@ -151,15 +151,15 @@ class ThrowUnit:
 
 
 @dataclass(frozen=True)
-class Work:
+class SweepWork:
     """All units of a list, the most important first."""
 
     name: str
-    sources: tuple[Source, ...]
+    sources: tuple[ResultSource, ...]
     throws: dict[str, tuple[ThrowUnit, ...]]  # by the policy's id
     checkpoint_every: int  # iterations
 
-    def source(self, name: str) -> Source:
+    def source(self, name: str) -> ResultSource:
         """The training of that id; ConfigError where the list has changed."""
         known = {source.id: source for source in self.sources}
         if name not in known:
@@ -182,7 +182,7 @@ def variant_of(run: str) -> str:
     return "full" if stem in FULL.values() else rest if layout in FULL and rest else stem
 
 
-def load_list(name: str, overrides: tuple[str, ...] = ()) -> Work:
+def load_list(name: str, overrides: tuple[str, ...] = ()) -> SweepWork:
     """Load a list by a name of ``configs/sweep`` or a file, and cut it into units; ConfigError
     where something is wrong in it.
     """
@@ -190,9 +190,9 @@ def load_list(name: str, overrides: tuple[str, ...] = ()) -> Work:
     return expand(path.stem, config.load(SweepList, path, overrides))
 
 
-def expand(name: str, params: SweepList) -> Work:
+def expand(name: str, params: SweepList) -> SweepWork:
     """Cut a list into units; ConfigError for a config, change or policy that does not exist."""
-    sources: dict[str, Source] = {}
+    sources: dict[str, ResultSource] = {}
     throws: dict[str, list[ThrowUnit]] = {}
     commit = provenance.commit() if params.commit == "same" else ""
     for called, group in params.runs.items():
@@ -202,7 +202,7 @@ def expand(name: str, params: SweepList) -> Work:
             for seed in group.seeds
             for item in group.configs
         ]
-        for source in [*(Source(str(policy)) for policy in group.policies), *trained]:
+        for source in [*(ResultSource(str(policy)) for policy in group.policies), *trained]:
             sources.setdefault(source.id, source)
             listed = throws.setdefault(source.id, [])
             for wanted in group.throws:
@@ -214,7 +214,7 @@ def expand(name: str, params: SweepList) -> Work:
                 )
                 fresh = _throws(source, wanted, replace(throw, count=count))
                 listed.extend(unit for unit in fresh if unit not in listed)
-    return Work(
+    return SweepWork(
         name,
         tuple(sources.values()),
         {key: tuple(units) for key, units in throws.items()},
@@ -234,15 +234,17 @@ def differences(own: dict, flown: dict, path: str = "") -> dict[str, Any]:
     return found
 
 
-def _trained(name: str, mark: str, changes: tuple[str, ...], seed: int, commit: str) -> Source:
+def _trained(
+    name: str, mark: str, changes: tuple[str, ...], seed: int, commit: str
+) -> ResultSource:
     stated = config.to_dict(
         _experiment(name, changes), defaults=False
     )  # a field that is added later changes no key
     key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
-    return Source(f"{Path(name).stem}-{mark}{seed}", name, changes, seed, key)
+    return ResultSource(f"{Path(name).stem}-{mark}{seed}", name, changes, seed, key)
 
 
-def _throws(source: Source, name: str, params: ThrowParams) -> list[ThrowUnit]:
+def _throws(source: ResultSource, name: str, params: ThrowParams) -> list[ThrowUnit]:
     if params.plant == "hybrid":
         return [ThrowUnit(source, name, params, target, params.count) for target in params.targets]
     cut = batches(params.count)
