@@ -15,9 +15,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 CEILINGS = {
-    "bound function words": 2323,
+    "bound function words": 2322,
     "first lines without a subject": 119,
-    "class names twice": 30,
+    "class names twice": 29,
     "file names twice": 28,
     "wide lines": 1,
     "fmt: skip": 0,

@@ -178,7 +178,7 @@ class HybridMotorPlant(HybridWirePlant):
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state as `WirePlant` does; a hanging ball stays above the ground."""
+        """Return the state as `HybridWirePlant` does; a hanging ball stays above the ground."""
         now = super().state
         ball = now["payload_pos_w"].copy()
         ball[2] = max(ball[2], self._floor)
@@ -186,7 +186,7 @@ class HybridMotorPlant(HybridWirePlant):
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under motor commands, 0 to 1, shape (4,); release: see
-        `WirePlant`.
+        `HybridWirePlant`.
         """
         vel_w = self._now["vel_w"]
         speed = (

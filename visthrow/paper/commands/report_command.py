@@ -70,17 +70,17 @@ def run(args: argparse.Namespace) -> int:
     writable(out)
     if args.quick:
         quick(out, jobs)
-        found = result_set.read(
+        thrown = result_set.read(
             (), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals"
         )
     else:
-        found = result_set.read([records], folders)
-    paths = page.write(out, TITLE, lead(found), sections(found))
-    print(summary(found))
+        thrown = result_set.read([records], folders)
+    paths = page.write(out, TITLE, lead(thrown), sections(thrown))
+    print(summary(thrown))
     for path in paths[:2]:
         print(path)
     print(
-        f"{len(found.results)} sets of throws, {len(found.runs)} trainings,"
+        f"{len(thrown.results)} sets of throws, {len(thrown.runs)} trainings,"
         f" {time.perf_counter() - begin:.0f} s"
     )
     return 0
@@ -164,9 +164,9 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def lead(found) -> str:
+def lead(thrown) -> str:
     """Return the page's introduction."""
-    note = f" **{found.note[0].upper() + found.note[1:]}.**" if found.note else ""
+    note = f" **{thrown.note[0].upper() + thrown.note[1:]}.**" if thrown.note else ""
     return (
         "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no"
         " vehicle was flown for this project**, and the reference plants (MuJoCo, own code of"
@@ -175,7 +175,7 @@ def lead(found) -> str:
     )
 
 
-def sections(found) -> list:
+def sections(thrown) -> list:
     """Return the sections, each followed by what somebody wrote beside its data."""
     from dataclasses import replace
 
@@ -183,34 +183,34 @@ def sections(found) -> list:
     from visthrow.view.parts import Text
 
     made = [
-        throws.throws_section(found),
-        throws.vision_section(found),
-        ablations.section(found),
-        trade.baseline_section(found),
-        trade.front_section(found),
-        gap.section(found),
-        beyond.section(found),
-        beyond.training_section(found),
-        beyond.origin_section(found),
+        throws.throws_section(thrown),
+        throws.vision_section(thrown),
+        ablations.section(thrown),
+        trade.baseline_section(thrown),
+        trade.front_section(thrown),
+        gap.section(thrown),
+        beyond.section(thrown),
+        beyond.training_section(thrown),
+        beyond.origin_section(thrown),
     ]
     return [
         replace(
             s,
             parts=(
                 *s.parts,
-                *(Text(p, "why") for p in found.findings.get(s.name, "").split("\n\n") if p),
+                *(Text(p, "why") for p in thrown.findings.get(s.name, "").split("\n\n") if p),
             ),
         )
         for s in made
     ]
 
 
-def summary(found) -> str:
+def summary(thrown) -> str:
     """The table that is printed."""
     from visthrow.paper.report.throws import throws_section
     from visthrow.view.parts import Grid
 
-    grids = [part for part in throws_section(found).parts if isinstance(part, Grid)]
+    grids = [part for part in throws_section(thrown).parts if isinstance(part, Grid)]
     return (
         grids[0].markdown() + "\n"
         if grids

@@ -114,18 +114,18 @@ def _rows(
         return []
     rows = [_row("full", full, full)]
     for variant in (*PAPER_FOUR, *FURTHER):
-        found = thrown.seeds(layout, variant, plant, TARGET)
-        if not found:
+        trainings = thrown.seeds(layout, variant, plant, TARGET)
+        if not trainings:
             if layout == "state" or variant in PAPER_FOUR:
                 missing.append(f"{TITLES[variant]} ({layout}, {SHORT[plant]})")
             continue
-        rows.append(_row(variant, found, full))
-        ratio = st.ratio(errors(found), errors(full))
+        rows.append(_row(variant, trainings, full))
+        ratio = st.ratio(errors(trainings), errors(full))
         series = list(SHORT_LAYOUT).index(layout) * len(PLANTS) + PLANTS.index(plant)
         paper = paper_ratio(variant) if not series else None
         marks.append(figures.Mark(TITLES[variant], ratio, series, paper))
         if layout == "state" and plant == PLANTS[0]:
-            said.append(_said(variant, ratio, found))
+            said.append(_said(variant, ratio, trainings))
     return rows
 
 
@@ -143,20 +143,20 @@ def paper_ratio(variant: str) -> st.Interval | None:
     return st.Interval(ratio, ratio - half, ratio + half, "throws")
 
 
-def _row(variant: str, found: list[Result], full: list[Result]) -> tuple[str, ...]:
-    paper, bias = paper_ratio(variant), st.bias([r.miss for r in found])
-    ratio = "1" if variant == "full" else st.ratio(errors(found), errors(full)).text(2)
+def _row(variant: str, trainings: list[Result], full: list[Result]) -> tuple[str, ...]:
+    paper, bias = paper_ratio(variant), st.bias([r.miss for r in trainings])
+    ratio = "1" if variant == "full" else st.ratio(errors(trainings), errors(full)).text(2)
     along, lateral = (of.text(sign=True) for of in (bias.along, bias.lateral))
     return (
         TITLES[variant],
-        str(len(found)),
-        str(sum(len(r.good) for r in found)),
-        landed(*found),
-        st.mean(errors(found)).text(),
+        str(len(trainings)),
+        str(sum(len(r.good) for r in trainings)),
+        landed(*trainings),
+        st.mean(errors(trainings)).text(),
         ratio,
         "-" if paper is None or variant == "full" else paper.text(1),
         f"{bias.scatter:.3f}",
-        f"{st.mean([r.of('duration') for r in found]).value:.3f}",
+        f"{st.mean([r.of('duration') for r in trainings]).value:.3f}",
         along,
         lateral,
         bias.direction,
@@ -164,7 +164,7 @@ def _row(variant: str, found: list[Result], full: list[Result]) -> tuple[str, ..
     )
 
 
-def _said(variant: str, ratio: st.Interval, found: list[Result]) -> str:
+def _said(variant: str, ratio: st.Interval, trainings: list[Result]) -> str:
     """One sentence: whether the component matters here as the paper says."""
     paper = paper_ratio(variant)
     head = f"**{TITLES[variant]}**: {ratio.text(2)} times the full model's error"
@@ -180,21 +180,25 @@ def _said(variant: str, ratio: st.Interval, found: list[Result]) -> str:
     agree = "apart from ours" if apart else "the intervals overlap"
     beside = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
     words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
-    bias = st.bias([r.miss for r in found])
+    bias = st.bias([r.miss for r in trainings])
     signs = f" Bias here: {bias.direction}, {100 * bias.share:.0f} % of the mean square miss"
     signs += f"; the paper's throws: {words}." if words else "."
-    seeds = "" if len(found) > 1 else " One training: the interval covers throws, not trainings."
+    seeds = (
+        "" if len(trainings) > 1 else " One training: the interval covers throws, not trainings."
+    )
     return f"{head}: {verdict}{beside}.{signs}{seeds}"
 
 
 def _scatter(thrown: ResultSet) -> Picture | None:
     plant, panels = PLANTS[0], []
     for variant in ("full", *PAPER_FOUR, *FURTHER):
-        found = thrown.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
-        if found:
+        trainings = thrown.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
+        if trainings:
             words = PAPER_ABLATIONS.get(variant)
             title = TITLES[variant] + ("" if words is None else f"\npaper: {words[4]}")
-            panels.append((title, [(f"training {r.unit['train_seed']}", r.miss) for r in found]))
+            panels.append(
+                (title, [(f"training {r.unit['train_seed']}", r.miss) for r in trainings])
+            )
     if len(panels) < 2:
         return None
     text = (

@@ -61,8 +61,8 @@ class ResultSet:
 
     def shipped(self, name: str, plant: str, target: float) -> Result | None:
         """Throws of a shipped policy under its own conditions."""
-        found = self.policies(plant, target, policy=name, departures={})
-        return found[0] if found else None
+        collected = self.policies(plant, target, policy=name, departures={})
+        return collected[0] if collected else None
 
     def seeds(
         self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY
@@ -70,9 +70,13 @@ class ResultSet:
         """Throws of runs that were trained for the comparison, shipped policies left out; one
         result a training seed.
         """
-        found = self.policies(plant, target, layout=layout, variant=variant, departures=departures)
+        collected = self.policies(
+            plant, target, layout=layout, variant=variant, departures=departures
+        )
         return [
-            result for result in found if result.unit["policy"] not in SHIPPED and result.good.any()
+            result
+            for result in collected
+            if result.unit["policy"] not in SHIPPED and result.good.any()
         ]
 
     def matching(self, **wanted: Any) -> list[Result]:
@@ -89,13 +93,13 @@ class ResultSet:
         """A shipped policy's throws with one value of the config changed: the value and the throws,
         ascending.
         """
-        found = [
+        collected = [
             r
             for r in self.matching(kind="policy", policy=policy, plant=plant, target=target)
             if list(r.unit["departures"]) == [key]
         ]
         return sorted(
-            ((r.unit["departures"][key], r) for r in found),
+            ((r.unit["departures"][key], r) for r in collected),
             key=lambda pair: float(np.ravel(pair[0])[0]),
         )
 
@@ -109,7 +113,7 @@ def read(
     A later one counts over an earlier one; what an older protocol flew is left out. StorageError
     for what cannot be read."""
     records = [Path(place) for place in records]
-    found = load_all([*(place / PARTS[0] for place in records), *folders]).values()
+    collected = load_all([*(place / PARTS[0] for place in records), *folders]).values()
     runs: dict[str, dict] = {}
     findings: dict[str, str] = {}
     for place in records:
@@ -119,7 +123,7 @@ def read(
             )
         for path in sorted((place / PARTS[2]).glob("*.md")):
             findings[path.stem] = path.read_text(encoding="utf-8").strip()
-    today = [result for result in found if result.unit.get("protocol") == PROTOCOL]
+    today = [result for result in collected if result.unit.get("protocol") == PROTOCOL]
     return ResultSet(tuple(join(today)), tuple(runs.values()), findings, note)
 
 

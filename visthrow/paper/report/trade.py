@@ -76,10 +76,10 @@ def baseline_section(thrown: ResultSet) -> Section:
 
 def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Result | None:
     """Throws at the speed and with the weights of the throws by target, the most there are."""
-    found = [
+    selected = [
         r for r in _of_baseline(thrown, plant, target, compensation=compensation) if _default(r)
     ]
-    return max(found, key=lambda r: r.unit["throws"], default=None)
+    return max(selected, key=lambda r: r.unit["throws"], default=None)
 
 
 def _of_baseline(
@@ -88,7 +88,7 @@ def _of_baseline(
     return thrown.matching(kind="baseline", plant=plant, target=target, **wanted)
 
 
-def by_target(found: Sequence[Result]) -> Grid:
+def by_target(results: Sequence[Result]) -> Grid:
     """Table of throws by target and plant, the paper's beside those of the own model."""
     head = (
         "target [m]",
@@ -107,30 +107,30 @@ def by_target(found: Sequence[Result]) -> Grid:
         "e_p and e_v: payload's position and velocity at separation against the plan; tracking:"
         " root mean square distance from the planned path until the release."
     )
-    return Grid("The baseline by target", head, tuple(map(_row, found)), note, heads=3)
+    return Grid("The baseline by target", head, tuple(map(_row, results)), note, heads=3)
 
 
-def _row(found: Result) -> tuple[str, ...]:
-    unit = found.unit
+def _row(result: Result) -> tuple[str, ...]:
+    unit = result.unit
     own = unit["plant"] == thrower.OWN
     paper = of_paper("TO+MPC", unit["target"]) if own else "-"
     head = (
         f"{unit['target']:.1f}",
         SHORT[unit["plant"]],
         "-" if own else thrower.MADE_UP[unit["compensation"]],
-        str(len(found.good)),
-        landed(found, digits=0),
+        str(len(result.good)),
+        landed(result, digits=0),
     )
-    if not found.good.any():
+    if not result.good.any():
         return (*head, "-", "-", "-", "-", "-", paper)
     means = (
-        f"{100 * found.of(name).mean():.1f}"
+        f"{100 * result.of(name).mean():.1f}"
         for name in ("position_error", "velocity_error", "tracking")
     )
     return (
         *head,
-        st.mean(found.of("error")).text(),
-        f"{found.of('duration').mean():.3f}",
+        st.mean(result.of("error")).text(),
+        f"{result.of('duration').mean():.3f}",
         *means,
         paper,
     )
@@ -138,8 +138,8 @@ def _row(found: Result) -> tuple[str, ...]:
 
 def _steps() -> list[Grid | Text]:
     """Step times of the controller, from the records of ``python -m bench.mpc``."""
-    found = [measurements.load(path) for path in sorted(measurements.FOLDER.glob("mpc*.json"))]
-    if not found:
+    records = [measurements.load(path) for path in sorted(measurements.FOLDER.glob("mpc*.json"))]
+    if not records:
         return [
             Text(
                 "No step times of the controller: `python -m bench.mpc --record mpc-cpu`.",
@@ -147,7 +147,7 @@ def _steps() -> list[Grid | Text]:
             )
         ]
     grids = []
-    for record in found:
+    for record in records:
         cpu, (table,) = record["provenance"]["processors"]["cpu"], record["tables"]
         note = f"{measurements.made_by(record)}. {record['notes'][0]}"
         rows = tuple(map(tuple, table["rows"]))
@@ -187,7 +187,7 @@ def front_section(
     """The sweep on each plant, as in :data:`PANELS`, with the policies of these names on it, and
     who beats whom.
     """
-    panels, said, sums, missing, picture, table = [], [], [], [], None, None
+    panels, sentences, sums, missing, picture, table = [], [], [], [], None, None
     for heading, plant, kinds, policies_on in shown:
         title = SHORT[plant]
         policies = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
@@ -196,17 +196,17 @@ def front_section(
         ]
         drawn = []
         for compensation, bounds in kinds:
-            found = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
+            selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
             label = f"TO+MPC, bounds on {bounds}" + (
                 "" if plant == thrower.OWN else f", {thrower.MADE_UP[compensation]}"
             )
-            if not found:
+            if not selected:
                 if (plant, bounds) != ("reference-realistic", BOUNDS[1]):
                     missing.append(f"{title}, {label}")
                 continue
-            drawn.append(((compensation, bounds), found))
-            sums.append(_summed(title, label, found))
-            said += _verdicts(title, label, found, policies, policies_on)
+            drawn.append(((compensation, bounds), selected))
+            sums.append(_summed(title, label, selected))
+            sentences += _verdicts(title, label, selected, policies, policies_on)
         for name, result in policies:
             sums.append(_policy_sum(title, name, result))
         stars = [
@@ -219,9 +219,9 @@ def front_section(
             (
                 kinds.index((made_up, bounds)),
                 f"TO+MPC, bounds on {bounds}{late.get(made_up, '')}",
-                points_of(found),
+                points_of(selected),
             )
-            for (made_up, bounds), found in drawn
+            for (made_up, bounds), selected in drawn
         )
         panels.append(figures.Trade(heading, fronts, tuple(stars), crosses))
     lead = Text(
@@ -258,21 +258,27 @@ def front_section(
             " follows e_v."
         )
         table = Grid("Fronts in figures", head, tuple(sums), note, heads=2)
-    made = (lead, picture, table, *(Text(text, "finding") for text in said), _breakdown(thrown))
+    made = (
+        lead,
+        picture,
+        table,
+        *(Text(text, "finding") for text in sentences),
+        _breakdown(thrown),
+    )
     return parts.section(
         "front", "Agility against accuracy", *made, missing=missing, head="Not swept"
     )
 
 
-def _swept(found: Sequence[Result]) -> list[Result]:
+def _swept(selected: Sequence[Result]) -> list[Result]:
     """Throws of the sweep: those by target are more."""
-    return [r for r in found if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
+    return [r for r in selected if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
 
 
-def points_of(found: Sequence[Result]) -> np.ndarray:
+def points_of(selected: Sequence[Result]) -> np.ndarray:
     """Mean duration [s] and landing error [m] of settings whose throws all landed, shape (N, 2)."""
     return np.array(
-        [(r.of("duration").mean(), r.of("error").mean()) for r in found if r.good.all()]
+        [(r.of("duration").mean(), r.of("error").mean()) for r in selected if r.good.all()]
     ).reshape(-1, 2)
 
 
@@ -287,11 +293,11 @@ def _paper_points() -> tuple[tuple[str, np.ndarray], ...]:
     )
 
 
-def hypervolume(found: Sequence[Result]) -> st.Interval | None:
+def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
     """Hypervolume of the settings whose throws all landed, with its interval over throws; None
     without any.
     """
-    sets = [np.column_stack([r.of("duration"), r.of("error")]) for r in found if r.good.all()]
+    sets = [np.column_stack([r.of("duration"), r.of("error")]) for r in selected if r.good.all()]
     if not sets:
         return None
     rng = np.random.default_rng(0)
@@ -308,11 +314,11 @@ def hypervolume(found: Sequence[Result]) -> st.Interval | None:
     )
 
 
-def _summed(title: str, label: str, found: Sequence[Result]) -> tuple[str, ...]:
-    points, volume = points_of(found), hypervolume(found)
+def _summed(title: str, label: str, selected: Sequence[Result]) -> tuple[str, ...]:
+    points, volume = points_of(selected), hypervolume(selected)
     if volume is None:
-        return (title, label, str(len(found)), "0", "-", "-", "-", "-")
-    good = [r for r in found if r.good.all()]
+        return (title, label, str(len(selected)), "0", "-", "-", "-", "-")
+    good = [r for r in selected if r.good.all()]
     error, velocity = (
         np.concatenate([r.of(name) for r in good]) for name in ("error", "velocity_error")
     )
@@ -320,7 +326,7 @@ def _summed(title: str, label: str, found: Sequence[Result]) -> tuple[str, ...]:
     return (
         title,
         label,
-        str(len(found)),
+        str(len(selected)),
         str(len(good)),
         f"{points[:, 0].min():.3f}",
         f"{points[:, 1].min():.3f}",
@@ -347,14 +353,14 @@ def _policy_sum(title: str, name: str, result: Result) -> tuple[str, ...]:
 def _verdicts(
     title: str,
     label: str,
-    found: Sequence[Result],
+    selected: Sequence[Result],
     policies: Sequence[tuple[str, Result]],
     policies_on: str,
 ) -> list[str]:
     """Whether the paper's claim holds: no setting as accurate and as fast, and at each setting's
     accuracy the policy faster.
     """
-    points, said = points_of(found), []
+    points, sentences = points_of(selected), []
     for name, result in policies:
         own = np.array([result.of("duration").mean(), result.of("error").mean()])
         head = (
@@ -362,7 +368,7 @@ def _verdicts(
             f" ({own[0]:.3f} s, {own[1]:.3f} m): "
         )
         if not len(points):
-            said.append(head + f"none of {_count(found)} landed all its throws.")
+            sentences.append(head + f"none of {_count(selected)} landed all its throws.")
             continue
         beating = points[np.all(points <= own, axis=1)]
         faster, nearer = points[points[:, 0] < own[0]], points[points[:, 1] < own[1]]
@@ -382,8 +388,8 @@ def _verdicts(
             if len(nearer)
             else ""
         )
-        said.append(f"{head}{claim}; {speed}; {accuracy}.")
-    return said
+        sentences.append(f"{head}{claim}; {speed}; {accuracy}.")
+    return sentences
 
 
 def _count(points: Sequence) -> str:
@@ -392,8 +398,8 @@ def _count(points: Sequence) -> str:
 
 def _breakdown(thrown: ResultSet) -> Grid | None:
     """The paper's table of settings, and ours of the own model."""
-    found = _swept(_of_baseline(thrown, thrower.OWN))
-    if not found:
+    selected = _swept(_of_baseline(thrown, thrower.OWN))
+    if not selected:
         return None
     rows = [
         (
@@ -408,7 +414,7 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
         )
         for v, w_t, rho, e, d, p, u in front.PAPER_FRONT
     ]
-    for r in sorted(found, key=lambda r: (r.unit["bounds"], r.unit["speed"], -r.unit["w_t"])):
+    for r in sorted(selected, key=lambda r: (r.unit["bounds"], r.unit["speed"], -r.unit["w_t"])):
         unit = r.unit
         head = (
             f"{unit['speed']:g}",
