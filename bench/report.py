@@ -14,7 +14,7 @@ from visthrow.common.errors import StorageError
 from visthrow.common.storage import write_json
 from visthrow.paper import measurements
 
-FURTHER_PACKAGES = ("mujoco-warp",)
+FURTHER_PACKAGES = ("mujoco-warp", "ovphysx")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
 
 
