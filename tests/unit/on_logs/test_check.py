@@ -280,6 +280,16 @@ def test_frozen_jumping_and_saturated_values():
     assert "saturated" in faults(log_of(columns), "warn")
 
 
+@pytest.mark.parametrize(
+    ("count", "clipped", "told"), [(60, 0, False), (60, 6, True), (40, 0, False)]
+)
+def test_the_least_of_few_samples_is_no_rail(count, clipped, told):
+    values = np.random.default_rng(0).normal(0.0, 1.0, (count, 3))
+    values[:clipped, 0] = np.max(values)
+    log = FlightLog({"rate_b": Channel(0.02 * np.arange(count), values, "rad/s", "body")})
+    assert ("saturated" in " ".join(row.text for row in check([log])[0].rows)) == told
+
+
 def test_gaps_and_clocks():
     columns = flight()
     keep = np.ones(len(columns["time"]), bool)

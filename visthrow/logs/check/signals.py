@@ -254,7 +254,7 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
         for rail, words in ((low, "lowest"), (high, "highest")):
             if rail == low and any(word in name for word in _STOPS_AT_ZERO):
                 continue  # switched off is no rail
-            share = float(np.mean(column == rail))
+            share = float(np.sum(column == rail) - 1) / len(column)  # one is always the least
             if share > worst:
                 worst, where = share, f"its {words} value {rail:.6g}"
     if worst <= _RAIL_SHARE:
