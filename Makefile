@@ -53,7 +53,7 @@ physx: .venv-physx/.installed
 	touch $@
 
 test-physx: physx
-	OMP_NUM_THREADS=1 .venv-physx/bin/python -m pytest tests/oracle/test_solvers.py
+	OMP_NUM_THREADS=1 .venv-physx/bin/python -m pytest tests/oracle/test_solvers.py -k physx
 
 # The documentation, to be read from its folder, offline: out/site/index.html. A broken link or name fails.
 docs: $(STAMP)
