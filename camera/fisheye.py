@@ -85,11 +85,11 @@ class Fisheye:
         radius2 = x * x + y * y + epsilon
         radius = radius2.sqrt()
         distance = (radius2 + z * z).sqrt()
-        behind = z < 0.0
+        backward = z < 0.0
         # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each
         # side of the lens plane.
         reach = distance + z.abs()
-        tangent = torch.where(behind, reach, radius) / torch.where(behind, radius, reach)
+        tangent = torch.where(backward, reach, radius) / torch.where(backward, radius, reach)
         return tangent.atan() * 2.0, radius, distance
 
     def radius_from_angle(self, theta: torch.Tensor) -> torch.Tensor:
@@ -167,8 +167,8 @@ class Fisheye:
         # A ray that was projected from the very edge may round to either side of it.
         valid = radius <= self.edge_radius * (1.0 + 8.0 * torch.finfo(pixels.dtype).eps)
         theta = self._angle_from_radius(radius.clamp(max=self.edge_radius))
-        across = plane * (theta.sin() / radius).unsqueeze(-1)
-        return torch.cat([across, theta.cos().unsqueeze(-1)], -1), valid
+        lateral = plane * (theta.sin() / radius).unsqueeze(-1)
+        return torch.cat([lateral, theta.cos().unsqueeze(-1)], -1), valid
 
     def normalize(self, pixels: torch.Tensor) -> torch.Tensor:
         """Normalised image coordinates [-] of pixels [px], both shape (..., 2)."""

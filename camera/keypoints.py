@@ -148,10 +148,10 @@ def ball_extremes_c(
     g = fisheye.radius_from_angle(theta) / s
     slope = fisheye.slope_from_angle(theta)
     q = (slope * centre[:, 2] - g) / (s * s)
-    across = centre[:, :2]
-    along = torch.cat([across * q.unsqueeze(-1), -slope.unsqueeze(-1)], -1)
+    lateral = centre[:, :2]
+    tangent = torch.cat([lateral * q.unsqueeze(-1), -slope.unsqueeze(-1)], -1)
     gradient = (
-        across.unsqueeze(-1) * along.unsqueeze(-2) + g[:, None, None] * axes
+        lateral.unsqueeze(-1) * tangent.unsqueeze(-2) + g[:, None, None] * axes
     )  # (E, 2, 3): of u, of v
     tx, ty, tz = gradient.unbind(-1)
     size = (tx * tx + ty * ty + tz * tz + AXIS_EPSILON).sqrt()
@@ -211,8 +211,8 @@ def corrected_keypoints(
         camera.fisheye.denormalize(points / (1.0 + scale[:, None, None]))
     )
     turn_c = camera.rot_cb @ rotation_from_vector(turn_b) @ camera.rot_cb.T
-    seen, inside = camera.fisheye.project_normalized(rays_c @ turn_c.transpose(-1, -2), clip=True)
-    valid = valid & inside
+    seen, visible = camera.fisheye.project_normalized(rays_c @ turn_c.transpose(-1, -2), clip=True)
+    valid = valid & visible
     return seen * valid.unsqueeze(-1), valid
 
 

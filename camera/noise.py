@@ -45,21 +45,21 @@ def apply_noise(
         What the detector reports [-], shape (E, K, 2), and its validity bits, shape (E, K).
     """
     noisy = keypoints + bias + draw.normals * params.step_std
-    kept = draw.uniforms >= params.drop_probability
-    seen = valid & kept
+    detected = draw.uniforms >= params.drop_probability
+    visible = valid & detected
     # Clipped points carry no noise: they are a rule, not a measurement.
     unseen = (
-        keypoints * kept.unsqueeze(-1)
+        keypoints * detected.unsqueeze(-1)
         if params.invalid_reads == "edge"
         else torch.zeros_like(keypoints)
     )
-    points = torch.where(seen.unsqueeze(-1), noisy, unseen)
+    points = torch.where(visible.unsqueeze(-1), noisy, unseen)
     if draw.wrong is None:
-        return points, seen
+        return points, visible
     mistaken = draw.wrong[..., 0] < params.wrong_probability
     return (
         torch.where(mistaken.unsqueeze(-1), 2.0 * draw.wrong[..., 1:] - 1.0, points),
-        seen | mistaken,
+        visible | mistaken,
     )
 
 

@@ -50,12 +50,12 @@ def draw_overlay(
     _draw_field_of_view(canvas, lens, thick)
     _draw_body_axes(canvas, camera, thick)
     pixels = lens.denormalize(keypoints.detach().cpu().double()).numpy()
-    seen = valid.detach().cpu().numpy().astype(bool)
+    visible = valid.detach().cpu().numpy().astype(bool)
     goal, box = pixels[:GOAL_KEYPOINTS], pixels[GOAL_KEYPOINTS:]
-    _draw_group(canvas, goal, seen[:GOAL_KEYPOINTS], goal, GREEN, thick)
+    _draw_group(canvas, goal, visible[:GOAL_KEYPOINTS], goal, GREEN, thick)
     left, top, right, bottom = box[0, 0], box[1, 1], box[2, 0], box[3, 1]
     rectangle = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    _draw_group(canvas, box, seen[GOAL_KEYPOINTS:], rectangle, RED, thick)
+    _draw_group(canvas, box, visible[GOAL_KEYPOINTS:], rectangle, RED, thick)
     return canvas
 
 

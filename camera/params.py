@@ -74,8 +74,10 @@ class FisheyeParams:
                 " 360 deg"
             )
         t2 = SEEN_AT_LEAST**2
-        near = SEEN_AT_LEAST * (1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients)))
-        if near * min(self.fx, self.fy) > math.hypot(self.width, self.height):
+        slope = SEEN_AT_LEAST * (
+            1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients))
+        )
+        if slope * min(self.fx, self.fy) > math.hypot(self.width, self.height):
             raise ValueError(
                 f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg"
                 f" off the axis falls outside an image of {self.width} x {self.height} px; expected"

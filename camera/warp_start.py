@@ -38,6 +38,6 @@ def start() -> None:
             os.dup2(saved, 2)
             os.close(saved)
         caught.seek(0)
-        rest = b"".join(line for line in caught if NO_DRIVER not in line)
-    if rest:
-        os.write(2, rest)
+        output = b"".join(line for line in caught if NO_DRIVER not in line)
+    if output:
+        os.write(2, output)

@@ -100,35 +100,35 @@ def _listen(args: argparse.Namespace) -> int:
         begin, seconds, poses = clock.now(), args.seconds or LISTEN, []
         last: list[str] = []
         while clock.now() - begin < seconds and not source.ended:
-            now = clock.now()
-            came = source.poll(now)
+            time = clock.now()
+            came = source.poll(time)
             poses += came
-            runner.hear(source.rivals(now))
-            runner.tick(now, came, autopilot.status(now), OperatorInput())
+            runner.hear(source.rivals(time))
+            runner.tick(time, came, autopilot.status(time), OperatorInput())
             last = runner.problems() or last
-            autopilot.tick(now, runner)
-            clock.sleep_until(now + runner.pilot.period)
-        now = clock.now()
-        found = autopilot.results(now, runner.mass)
+            autopilot.tick(time, runner)
+            clock.sleep_until(time + runner.pilot.period)
+        time = clock.now()
+        results = autopilot.results(time, runner.mass)
         autopilot.backend.close()
     rosters = [*source.rosters, *filter(None, [getattr(autopilot.backend, "roster", None)])]
     for name, track in runner.tracks.items():
-        print(_body_line(name, track, now, now - begin, source.stamped))
+        print(_body_line(name, track, time, time - begin, source.stamped))
     for roster in rosters:
-        print("".join(f"{line}\n" for line in _link_lines(roster, params, now - begin)), end="")
+        print("".join(f"{line}\n" for line in _link_lines(roster, params, time - begin)), end="")
     problems = (
         runner.problems()
-        + _not_taken(rosters, now - begin)
+        + _not_taken(rosters, time - begin)
         + unit_problems(poses, params.frames)
-        + [text for good, text in found if not good]
+        + [text for good, text in results if not good]
     )
-    held, wanted = runner.machine.held(now), params.states.check_hold
+    held, wanted = runner.machine.held(time), params.states.check_hold
     if not problems and held < wanted:
         problems = [
             f"all was well for the last {held:.1f} s; expected {wanted:g} s:"
             f" {'; '.join(last) or 'look longer, with --seconds'}"
         ]
-    print("".join(f"{text}\n" for good, text in found if good), end="")
+    print("".join(f"{text}\n" for good, text in results if good), end="")
     print("\n".join(f"FAIL  {text}" for text in problems) or "PASS  all checks: a run would hover")
     return 1 if problems else 0
 
@@ -254,11 +254,11 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
             " states.armed_least=3.0"
         )
     thrust = getattr(params, params.backend).thrust
-    asked, weight = sum(thrusts) / len(thrusts), mass * GRAVITY
-    ratio = asked / weight
+    commanded, weight = sum(thrusts) / len(thrusts), mass * GRAVITY
+    ratio = commanded / weight
     text = (
         f"hover took {ratio:.3f} times the weight by the config's calibration: the hover share is"
-        f" {thrust.share(asked):.4f}, not {thrust.share(weight):.4f} ({len(thrusts)} ticks,"
+        f" {thrust.share(commanded):.4f}, not {thrust.share(weight):.4f} ({len(thrusts)} ticks,"
         f" {100 * thrust.tolerance:g} % allowed)"
     )
     return abs(ratio - 1.0) <= thrust.tolerance, text

@@ -77,9 +77,10 @@ class Console:
             self.say(head + (decision.reason if decision.reason != self._before[1] else ""))
             self._before = decision.state, decision.reason
         if decision.calibration is not None:
-            found = decision.calibration
+            estimate = decision.calibration
             self.say(
-                f"{head}calibration: {found if isinstance(found, str) else Calibration.of(found)}"
+                f"{head}calibration:"
+                f" {estimate if isinstance(estimate, str) else Calibration.of(estimate)}"
             )
         if decision.waits:
             self.say(f"{head}waits: {decision.waits}")
@@ -132,8 +133,8 @@ class Terminal:
             )
 
     def words(self, state: str) -> OperatorInput:
-        said = self._lines()
-        arm = "arm" in said
+        lines = self._lines()
+        arm = "arm" in lines
         if self._auto and state == "ready" and not arm:
             arm = self._simulated()
             if not arm and not self._warned:
@@ -142,7 +143,7 @@ class Terminal:
                     "--auto-arm: this vehicle does not say that it is simulated (`visthrow hil"
                     " fake` does); type arm"
                 )
-        return OperatorInput(arm, "land" in said, "abort" in said or bool(self._why), self._why)
+        return OperatorInput(arm, "land" in lines, "abort" in lines or bool(self._why), self._why)
 
     def _lines(self) -> set[str]:
         """Return lines that were typed since the last call; half a line waits for its end."""
@@ -154,7 +155,7 @@ class Terminal:
             if not data:
                 self._file = -1
             self._typed += data
-        *whole, rest = self._typed.split(b"\n")
-        self._typed = rest[-MOST_TYPED:] if self._file >= 0 else b""
-        whole += [] if self._file >= 0 else [rest]
+        *whole, partial = self._typed.split(b"\n")
+        self._typed = partial[-MOST_TYPED:] if self._file >= 0 else b""
+        whole += [] if self._file >= 0 else [partial]
         return {line.decode("utf-8", "replace").strip().lower() for line in whole}

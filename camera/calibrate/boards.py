@@ -62,10 +62,10 @@ class BoardParams:
         """OpenCV's object of a ChArUco board: one square more each way than inner corners."""
         import cv2
 
-        known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-        if self.dictionary not in known:
+        names = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+        if self.dictionary not in names:
             raise ValueError(
-                f"ChArUco dictionary {self.dictionary!r}; expected one of {', '.join(known)}"
+                f"ChArUco dictionary {self.dictionary!r}; expected one of {', '.join(names)}"
             )
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard(
@@ -123,15 +123,19 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
         )  # free of the marker about each corner, in squares
         return View(board.corners_m()[ids.ravel()], _refine(grey, corners.reshape(-1, 2), margin))
     if board.pattern == "circles":
-        found, centres = cv2.findCirclesGrid(
+        success, centres = cv2.findCirclesGrid(
             grey, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID
         )
-        return View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64)) if found else None
+        return (
+            View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64)) if success else None
+        )
     # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes
     # second.
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
-        found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=flags)
-        if found:
+        success, corners = cv2.findChessboardCornersSB(
+            grey, (board.columns, board.rows), flags=flags
+        )
+        if success:
             return View(board.corners_m(), _refine(grey, corners.reshape(-1, 2)))
     return None
 
@@ -145,10 +149,10 @@ def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.nd
     """
     import cv2
 
-    apart = np.linalg.norm(corners[:, None] - corners[None], axis=-1) + np.diag(
+    distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1) + np.diag(
         np.full(len(corners), np.inf)
     )
-    half = int(np.clip(share * apart.min(), 1, 8))
+    half = int(np.clip(share * distances.min(), 1, 8))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     start = corners.astype(np.float32).reshape(-1, 1, 2).copy()
     return (
@@ -195,24 +199,24 @@ def calibrate_from_boards(
             centre = np.array([width - 1.0, height - 1.0]) / 2.0
             reach = [float(np.linalg.norm(v.pixels - centre, axis=1).max()) for v in views]
             worst = int(np.argmax(reach))
-            said = str(error).strip().splitlines()[-1]
+            reason = str(error).strip().splitlines()[-1]
             left_out[used[worst]] = (
                 f"reaches {reach[worst]:.0f} px from the image's centre, and OpenCV's model, which"
-                f" ends 90 deg off the axis, cannot be started with it ({said})"
+                f" ends 90 deg off the axis, cannot be started with it ({reason})"
             )
             continue
-        every = {
+        estimates = {
             i: _residual(Fisheye(lens), view, board_pose(Fisheye(lens), view))
             for i, view in zip(used, views)
         }
-        sizes = {i: float(np.sqrt(2.0 * np.mean(every[i] ** 2))) for i in used}
+        sizes = {i: float(np.sqrt(2.0 * np.mean(estimates[i] ** 2))) for i in used}
         limit = WRONG_BOARD * float(np.median(list(sizes.values())))
         wrong = max(sizes, key=sizes.__getitem__)
         if sizes[wrong] <= limit:
             break
         left_out[wrong] = f"is {sizes[wrong]:.2f} px off, the others {limit / WRONG_BOARD:.2f} px"
-    kept = [every.get(i) for i in range(len(found))]
-    return replace(lens, fov_deg=fov_deg), replace(_report(kept), left_out=left_out)
+    poses = [estimates.get(i) for i in range(len(found))]
+    return replace(lens, fov_deg=fov_deg), replace(_report(poses), left_out=left_out)
 
 
 def _solved(views: list[View], width: int, height: int, fov_deg: float) -> FisheyeParams:
@@ -259,14 +263,14 @@ def check_boards(
         board: The board.
         fisheye: The lens.
     """
-    size, found = find_boards(images, board)
+    size, views = find_boards(images, board)
     if size != (fisheye.height, fisheye.width):
         raise ValueError(
             f"pictures of {size[1]} x {size[0]} px came; expected {fisheye.width} x"
             f" {fisheye.height}, the lens's size"
         )
     lens = Fisheye(fisheye)
-    return _report([None if v is None else _residual(lens, v, board_pose(lens, v)) for v in found])
+    return _report([None if v is None else _residual(lens, v, board_pose(lens, v)) for v in views])
 
 
 def find_boards(
@@ -282,10 +286,10 @@ def find_boards(
             f"pictures of sizes {sizes} came (height, width); expected one size, that of one camera"
         )
     views = [find_board(image, board) for image in images]
-    seen = sum(view is not None for view in views)
-    if seen < DETECTED_AT_LEAST:
+    count = sum(view is not None for view in views)
+    if count < DETECTED_AT_LEAST:
         raise ValueError(
-            f"a {board.pattern} of {board.columns} x {board.rows} points was found in {seen} of "
+            f"a {board.pattern} of {board.columns} x {board.rows} points was found in {count} of "
             f"{len(images)} pictures; expected at least {DETECTED_AT_LEAST}"
         )
     return sizes[0], views
@@ -339,5 +343,7 @@ def _residual(lens: Fisheye, view: View, pose: np.ndarray) -> np.ndarray:
 def _report(residuals: list[np.ndarray | None]) -> BoardReport:
     """Errors of pictures from their residuals, shape (2 N,) each."""
     together = np.concatenate([r for r in residuals if r is not None])
-    each = (np.nan if r is None else float(np.sqrt(2.0 * np.mean(r * r))) for r in residuals)
-    return BoardReport(float(np.sqrt(2.0 * np.mean(together**2))), tuple(each), together.size // 2)
+    errors = (np.nan if r is None else float(np.sqrt(2.0 * np.mean(r * r))) for r in residuals)
+    return BoardReport(
+        float(np.sqrt(2.0 * np.mean(together**2))), tuple(errors), together.size // 2
+    )

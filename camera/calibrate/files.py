@@ -70,23 +70,23 @@ def read(
         (zero where the file holds ours).
     """
     try:
-        found = _cameras(_tree(path))
-        if not found:
+        cameras = _cameras(_tree(path))
+        if not cameras:
             named = re.findall(r"[\w./-]+\.ya?ml", Path(path).read_text())
             hint = f"; it names {', '.join(dict.fromkeys(named))}: one of these?" if named else ""
             raise ValueError(
                 f"holds no camera of a known tool; expected one of {', '.join(BOXES)}{hint}"
             )
-        box, node, name = _chosen(found, camera)
+        box, node, name = _chosen(cameras, camera)
         node = {**node, "asked_model": model} if model else node
         lens, report = _lens(*BOXES[box][1](node), node, fov_deg)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    if len(found) > 1:
-        others = ", ".join(of[2] or str(i) for i, of in enumerate(found))
+    if len(cameras) > 1:
+        names = ", ".join(of[2] or str(i) for i, of in enumerate(cameras))
         report = replace(
             report,
-            remarks=(f"camera {name} of {len(found)} in the file ({others})", *report.remarks),
+            remarks=(f"camera {name} of {len(cameras)} in the file ({names})", *report.remarks),
         )
     return box, lens, report
 
@@ -158,7 +158,7 @@ def _tree_of_xml(text: str) -> Any:
 def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
     """Each camera in a tree: its box, its node and what it is called there."""
     if isinstance(tree, list):
-        named = [(str(i), of) for i, of in enumerate(tree)]
+        named = [(str(i), entry) for i, entry in enumerate(tree)]
     elif isinstance(tree, dict):
         if isinstance(tree.get("intrinsics"), list) and "resolution" in tree:
             tree = _unzipped(tree)
@@ -166,13 +166,13 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
         box = next((box for box, (keys, _) in BOXES.items() if keys(known)), "")
         if box:
             return [(box, tree, str(tree.get("label", name) or name))]
-        named = [(str(key), of) for key, of in tree.items()]
+        named = [(str(key), entry) for key, entry in tree.items()]
     else:
         return []
     return [
         found
-        for key, of in named
-        for found in _cameras(of, name if key in ("camera", "value0", "cameras") else key)
+        for key, entry in named
+        for found in _cameras(entry, name if key in ("camera", "value0", "cameras") else key)
     ]
 
 
@@ -215,24 +215,25 @@ def _floats(value: Any, name: str, counts: tuple[int, ...] | None = None) -> lis
             raise ValueError
     except (TypeError, ValueError):
         text = repr(value)
-        wanted = " or ".join(map(str, counts)) if counts else "some"
+        expected = " or ".join(map(str, counts)) if counts else "some"
         raise ValueError(
-            f"{name} is {text if len(text) <= 80 else text[:77] + '...'}; expected {wanted} numbers"
+            f"{name} is {text if len(text) <= 80 else text[:77] + '...'}; expected {expected}"
+            " numbers"
         ) from None
     return numbers
 
 
 def _named(node: Node, names: str, section: str = "") -> Values:
     """Numbers that stand under their own names."""
-    at = _any(node, section) if section else node
+    section_node = _any(node, section) if section else node
     words = names.split()
-    return dict(zip(words, _floats([_any(at, word) for word in words], names)))
+    return dict(zip(words, _floats([_any(section_node, word) for word in words], names)))
 
 
 def _label(node: Node, *names: str) -> str:
     """Distortion model by whatever name a tool gives it."""
-    asked = node.get("asked_model")
-    word = str(asked if asked else _any(node, *names))
+    model_name = node.get("asked_model")
+    word = str(model_name if model_name else _any(node, *names))
     plain = re.sub(r"[^a-z0-9]", "", word.lower())
     for model, words in LABELS.items():
         if plain in words.split():
@@ -315,10 +316,10 @@ def _svo(node: Node) -> Camera:
             f"type is {core!r} with {len(numbers)} intrinsics; expected 'pinhole' with 4 or 'omni'"
             " with 24"
         )
-    given = _any(node, "distortion.parameters", "distortion_coefficients", "distortion.data")
+    coefficients = _any(node, "distortion.parameters", "distortion_coefficients", "distortion.data")
     label = "fov" if _any(node, "distortion.type") == "fisheye" else _label(node, "distortion.type")
     values = dict(zip(KB4.split(), numbers))
-    return _model(core, label, values, _floats(given, "distortion.parameters"))
+    return _model(core, label, values, _floats(coefficients, "distortion.parameters"))
 
 
 VIKIT = {
@@ -340,17 +341,19 @@ def _vikit(node: Node) -> Camera:
     if fx < 10.0:  # shares of the image, which count from its corner
         width, height = _size(node) or (0, 0)
         fx, fy, cx, cy = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5
-    given = [_floats([node.get(f"cam_d{i}", 0.0)], f"cam_d{i}")[0] for i in range(5)]
+    coefficients = [_floats([node.get(f"cam_d{i}", 0.0)], f"cam_d{i}")[0] for i in range(5)]
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return _model("pinhole", VIKIT[kind], values, given[: 1 if VIKIT[kind] == "fov" else None])
+    return _model(
+        "pinhole", VIKIT[kind], values, coefficients[: 1 if VIKIT[kind] == "fov" else None]
+    )
 
 
 def _matrix(node: Node) -> Camera:
     """ROS camera_info and OpenCV's FileStorage: a camera matrix and coefficients."""
-    given = _any(node, "camera_matrix", "cameraMatrix", "K", "k")
-    fx, skew, cx, _, fy, cy, *_ = _floats(given, "camera_matrix", (9,))
-    given = _any(node, "distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "d")
-    coefficients = _floats(given, "distortion_coefficients")
+    matrix = _any(node, "camera_matrix", "cameraMatrix", "K", "k")
+    fx, skew, cx, _, fy, cy, *_ = _floats(matrix, "camera_matrix", (9,))
+    matrix = _any(node, "distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "d")
+    coefficients = _floats(matrix, "distortion_coefficients")
     flag = node.get("fisheye_model")
     if flag is not None:
         node = {**node, "distortion_model": "fisheye" if int(flag) else "radtan"}
@@ -371,9 +374,9 @@ def _orbslam(node: Node) -> Camera:
     fisheye = "kannala" in str(node.get("Camera.type", "")).lower()
     plain = {key.partition(".")[2]: of for key, of in node.items() if key.startswith(head + ".")}
     names = KB4.split()[4:] if fisheye else DISTORTIONS["radtan"][0].split()[:5]
-    given = [_floats([plain.get(name, 0.0)], name)[0] for name in names]
+    coefficients = [_floats([plain.get(name, 0.0)], name)[0] for name in names]
     values = _named(plain, "fx fy cx cy")
-    return _model("pinhole", "kb4" if fisheye else "radtan", values, given)
+    return _model("pinhole", "kb4" if fisheye else "radtan", values, coefficients)
 
 
 def _basalt(node: Node) -> Camera:
@@ -385,8 +388,8 @@ def _basalt(node: Node) -> Camera:
     elif core in DENOMINATORS and not names:
         names = f"fx fy cx cy {DENOMINATORS[core][0]}"
     if not names:
-        known = ["kb4", "pinhole-radtan8", *DENOMINATORS]
-        raise ValueError(f"camera_type is {kind!r}; expected one of {known}")
+        models = ["kb4", "pinhole-radtan8", *DENOMINATORS]
+        raise ValueError(f"camera_type is {kind!r}; expected one of {models}")
     return kind.replace("radtan8", "radtan"), _named(node, names, "intrinsics")
 
 
@@ -445,16 +448,16 @@ def _size(node: Node) -> tuple[int, int] | None:
         height, width = _floats(node["ocam_lines"][4], "height and width", (2,))
         return int(width), int(height)
     pair = ("resolution", "cameraResolution", "image_size", "imageSize", "img_size")
-    given = next((node[name] for name in pair if node.get(name) is not None), None)
-    if given is not None:
-        width, height = _floats(given, "image size", (2,))
+    value = next((node[name] for name in pair if node.get(name) is not None), None)
+    if value is not None:
+        width, height = _floats(value, "image size", (2,))
         return int(width), int(height)
     sides = [("image_width", "width", "cam_width", "Camera.width")]
     sides.append(("image_height", "height", "cam_height", "Camera.height"))
-    found = [next((node[n] for n in names if n in node), None) for names in sides]
-    if None in found:
+    sizes = [next((node[n] for n in names if n in node), None) for names in sides]
+    if None in sizes:
         return None
-    width, height = _floats(found, "image size")
+    width, height = _floats(sizes, "image size")
     return int(width), int(height)
 
 
@@ -475,8 +478,8 @@ def _lens(
         )
     if model == "kb4" and values.pop("skew", 0.0):
         raise ValueError("a camera matrix with skew, which our model has not")
-    model, said = _contradictions(model, values, size, bool(node.get("asked_model")))
-    remarks += said
+    model, notes = _contradictions(model, values, size, bool(node.get("asked_model")))
+    remarks += notes
     fov = asked_fov
     if node.get("fov_deg") is not None:
         fov = _floats([node["fov_deg"]], "fov_deg")[0]
@@ -536,9 +539,9 @@ def _contradictions(
         )
     if model == "pinhole-radtan" and not asked:
         k1, k2, k3, k4 = (values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2"))
-        rest = any(values.get(k, 0.0) for k in ("k3", "k4", "k5", "k6"))
+        higher_terms = any(values.get(k, 0.0) for k in ("k3", "k4", "k5", "k6"))
         tangential = max(abs(k3), abs(k4))
-        if tangential > LARGEST_DECENTRING and not rest:
+        if tangential > LARGEST_DECENTRING and not higher_terms:
             values |= {"k1": k1, "k2": k2, "k3": k3, "k4": k4}
             remarks.append(
                 f"its label says radial and tangential distortion, but no lens has p = {k3:g},"

@@ -149,16 +149,16 @@ def _ocam_radius(values: Values, theta: Array) -> Array:
     """
     powers = np.array([values[f"a{i}"] for i in range(sum(name[0] == "a" for name in values))])
     rho = np.linspace(0.0, values["farthest"], 4096)
-    seen = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, powers))
-    grows = int(np.argmin(np.append(np.diff(seen) > 0.0, False)))
-    found = np.interp(theta, seen[: grows + 1], rho[: grows + 1], right=np.nan)
+    angles = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, powers))
+    grows = int(np.argmin(np.append(np.diff(angles) > 0.0, False)))
+    radius = np.interp(theta, angles[: grows + 1], rho[: grows + 1], right=np.nan)
     slope = np.polynomial.polynomial.polyder(powers)
     for _ in range(4):
-        depth = np.polynomial.polynomial.polyval(found, powers)
-        off = found * np.cos(theta) + depth * np.sin(theta)
-        steepness = np.cos(theta) + np.sin(theta) * np.polynomial.polynomial.polyval(found, slope)
-        found = found - off / steepness
-    return np.asarray(found)
+        depth = np.polynomial.polynomial.polyval(radius, powers)
+        off = radius * np.cos(theta) + depth * np.sin(theta)
+        steepness = np.cos(theta) + np.sin(theta) * np.polynomial.polynomial.polyval(radius, slope)
+        radius = radius - off / steepness
+    return np.asarray(radius)
 
 
 _RADII = {"kb4": _kb4_radius, "polyfisheye": _polyfisheye_radius, "ocam": _ocam_radius}
@@ -178,22 +178,22 @@ def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
     theta = np.linspace(0.0, math.pi, ANGLES)
     turn = 2.0 * math.pi * np.arange(TURNS) / TURNS
     direction = np.column_stack([np.cos(turn), np.sin(turn)])
-    across = np.sin(theta)[:, None, None] * direction
-    ahead = np.broadcast_to(np.cos(theta)[:, None, None], (ANGLES, TURNS, 1))
-    rays = np.concatenate([across, ahead], axis=2)
+    lateral = np.sin(theta)[:, None, None] * direction
+    axial = np.broadcast_to(np.cos(theta)[:, None, None], (ANGLES, TURNS, 1))
+    rays = np.concatenate([lateral, axial], axis=2)
     pixels = project(model, values, rays.reshape(-1, 3)).reshape(ANGLES, TURNS, 2)
     radius = np.linalg.norm(pixels - pixels[:1], axis=2)
     with np.errstate(invalid="ignore"):
         grows = np.vstack([np.isfinite(radius[:1]), np.diff(radius, axis=0) > 0.0])
-        inside = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=2)
+        on_image = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=2)
     one_to_one = np.logical_and.accumulate(grows, axis=0)
-    seen = np.logical_and.accumulate(one_to_one & inside, axis=0)
-    last = np.sum(seen, axis=0)  # the first angle of each direction that is not seen
+    visible = np.logical_and.accumulate(one_to_one & on_image, axis=0)
+    last = np.sum(visible, axis=0)  # the first angle of each direction that is not seen
     last_angle = np.minimum(last, ANGLES - 1)
     folds = ~one_to_one[last_angle, np.arange(TURNS)] & (last < ANGLES)
     fold = float(theta[last_angle[folds]].min()) if np.any(folds) else math.pi
-    at = np.nonzero(seen)
-    return _Samples(theta[at[0]], direction[at[1]], pixels[at], fold)
+    index = np.nonzero(visible)
+    return _Samples(theta[index[0]], direction[index[1]], pixels[index], fold)
 
 
 def fit_fisheye(
@@ -226,11 +226,11 @@ def fit_fisheye(
             f"the image of this {model} lens shows {len(theta)} of {ANGLES * TURNS} rays that were"
             " tried; expected a principal point and focal lengths that lie in the image"
         )
-    found = _fitted(theta, direction, pixels, np.array([values["cx"], values["cy"]]), values)
-    error = np.linalg.norm(_project_ours(found, theta, direction) - pixels, axis=1)
-    coefficients = tuple(float(k) for k in found[4:])
+    parameters = _fitted(theta, direction, pixels, np.array([values["cx"], values["cy"]]), values)
+    error = np.linalg.norm(_project_ours(parameters, theta, direction) - pixels, axis=1)
+    coefficients = tuple(float(k) for k in parameters[4:])
     folds = min(limit, monotonic_limit(coefficients) * (1.0 - 1e-9))
-    lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), map(float, found)))
+    lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), map(float, parameters)))
     narrow = FisheyeParams(width, height, **lens, fov_deg=2.0 * math.degrees(min(folds, 0.1)))
     fov = min(image_fov_deg(narrow), 2.0 * math.degrees(folds))
     off = theta[error > HOLDS_PX]
@@ -277,9 +277,9 @@ def _fitted(theta: Array, direction: Array, pixels: Array, centre: Array, values
     fit = least_squares(
         residual, start[free], x_scale="jac", method="lm", xtol=1e-14, ftol=1e-14, max_nfev=400
     )
-    found = start.copy()
-    found[free] = fit.x
-    return found
+    parameters = start.copy()
+    parameters[free] = fit.x
+    return parameters
 
 
 def image_fov_deg(fisheye: FisheyeParams) -> float:

@@ -184,18 +184,18 @@ class Detector:
     ) -> BallSeen | None:
         best: BallSeen | None = None
         for centre, radius in circles:
-            found = self._cone(level, centre, radius)
-            if found is None or not self._in_place(found.ray_c, found.half_angle, known):
+            cone = self._cone(level, centre, radius)
+            if cone is None or not self._in_place(cone.ray_c, cone.half_angle, known):
                 continue
-            score = found.score
+            score = cone.score
             if known.ball_ray_c is not None:
                 score -= (
                     0.5
-                    * math.acos(min(1.0, float(found.ray_c @ known.ball_ray_c)))
+                    * math.acos(min(1.0, float(cone.ray_c @ known.ball_ray_c)))
                     / known.ball_within
                 )
             if best is None or score > best.score:
-                best = BallSeen(found.ray_c, found.half_angle, score)
+                best = BallSeen(cone.ray_c, cone.half_angle, score)
         return best
 
     def _expected(self, level: np.ndarray, known: Known) -> BallSeen | None:
@@ -204,16 +204,16 @@ class Detector:
         """
         import cv2
 
-        middle, inside = self.lens.project(
+        middle, visible = self.lens.project(
             torch.from_numpy(np.ascontiguousarray(known.ball_ray_c, np.float64)[None])
         )
-        if not bool(inside):
+        if not bool(visible):
             return None
         low, high = known.ball_distance or self.params.ball_distance
         radius = self.lens.params.fx * self.radius / math.sqrt(low * high)
         u, v = (int(x) for x in middle[0].round())
-        near = level[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4]
-        distinct = cv2.subtract(level, ABOVE * float(np.median(near)) if near.size else 0.0)  # type: ignore[call-overload]  # a scalar: its types leave it out
+        patch = level[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4]
+        distinct = cv2.subtract(level, ABOVE * float(np.median(patch)) if patch.size else 0.0)  # type: ignore[call-overload]  # a scalar: its types leave it out
         mask = ((distinct > 0.0) & (self._in_view > 0)).astype(np.uint8)
         circles = [(centre, size) for centre, size in circles_of(mask) if size < 2.0 * radius]
         return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, known)
@@ -222,24 +222,24 @@ class Detector:
         """The cone about a circle [px]; looked for again from where it was found, as part of a ball
         may hide.
         """
-        found = None
+        best = None
         for _ in range(2):
             edge = polar_edge(level, centre, radius)
             if len(edge.points) < 8:
                 return None
             ray, half_angle, misfit, share = cone_fit(rays_of(self.lens, edge.points))
-            seen = edge.share * share
-            if seen < 0.5 * self.params.coverage or not half_angle > 0.0:
+            score = edge.share * share
+            if score < 0.5 * self.params.coverage or not half_angle > 0.0:
                 return None
-            found = (
-                BallSeen(ray, half_angle, seen - misfit) if seen >= self.params.coverage else None
+            best = (
+                BallSeen(ray, half_angle, score - misfit) if score >= self.params.coverage else None
             )
-            middle, inside = self.lens.project(torch.from_numpy(ray[None]))
-            if misfit > self.params.misfit or not bool(inside):
+            middle, visible = self.lens.project(torch.from_numpy(ray[None]))
+            if misfit > self.params.misfit or not bool(visible):
                 return None
             centre = middle[0].numpy()
             radius = float(np.median(np.linalg.norm(edge.points - centre, axis=1)))
-        return found
+        return best
 
     def _in_place(self, ray: np.ndarray, half_angle: float, known: Known) -> bool:
         """Whether a ball can be where a cone puts it: its true radius says how far off it is."""
@@ -264,10 +264,10 @@ class Detector:
             fit_goal(self.lens, self.params.field_share, contour, level, bright)
             for contour in outlines_of(mask)
         ]
-        found = [
+        squares = [
             GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], known)
         ]
-        return tuple(sorted(found, key=lambda square: -square.score))
+        return tuple(sorted(squares, key=lambda square: -square.score))
 
     def _right_size(self, rays_c: np.ndarray, known: Known) -> bool:
         """Whether the corners lie on the ground, a goal's side from one another; true where that
@@ -297,11 +297,11 @@ def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
     rays_w = rays_c @ rot_wc.T
     ground = rays_w[:, :2] / np.maximum(-rays_w[:, 2:], 1e-3)
     off = ground - ground.mean(axis=0)
-    wanted = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+    quadrants = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
     orders = [
         np.roll(base, shift) for base in (np.arange(4), np.arange(4)[::-1]) for shift in range(4)
     ]
-    best = max(orders, key=lambda order: float(np.sum(off[order] * wanted)))
+    best = max(orders, key=lambda order: float(np.sum(off[order] * quadrants)))
     return rays_c[best]
 
 

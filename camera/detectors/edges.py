@@ -142,11 +142,11 @@ def polar_edge(level: np.ndarray, centre: np.ndarray, radius: float) -> Edge:
     angle = 2.0 * math.pi * np.arange(ANGLES) / ANGLES
     u = centre[0] + np.cos(angle)[:, None] * reach
     v = centre[1] + np.sin(angle)[:, None] * reach
-    found, at = _last_crossing(_sample(level, u, v), reach)
-    points = np.column_stack([centre[0] + np.cos(angle) * at, centre[1] + np.sin(angle) * at])[
-        found
-    ]
-    return Edge(points, float(found.mean()))
+    hit, distance = _last_crossing(_sample(level, u, v), reach)
+    points = np.column_stack(
+        [centre[0] + np.cos(angle) * distance, centre[1] + np.sin(angle) * distance]
+    )[hit]
+    return Edge(points, float(hit.mean()))
 
 
 def cone_fit(rays: np.ndarray) -> tuple[np.ndarray, float, float, float]:
@@ -237,11 +237,11 @@ def _quadrangle(points: np.ndarray) -> np.ndarray | None:
     length = cv2.arcLength(hull, True)
     found = cv2.boxPoints(cv2.minAreaRect(hull))
     for share in np.arange(0.02, 0.16, 0.01):
-        few = cv2.approxPolyDP(hull, share * length, True)
-        if len(few) == 4:
-            found = few[:, 0]
+        polygon = cv2.approxPolyDP(hull, share * length, True)
+        if len(polygon) == 4:
+            found = polygon[:, 0]
             break
-        if len(few) < 4:
+        if len(polygon) < 4:
             break
     corners = found.astype(np.float64) * scale
     if cv2.contourArea((corners / scale).astype(np.float32)) < 1e-3:
@@ -276,14 +276,14 @@ def _refined(
             start[:, 0, None] + way[:, 0, None] * reach,
             start[:, 1, None] + way[:, 1, None] * reach,
         )
-        found, at = _first_crossing(values, reach)
-        if found.sum() < ALONG // 3:
+        hit, distance = _first_crossing(values, reach)
+        if hit.sum() < ALONG // 3:
             return None
-        edge = rays_of(lens, start[found] + way[found] * at[found, None]) @ frame
+        edge = rays_of(lens, start[hit] + way[hit] * distance[hit, None]) @ frame
         line, off = _line(edge[:, :2] / edge[:, 2:])
         lines.append(line)
         misfit.append(off / np.linalg.norm(side))
-        share.append(found.mean())
+        share.append(hit.mean())
     met = np.array([_meet(lines[i - 1], lines[i]) for i in range(4)])
     if (
         not np.isfinite(met).all()
@@ -348,13 +348,13 @@ def _rim_contrast(
             else _sample(bright, pixels[:, 0], pixels[:, 1])
         )
 
-    rim, beyond = around(0.5 * (1.0 + 1.0 / share)), around(1.0 / share + 0.25)
-    if np.isnan(rim).any() or np.isnan(beyond).any():
+    rim, surroundings = around(0.5 * (1.0 + 1.0 / share)), around(1.0 / share + 0.25)
+    if np.isnan(rim).any() or np.isnan(surroundings).any():
         return 0.0
-    told = beyond < OVEREXPOSED
-    if told.mean() < 0.25:
+    readable = surroundings < OVEREXPOSED
+    if readable.mean() < 0.25:
         return LEAST_RIM
-    return float(np.median(rim[told] / np.maximum(beyond[told], 1.0) - 1.0))
+    return float(np.median(rim[readable] / np.maximum(surroundings[readable], 1.0) - 1.0))
 
 
 def _pixels(lens: Fisheye, plane: np.ndarray, frame: np.ndarray) -> np.ndarray | None:
@@ -403,26 +403,26 @@ def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
     A ball is darker towards its rim, so the levels are taken next to the edge, a blur's width away
     from it."""
     plateau = np.quantile(values, 0.75, axis=1)
-    inside = values > 0.4 * plateau[:, None]
-    falls = inside[:, :-1] & ~inside[:, 1:]
+    bright = values > 0.4 * plateau[:, None]
+    falls = bright[:, :-1] & ~bright[:, 1:]
     last = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
-    found = falls.any(axis=1) & (plateau > LEAST_LEVEL) & ~inside[:, -1]
-    away, rows, most = (
+    hit = falls.any(axis=1) & (plateau > LEAST_LEVEL) & ~bright[:, -1]
+    start, rows, peak = (
         round(BLUR_WIDTH / STEP),
         np.arange(len(values))[:, None],
         values.shape[1] - 1,
     )
-    near = np.arange(away, 2 * away)
-    high = np.quantile(values[rows, np.clip(last[:, None] - near, 0, most)], 0.75, axis=1)
-    low = np.median(values[rows, np.clip(last[:, None] + near, 0, most)], axis=1)
-    window = np.clip(last[:, None] + np.arange(-2 * away, 2 * away + 1), 0, most)
+    near = np.arange(start, 2 * start)
+    high = np.quantile(values[rows, np.clip(last[:, None] - near, 0, peak)], 0.75, axis=1)
+    low = np.median(values[rows, np.clip(last[:, None] + near, 0, peak)], axis=1)
+    window = np.clip(last[:, None] + np.arange(-2 * start, 2 * start + 1), 0, peak)
     level = low + RIM_LEVEL * (high - low)
     local = values[rows, window]
     above = local > level[:, None]
     falls = above[:, :-1] & ~above[:, 1:]
     index = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
-    found &= falls.any(axis=1) & (high - low > LEAST_LEVEL)
-    return found, _between(values, reach, np.minimum(window[rows[:, 0], index], most - 1), level)
+    hit &= falls.any(axis=1) & (high - low > LEAST_LEVEL)
+    return hit, _between(values, reach, np.minimum(window[rows[:, 0], index], peak - 1), level)
 
 
 def _first_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -431,8 +431,8 @@ def _first_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, 
     """
     plateau = np.median(values[:, : max(2, len(reach) // 5)], axis=1)
     falls = (values[:, :-1] > 0.5 * plateau[:, None]) & (values[:, 1:] <= 0.5 * plateau[:, None])
-    found = falls.any(axis=1) & (plateau > LEAST_LEVEL)
-    return found, _between(values, reach, np.argmax(falls, axis=1), 0.5 * plateau)
+    hit = falls.any(axis=1) & (plateau > LEAST_LEVEL)
+    return hit, _between(values, reach, np.argmax(falls, axis=1), 0.5 * plateau)
 
 
 def _between(

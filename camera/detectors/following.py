@@ -124,10 +124,10 @@ class Following:
             stamp: of the frame [s].
         """
         if self._begin is not None:
-            far = float(np.linalg.norm(self._begin))
+            length = float(np.linalg.norm(self._begin))
             self._ball, self._half_angle = (
-                Track(self._begin / far, stamp, *STILL),
-                math.asin(self._radius / far),
+                Track(self._begin / length, stamp, *STILL),
+                math.asin(self._radius / length),
             )
             self._begin = None
         where = {}
@@ -146,10 +146,10 @@ class Following:
             square.log_odds *= 1.0 - self._weight
         self._eye_w, self._stamp = eye_w, stamp
         if self._squares:
-            away = np.append(self._likeliest().place_w, 0.0) - eye_w
+            offset = np.append(self._likeliest().place_w, 0.0) - eye_w
             where |= {
-                "goal_ray_c": rot_wc.T @ _unit(away),
-                "goal_within": self._side / float(np.linalg.norm(away)),
+                "goal_ray_c": rot_wc.T @ _unit(offset),
+                "goal_within": self._side / float(np.linalg.norm(offset)),
             }
         return Known(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
@@ -180,24 +180,26 @@ class Following:
         """Add up what a frame says of squares, of which two are no nearer than a side; returns the
         goal, unless it was missed.
         """
-        found: dict[int, GoalSeen] = {}
+        squares: dict[int, GoalSeen] = {}
         for one in seen.squares:  # the likeliest first
             ray_w = rot_wc @ one.rays_c.mean(0)
             place_w = self._eye_w[:2] + ray_w[:2] * (self._eye_w[2] / -ray_w[2])
-            apart = [float(np.linalg.norm(square.place_w - place_w)) for square in self._squares]
-            i = int(np.argmin([*apart, self._side]))  # the last: a new one
-            if i in found:
+            distances = [
+                float(np.linalg.norm(square.place_w - place_w)) for square in self._squares
+            ]
+            i = int(np.argmin([*distances, self._side]))  # the last: a new one
+            if i in squares:
                 continue
             if i == len(self._squares):
                 self._squares.append(Square(place_w, self._stamp))
-            square, sure, found[i] = (
+            square, sure, squares[i] = (
                 self._squares[i],
                 min(max(one.score, 1.0 - SUREST), SUREST),
                 one,
             )
             square.place_w, square.stamp = place_w, self._stamp
             square.log_odds += self._weight * math.log(sure / (1.0 - sure))
-        return found.get(self._squares.index(self._likeliest())) if self._squares else None
+        return squares.get(self._squares.index(self._likeliest())) if self._squares else None
 
     def _likeliest(self) -> Square:
         return max(self._squares, key=lambda square: square.log_odds)

@@ -133,7 +133,7 @@ class Networks(nn.Module):
     @staticmethod
     def load(path: str | Path = SHIPPED) -> "Networks":
         """Read what `save` wrote. Raises ValueError: no such file, or not of this format."""
-        found = Networks()
+        networks = Networks()
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 header = json.loads(arrays["header"].tobytes())
@@ -142,16 +142,16 @@ class Networks(nn.Module):
                         f"format version {header['format_version']}, this program reads {FORMAT}"
                     )
                 names = [name for name in arrays.files if name != "header"]
-                found.load_state_dict(
+                networks.load_state_dict(
                     {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names}
                 )
         except (OSError, EOFError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
             raise ValueError(
                 f"{path}: no detector written by `visthrow detector train`: {error}"
             ) from error
-        found.calibration = {kind: tuple(header["calibration"][kind]) for kind in KINDS}
-        found.made_by = header["made_by"]
-        return found.eval()
+        networks.calibration = {kind: tuple(header["calibration"][kind]) for kind in KINDS}
+        networks.made_by = header["made_by"]
+        return networks.eval()
 
 
 def halved(frames: Tensor) -> Tensor:
@@ -171,9 +171,9 @@ class Views:
 
     def rays(self, points: Tensor) -> Tensor:
         """Unit rays (B, K, 3) through points in half sides (B, K, 2)."""
-        across = points * self.reach[:, None, None]
-        ahead = torch.cat([across, torch.ones_like(across[..., :1])], -1)
-        return F.normalize(ahead @ self.axes, dim=-1)
+        lateral = points * self.reach[:, None, None]
+        axial = torch.cat([lateral, torch.ones_like(lateral[..., :1])], -1)
+        return F.normalize(axial @ self.axes, dim=-1)
 
     def points(self, rays: Tensor) -> Tensor:
         """The inverse of `rays`, of rays less than a right angle off (B, K, 3)."""
@@ -217,8 +217,8 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
     e = index[:, None]
     top = frames[e, j, i] * (1 - a) + frames[e, j, i + 1] * a
     low = frames[e, j + 1, i] * (1 - a) + frames[e, j + 1, i + 1] * a
-    found = (top * (1 - b) + low * b) / 127.5 - 1.0
-    return found.unflatten(1, (side, side)).permute(0, 3, 1, 2)
+    patches = (top * (1 - b) + low * b) / 127.5 - 1.0
+    return patches.unflatten(1, (side, side)).permute(0, 3, 1, 2)
 
 
 class LearntDetector(Detector):
@@ -265,12 +265,12 @@ class LearntDetector(Detector):
     ) -> tuple[Tensor, Tensor]:
         """Probabilities and findings at places."""
         factor, offset, _ = self.networks.calibration[kind]
-        views, found, _, _ = looked(self.networks, kind, frames, rays, sizes, self.lens, north)
-        probability = torch.sigmoid(factor * found[:, 0] + offset)
+        views, outputs, _, _ = looked(self.networks, kind, frames, rays, sizes, self.lens, north)
+        probability = torch.sigmoid(factor * outputs[:, 0] + offset)
         things = (
-            ball_of(views, found)
+            ball_of(views, outputs)
             if kind == "ball"
-            else views.rays(found[:, 2:].unflatten(1, (4, 2)))
+            else views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
         )
         return probability, things
 
@@ -291,14 +291,14 @@ class LearntDetector(Detector):
         raised = self._expected_there(
             probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within
         )
-        found = []
+        squares = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
             if max(probability[i], raised[i]) >= LEAST_PROBABILITY and self._right_size(
                 rays, known
             ):
-                found.append(GoalSeen(rays, float(probability[i])))
-        return tuple(found)
+                squares.append(GoalSeen(rays, float(probability[i])))
+        return tuple(squares)
 
     def _expected_there(
         self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float
@@ -339,9 +339,9 @@ def looked(
         views = views_about(
             rays, (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0), north.expand_as(rays)
         )
-        found = getattr(networks, kind)(patches_of(frame, index, views, lens, PATCH[kind]))
-        rays, sizes = middle_of(kind, views, found)
-    return views, found, rays, sizes
+        outputs = getattr(networks, kind)(patches_of(frame, index, views, lens, PATCH[kind]))
+        rays, sizes = middle_of(kind, views, outputs)
+    return views, outputs, rays, sizes
 
 
 def middle_of(kind: str, views: Views, found: Tensor) -> tuple[Tensor, Tensor]:
@@ -374,7 +374,7 @@ def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
     Args:
         grids: of `Search`, shape (1, 2, 4, h, w). lens: of the frame.
     """
-    found = {}
+    places = {}
     for k, kind in enumerate(KINDS):
         logits = grids[0, k, 0]
         peak = F.max_pool2d(logits[None, None], 3, 1, 1)[0, 0]
@@ -390,11 +390,11 @@ def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
             [(i + 0.5 + du.clamp(-1, 1)) * CELL - 0.5, (j + 0.5 + dv.clamp(-1, 1)) * CELL - 0.5], -1
         )
         rays, _ = lens.unproject(pixels)
-        found[kind] = (
+        places[kind] = (
             F.normalize(rays, dim=-1),
             size.clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx),
         )
-    return found
+    return places
 
 
 def log_size(angle: Tensor, lens: Fisheye) -> Tensor:

@@ -71,8 +71,8 @@ class Aim:
         return pos[0], pos[1]
 
     def _acceleration(self, vel: Vector) -> Vector:
-        through = -self._drag * math.hypot(*vel)
-        return (through * vel[0], through * vel[1], through * vel[2] - GRAVITY)
+        drag = -self._drag * math.hypot(*vel)
+        return (drag * vel[0], drag * vel[1], drag * vel[2] - GRAVITY)
 
     def astray(self, now: float, payload: BodyState, goal_w: Vector) -> str | None:
         """Return why a release that was asked for at a time [s] is held back, or None."""

@@ -167,10 +167,10 @@ class Calibrating:
 
     def problems(self) -> list[str]:
         """Return why a throw has to wait, or is refused."""
-        p, found = self.params, self.found
-        if found is None:
+        p, estimate = self.params, self.found
+        if estimate is None:
             return ["calibrating in the hover" + (f" again: {self._why}" if self._why else "")]
-        tilt, tilts = np.degrees(found.turn_b[:2]), np.degrees(found.turn_sigma[:2])
+        tilt, tilts = np.degrees(estimate.turn_b[:2]), np.degrees(estimate.turn_sigma[:2])
         limits = {
             f"camera tilted by {np.abs(tilt).max():.1f} deg, {p.most_tilt_deg:g} at most": (
                 np.abs(tilt).max() > p.most_tilt_deg
@@ -178,18 +178,19 @@ class Calibrating:
             f"camera's tilt known to {tilts.max():.2f} deg, {p.sure_tilt_deg:g} at most": (
                 tilts.max() > p.sure_tilt_deg
             ),
-            f"focal length off by {100 * abs(found.scale):.1f} %, {100 * p.most_scale:g} at most": (
-                abs(found.scale) > p.most_scale
-            ),
-            f"keypoints {1e3 * found.latency:.0f} ms late, {1e3 * p.most_latency:g} at most": (
-                found.latency > p.most_latency
+            (
+                f"focal length off by {100 * abs(estimate.scale):.1f} %, "
+                f"{100 * p.most_scale:g} at most"
+            ): abs(estimate.scale) > p.most_scale,
+            f"keypoints {1e3 * estimate.latency:.0f} ms late, {1e3 * p.most_latency:g} at most": (
+                estimate.latency > p.most_latency
             ),
             (
-                f"keypoints' latency known to {1e3 * found.latency_sigma:.1f} ms, "
+                f"keypoints' latency known to {1e3 * estimate.latency_sigma:.1f} ms, "
                 f"{1e3 * p.sure_latency:g} at most"
-            ): found.latency_sigma > p.sure_latency,
-            f"thrust {found.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected": (
-                abs(found.thrust - 1.0) > p.thrust
+            ): estimate.latency_sigma > p.sure_latency,
+            f"thrust {estimate.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected": (
+                abs(estimate.thrust - 1.0) > p.thrust
             ),
         }
         return [f"{text}: outside of what was trained" for text, broken in limits.items() if broken]

@@ -41,7 +41,7 @@ class Hovering:
         """Return the thrust [N] and body rates [rad/s] for a vehicle of a mass [kg] with all that
         hangs on it.
         """
-        found = self._controller.step(
+        output = self._controller.step(
             np.array([vehicle.pos]),
             np.array([vehicle.quat]),
             np.array([vehicle.vel]),
@@ -49,7 +49,7 @@ class Hovering:
             mass,
             self._heading,
         )
-        return tuple(found[0].tolist())
+        return tuple(output[0].tolist())
 
     def note(self, share: float | None) -> None:
         """Note the thrust over the weight of a tick that was flown; None for one that was not."""

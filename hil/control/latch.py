@@ -89,22 +89,22 @@ class Flight:
         """Return the landing of a ball that by a time [s] was lost from sight shortly before the
         ground.
         """
-        seen = self._times
-        free = len(seen) >= NEAR and seen[-NEAR] > self.latch + self.lag
-        if not free or now - seen[-1] < UNSEEN:
+        times = self._times
+        free = len(times) >= NEAR and times[-NEAR] > self.latch + self.lag
+        if not free or now - times[-1] < UNSEEN:
             return None
         landing = self._landing()
         return (
             landing
-            if landing.time - seen[-1] < MOST_BLIND and landing.time < now - UNSEEN
+            if landing.time - times[-1] < MOST_BLIND and landing.time < now - UNSEEN
             else None
         )
 
     def _landing(self) -> Landing:
         times, points = np.array(self._times), np.array(self._points)
         last = times[-1]
-        near = slice(max(0, len(times) - NEAR), len(times))
-        x, vx = _parabola(times[near] - last, points[near])
+        window = slice(max(0, len(times) - NEAR), len(times))
+        x, vx = _parabola(times[window] - last, points[window])
         drop = x[2] - self.height
         fall = (vx[2] + np.sqrt(max(vx[2] ** 2 + 2.0 * GRAVITY * drop, 0.0))) / GRAVITY
         point = x + fall * vx
@@ -112,7 +112,7 @@ class Flight:
         when = float(last + fall)
         landed = tuple(point.tolist())
         error = float(np.hypot(landed[0] - self.goal_w[0], landed[1] - self.goal_w[1]))
-        found = separation(times, points, self.latch + self.lag)
+        released = separation(times, points, self.latch + self.lag)
         return Landing(
             self.goal_w,
             self.start,
@@ -122,7 +122,7 @@ class Flight:
             error,
             when - self.start,
             self.lag,
-            *(found or (None, None)),
+            *(released or (None, None)),
         )
 
 
@@ -149,9 +149,9 @@ def separation(
     slope, offset = np.polyfit(when[bent], np.sqrt(off[bent]), 1)
     if not slope < 0.0 or not -BENT_MOST < -offset / slope < BENT_MOST:
         return None
-    at = -offset / slope
-    point = x + at * v - [0.0, 0.0, 0.5 * GRAVITY * at * at]
-    return float(expected + at), tuple(point.tolist())
+    root = -offset / slope
+    point = x + root * v - [0.0, 0.0, 0.5 * GRAVITY * root * root]
+    return float(expected + root), tuple(point.tolist())
 
 
 def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -95,11 +95,11 @@ class Loop:
         runner, clock, begin = self.runner, self.clock, self.clock.now()
         with collected():
             while runner.machine.state is not State.DONE and not self.source.ended:
-                over = clock.now() - begin >= most
-                if over and (runner.backend.name == DryRun.name or not runner.in_flight):
+                finished = clock.now() - begin >= most
+                if finished and (runner.backend.name == DryRun.name or not runner.in_flight):
                     break
                 try:
-                    self.turn(over)
+                    self.turn(finished)
                 except KeyboardInterrupt as error:
                     runner.fail(clock.now(), error)
                     break
@@ -139,7 +139,7 @@ class Loop:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
         runner.hear(source.rivals(now))
-        asked = time.perf_counter()
+        end = time.perf_counter()
         if self.eyes is not None:
             self.eyes.hint = runner.hint(now)
             runner.look(self.eyes.poll(now))
@@ -155,7 +155,7 @@ class Loop:
             **runner.spent,
         }
         if "total" in times:
-            times["total"] += asked - start
+            times["total"] += end - start
         backend.service(now)
         self.stages.add(times)
         if decision.release:
@@ -173,15 +173,17 @@ class Loop:
         """Say a change of state and a new reason to wait at once, and one that differs in its
         numbers alone every few seconds.
         """
-        waits, now = decision.waits, decision.time
+        waits, time = decision.waits, decision.time
         kind = NUMBER.sub("", waits)
         if decision.state != self._state:
             self._state, self._said = decision.state, {}
         elif decision.calibration is not None:
             pass
-        elif not waits or waits == self._waits or now - self._said.get(kind, -math.inf) < SAY_AGAIN:
+        elif (
+            not waits or waits == self._waits or time - self._said.get(kind, -math.inf) < SAY_AGAIN
+        ):
             return
-        self._said[kind], self._waits = now, waits
+        self._said[kind], self._waits = time, waits
         if self.tell is not None:
             self.tell(decision)
 

@@ -204,13 +204,13 @@ class Runner:
 
         The autopilot is asked to land, tick by tick.
         """
-        told = "".join(traceback.format_exception(error))
+        trace = "".join(traceback.format_exception(error))
         if (
             isinstance(error, Exception)
-            and told not in self.errors
+            and trace not in self.errors
             and len(self.errors) < MOST_ERRORS
         ):
-            self.errors.append(told)
+            self.errors.append(trace)
         what = (
             "Ctrl-C twice"
             if isinstance(error, KeyboardInterrupt)
@@ -235,13 +235,13 @@ class Runner:
             copy.copy(self.pilot),
             np.array([self.params.home_w if vehicle is None else vehicle.pos]),
         )
-        still, goal_w = np.zeros((1, 3)), np.array(self.params.goal_w)
+        zero, goal_w = np.zeros((1, 3)), np.array(self.params.goal_w)
         for _ in range(WARM_CALLS):
             pilot.act(
                 pos,
                 np.array([[0.0, 0.0, 0.0, 1.0]]),
-                still,
-                still,
+                zero,
+                zero,
                 pos - [0.0, 0.0, self.hang],
                 goal_w,
             )
@@ -294,20 +294,25 @@ class Runner:
         self, now: float, poses: list[Pose], status: Status, words: OperatorInput, recording: bool
     ) -> Decision:
         begin = perf_counter()
-        seen = self._estimate(now, poses)
-        decision, state = self._decide(now, seen, status, words, recording)
+        estimate = self._estimate(now, poses)
+        decision, state = self._decide(now, estimate, status, words, recording)
         self.spent["estimate"] = perf_counter() - begin
-        wanted = self._command(now, state, seen, decision)
+        command = self._command(now, state, estimate, decision)
         if self.calibrating is not None:
-            wanted = self._calibrated(now, state, seen, status, wanted, decision)
-        wanted = self._probed(state, status, wanted)
-        self._ask(now, state, seen.vehicle, status)
-        if self.params.observe and decision.action is None and seen.known and seen.vehicle.quat:
-            self._show(seen, decision)
+            command = self._calibrated(now, state, estimate, status, command, decision)
+        command = self._probed(state, status, command)
+        self._ask(now, state, estimate.vehicle, status)
+        if (
+            self.params.observe
+            and decision.action is None
+            and estimate.known
+            and estimate.vehicle.quat
+        ):
+            self._show(estimate, decision)
         decision.command = self._guarded(
-            now, wanted if self._ours(state, status) else None, decision
+            now, command if self._ours(state, status) else None, decision
         )
-        self._send(now, state, decision, status, seen, begin)
+        self._send(now, state, decision, status, estimate, begin)
         return decision
 
     def _estimate(self, now: float, poses: list[Pose]) -> Seen:
@@ -464,11 +469,11 @@ class Runner:
         """Return the cable's other end for a pose of vehicle or payload while the payload hangs;
         None on the ground and after.
         """
-        other = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
-        if other is None or self.latch.at is not None or self.machine.state not in FLYING:
+        partner = {VEHICLE: PAYLOAD, PAYLOAD: VEHICLE}.get(pose.body)
+        if partner is None or self.latch.at is not None or self.machine.state not in FLYING:
             return None
-        pos = self.tracks[other].expected(pose.arrival)
-        fresh = self.tracks[other].gate.level(pose.arrival) < HOLD
+        pos = self.tracks[partner].expected(pose.arrival)
+        fresh = self.tracks[partner].gate.level(pose.arrival) < HOLD
         return None if pos is None else Tether(pos, self._reach if fresh else math.inf)
 
     def _ask(self, now: float, state: State, vehicle: BodyState | None, status: Status) -> None:
@@ -489,8 +494,8 @@ class Runner:
         where the config says so.
         """
         delay, age = self.params.delay, self._age(track, now)
-        ahead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
-        return track.state(now, ahead)
+        lead = age - self._aged + delay.command if delay.compensate and math.isfinite(age) else 0.0
+        return track.state(now, lead)
 
     def _age(self, track: Track, now: float) -> float:
         """Return the age of a body's last pose [s]."""
@@ -534,7 +539,7 @@ class Runner:
                 checks += self.detections.problems(now)
                 checks += self.calibrating.problems() if self.calibrating is not None else []
         # What has not been answered is not over: the payload may yet come off.
-        over = (
+        overrun = (
             vehicle is not None
             and state in (State.ARMED, State.RECOVER)
             and status.release != PENDING
@@ -551,7 +556,7 @@ class Runner:
             status.connected,
             tuple(checks),
             fence,
-            over and self._still(vehicle, payload, status.mode == HELD),
+            overrun and self._still(vehicle, payload, status.mode == HELD),
             self.latch.separated(now),
             self.latch.at is not None,
             self.latch.at is None and not self._carries(now, vehicle, payload),
@@ -667,9 +672,9 @@ class Runner:
         out, payload, goal_w = self._show(seen, decision), seen.payload, seen.goal_w
         if out.release[0] and self.latch.at is None:
             fence = self.params.fence
-            beyond = outside(payload.pos, fence.payload_low, fence.payload_high)
+            breach = outside(payload.pos, fence.payload_low, fence.payload_high)
             wrong = (
-                f"payload {beyond}" if beyond else self.aim.astray(decision.time, payload, goal_w)
+                f"payload {breach}" if breach else self.aim.astray(decision.time, payload, goal_w)
             )
             decision.release = wrong is None
             if wrong is not None:

@@ -87,9 +87,9 @@ def outside(point: Vector, low: Vector, high: Vector) -> str | None:
     """Return the first axis along which a point lies outside of a box, with its value;
     None inside.
     """
-    for axis, x, least, most in zip("xyz", point, low, high):
-        if not least <= x <= most:
-            return f"{axis} {x:.2f} m beyond {least:g} to {most:g} m"
+    for axis, x, lowest, highest in zip("xyz", point, low, high):
+        if not lowest <= x <= highest:
+            return f"{axis} {x:.2f} m beyond {lowest:g} to {highest:g} m"
     return None
 
 
@@ -157,9 +157,9 @@ def failed_checks(
             f"payload {below:.2f} m from where it should hang (bodies exchanged, or an offset"
             " wrong?)"
         )
-    away = math.dist(vehicle.pos, home_w)
-    if away > params.home_radius:
-        failed.append(f"vehicle {away:.2f} m from its hover point")
+    distance = math.dist(vehicle.pos, home_w)
+    if distance > params.home_radius:
+        failed.append(f"vehicle {distance:.2f} m from its hover point")
     speed = math.hypot(*vehicle.vel)
     if speed > params.speed:
         failed.append(f"vehicle moves at {speed:.2f} m/s")

@@ -83,15 +83,15 @@ class Inputs:
 
     def missing(self) -> list[str]:
         """Return what has to be there before anything is checked, and is not."""
-        found = [
+        texts = [
             f"no fresh pose of the {n}"
             for n, level in (("vehicle", self.vehicle), ("payload", self.payload))
             if level >= HOLD
         ]
         return (
-            found
+            texts
             if self.connected
-            else [*found, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
+            else [*texts, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
         )
 
 
@@ -156,10 +156,10 @@ class Machine:
             return None
         if seen.vehicle >= ABORT:
             return "no new pose of the vehicle"
-        others = self.state is State.READY and not self.sends
+        spectating = self.state is State.READY and not self.sends
         if (
             seen.fence is not None
-            and not others
+            and not spectating
             and not (self.state is State.RECOVER and seen.released)
         ):
             return f"fence: {seen.fence}"
@@ -281,8 +281,8 @@ class Machine:
             self.left_fence = seen.fence
             self._go(now, State.LAND, f"after the throw, fence: {seen.fence}")
         elif self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
-            more = self.throws < self.most
-            self._go(now, State.READY if more else State.LAND, "hovering again")
+            again = self.throws < self.most
+            self._go(now, State.READY if again else State.LAND, "hovering again")
         elif seen.land or self._late(now):
             self._go(
                 now,

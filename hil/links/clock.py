@@ -36,14 +36,14 @@ class MonotonicClock:
         return time.monotonic() * self._speed
 
     def sleep_until(self, when: float) -> None:
-        left = (when - self.now()) / self._speed
-        if left > 0.0:
-            time.sleep(left)
+        remaining = (when - self.now()) / self._speed
+        if remaining > 0.0:
+            time.sleep(remaining)
 
     def wait_for(self, files: Sequence[Any], when: float) -> None:
-        left = (when - self.now()) / self._speed
-        if left > 0.0:
-            select.select(files, [], [], left)
+        remaining = (when - self.now()) / self._speed
+        if remaining > 0.0:
+            select.select(files, [], [], remaining)
 
 
 class ManualClock:
@@ -89,14 +89,14 @@ class Ticker:
 
     def take(self) -> float:
         """Begin the tick that is due; returns the time now [s]."""
-        due, now = self.due(), self.clock.now()
-        behind = max(0.0, now - due)
-        skipped = int(behind / self.period)
-        self.late = behind - skipped * self.period
+        due, time = self.due(), self.clock.now()
+        lag = max(0.0, time - due)
+        skipped = int(lag / self.period)
+        self.late = lag - skipped * self.period
         self.index += 1 + skipped
         self.missed += skipped
-        self.worst = max(self.worst, behind)
-        return now
+        self.worst = max(self.worst, lag)
+        return time
 
 
 class TimeSync:

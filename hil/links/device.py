@@ -45,19 +45,19 @@ def check_device(text: str, *, remote: bool = False) -> Device:
     """Read a device string against the whitelist, loopback ones alone without ``remote``; raises
     `LinkError` with what is allowed.
     """
-    found = _SERIAL.fullmatch(text)
-    if found:
-        return Device("serial", found[1], int(found[2]))
-    found = _NETWORK.fullmatch(text)
-    if not found:
+    match = _SERIAL.fullmatch(text)
+    if match:
+        return Device("serial", match[1], int(match[2]))
+    match = _NETWORK.fullmatch(text)
+    if not match:
         raise LinkError(
             f"device {text[:80]!r} is refused; expected udp:127.0.0.1:14550 (listen),"
             " udpout:127.0.0.1:14550 (send first), tcp:127.0.0.1:5760 or"
             " serial:/dev/ttyACM0:921600"
         )
-    host = "127.0.0.1" if found[2] == "localhost" else found[2].strip("[]")
+    host = "127.0.0.1" if match[2] == "localhost" else match[2].strip("[]")
     try:
-        address, port = ipaddress.ip_address(host), int(found[3])
+        address, port = ipaddress.ip_address(host), int(match[3])
     except ValueError as error:
         raise LinkError(
             f"device {text!r}: {error}; expected a numeric address such as 127.0.0.1"
@@ -69,7 +69,7 @@ def check_device(text: str, *, remote: bool = False) -> Device:
             f"device {text!r} leaves this machine; set link.remote = true in the config where that"
             " is what you want"
         )
-    return Device(found[1], host, port)
+    return Device(match[1], host, port)
 
 
 class Port(Protocol):
@@ -240,12 +240,12 @@ class SerialPort(_Stream):
             self._open = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:
             number = getattr(error, "errno", None)  # pyserial's text names port and reason twice
-            here = ", ".join(
+            ports = ", ".join(
                 str(path) for name in PLUGGED for path in sorted(Path("/dev").glob(name))
             )
             raise LinkError(
                 f"cannot open {device.host}: {os.strerror(number) if number else error}; plugged in"
-                f" here: {here or 'no serial port'}"
+                f" here: {ports or 'no serial port'}"
             ) from error
         self._get, self._put = lambda: self._open.read(self._open.in_waiting or 1), self._open.write
 

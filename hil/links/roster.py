@@ -225,10 +225,10 @@ class Roster:
         """
         ours = [party for party in self.parties if party.has(system, component)]
         if kind in SHARED:
-            here = [
+            senders = [
                 party for party in ours if party.name in self.at and self.at[party.name] == address
             ]
-            return next(iter([*here, *ours]), None)
+            return next(iter([*senders, *ours]), None)
         return next(
             (p for p in ours if kind in p.kinds), next((p for p in ours if not p.kinds), None)
         )

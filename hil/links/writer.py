@@ -67,9 +67,9 @@ class Writer:
         self.why = self.why or f"cannot write {self._name}: {why}"
 
     def _write(self) -> None:
-        over = False
-        while not over:
-            over = self._over.wait(WRITE_EVERY)
+        closing = False
+        while not closing:
+            closing = self._over.wait(WRITE_EVERY)
             try:
                 while self._waiting:
                     self._file.write(self._waiting.popleft())

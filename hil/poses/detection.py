@@ -105,18 +105,18 @@ class Detections:
         """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
         at a tick [s].
         """
-        seen = detection.seen()
+        frame = detection.seen()
         rot_wb = rotation_of(quat)
         if self._turn is not None and self._path:
-            seen = self._carried(seen, detection.stamp - self._latency + aged)
-        points, valid = detected_keypoints(self._camera, seen, rot_wb)
+            frame = self._carried(frame, detection.stamp - self._latency + aged)
+        points, valid = detected_keypoints(self._camera, frame, rot_wb)
         self.fresh = detection.stamp, points.numpy(), valid.numpy()
         if detection.stamp <= self._newest:
             return
         self._newest = detection.stamp
         for name, part in PARTS.items():
-            self._times[name] = -np.inf if getattr(seen, name) is None else detection.stamp
-            if getattr(seen, name) is not None:
+            self._times[name] = -np.inf if getattr(frame, name) is None else detection.stamp
+            if getattr(frame, name) is not None:
                 self._points[part], self._valid[part] = points[part], valid[part]
 
     def problems(self, now: float) -> list[str]:
@@ -179,10 +179,10 @@ class Detections:
         for name, part in PARTS.items():
             if now - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)
-                left = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())
+                edge_exit = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())
                 points[part] = (
                     points[part] / radius.clamp(min=1e-6)
-                    if left
+                    if edge_exit
                     else torch.zeros_like(points[part])
                 )
                 valid[part] = False

@@ -136,13 +136,13 @@ class Gate:
         same = pose.pos == last.pos and pose.quat == last.quat
         if pose.stamp <= last.stamp and not stepped:
             return "repeated" if same and pose.stamp == last.stamp else "old"
-        came, self._came = self._came or last, pose
+        previous, self._came = self._came or last, pose
         if same:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
         age, gap = (
-            max(pose.arrival - then.arrival if stepped else pose.stamp - then.stamp, 0.0)
-            for then in (last, came)
+            max(pose.arrival - earlier.arrival if stepped else pose.stamp - earlier.stamp, 0.0)
+            for earlier in (last, previous)
         )
         return self._motion(pose, last, velocity, tether, age, gap)
 
@@ -185,10 +185,10 @@ class Gate:
         expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
         off = math.dist(pose.pos, expected)
         if tether is not None and off > p.max_jump:
-            apart = math.dist(pose.pos, tether.pos)
-            if apart < off:
+            distance = math.dist(pose.pos, tether.pos)
+            if distance < off:
                 return "swapped"
-            if apart > tether.length:
+            if distance > tether.length:
                 return "cable"
         if math.dist(pose.pos, last.pos) > p.max_jump + p.max_speed * age:
             return "speed"

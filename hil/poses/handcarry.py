@@ -125,20 +125,22 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     span = np.maximum(times[late] - times[early], 1e-9)
     cosine = np.abs(np.sum(quat[late] * quat[early], axis=1)) / np.linalg.norm(quat[late], axis=1)
     rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
-    still = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
+    resting = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
     return [
-        s for (s,) in find_objects(label(still)[0]) if times[s.stop - 1] - times[s.start] >= REST
+        s for (s,) in find_objects(label(resting)[0]) if times[s.stop - 1] - times[s.start] >= REST
     ]
 
 
 def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
     """Return the mean of the poses of a rest next to a move."""
-    near = [p for p in poses[: rest.stop - rest.start] if abs(p.arrival - poses[0].arrival) <= REST]
-    quats = np.array([p.quat for p in near])
+    close = [
+        p for p in poses[: rest.stop - rest.start] if abs(p.arrival - poses[0].arrival) <= REST
+    ]
+    quats = np.array([p.quat for p in close])
     quats[np.sum(quats * quats[0], axis=1) < 0.0] *= -1.0
     quat = quats.mean(axis=0)
-    place = tuple(np.mean([p.pos for p in near], axis=0).tolist())
-    return replace(near[0], pos=place, quat=tuple((quat / np.linalg.norm(quat)).tolist()))
+    place = tuple(np.mean([p.pos for p in close], axis=0).tolist())
+    return replace(close[0], pos=place, quat=tuple((quat / np.linalg.norm(quat)).tolist()))
 
 
 def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
@@ -146,31 +148,33 @@ def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
     frames would fit; raises `RunError` for another number of moves than `MOVES`.
     """
     if len(steps) != len(MOVES):
-        seen = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
+        moves = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
         raise RunError(
             f"hand-carry: {len(steps)} moves between rests; expected {len(MOVES)}, a second of rest"
-            f" around each: {seen}"
+            f" around each: {moves}"
         )
     pairs = [(move, step) for move, step in zip(MOVES, steps) if move.axis is not None]
     ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
     turns = [(move.axis, step) for move, step in pairs if move.turn]
     world = max(TURNS, key=lambda axes: _agreement([(i, turn_of(axes) @ way) for i, way in ways]))
 
-    known = {
+    choices = {
         order: Frames(
             replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)
         )
         for order in ("xyzw", "wxyz")
     }
-    vectors = {order: [(i, step.turns(ours)) for i, step in turns] for order, ours in known.items()}
+    vectors = {
+        order: [(i, step.turns(ours)) for i, step in turns] for order, ours in choices.items()
+    }
 
     def fits(order: str, body: str) -> float:
-        both = [
+        pair = [
             (i, v)
             for i, (in_world, in_body) in vectors[order]
             for v in (in_world, turn_of(body) @ in_body)
         ]
-        return round(_agreement(both), 9)
+        return round(_agreement(pair), 9)
 
     order, body = max(product(vectors, TURNS), key=lambda case: fits(*case))
     fitting = replace(
@@ -203,14 +207,14 @@ def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
 
 def _line(move: Move, step: Step, frames: FrameParams) -> Line:
     ours = Frames(frames)
-    went = step.turns(ours)[1] if move.turn else np.array(ours.world_from_source(tuple(step.way)))
+    motion = step.turns(ours)[1] if move.turn else np.array(ours.world_from_source(tuple(step.way)))
     size = "rad about" if move.turn else "m along"
-    length = float(np.linalg.norm(went))
-    off = math.acos(max(-1.0, min(1.0, went[move.axis] / max(length, 1e-12))))
+    length = float(np.linalg.norm(motion))
+    off = math.acos(max(-1.0, min(1.0, motion[move.axis] / max(length, 1e-12))))
     passed = off <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
-    told = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", went))
+    numbers = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", motion))
     return (
-        f"{move.text.split(',')[0]}: {told} ({size} our axes), {math.degrees(off):.0f} deg off",
+        f"{move.text.split(',')[0]}: {numbers} ({size} our axes), {math.degrees(off):.0f} deg off",
         passed,
     )
 

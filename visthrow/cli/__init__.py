@@ -139,13 +139,13 @@ def _hidden(error: ModuleNotFoundError) -> str | None:
     ``camera.py`` in the working folder.
     """
     name = (error.name or "").partition(".")[0]
-    found = sys.modules.get(name)
-    here = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    place = getattr(found, "__file__", None)
+    module = sys.modules.get(name)
+    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    place = getattr(module, "__file__", None)
     if (
         name not in ("camera", "sim", "hil")
         or place is None
-        or os.path.abspath(place).startswith(os.path.join(here, name))
+        or os.path.abspath(place).startswith(os.path.join(root, name))
     ):
         return None
     return str(place)

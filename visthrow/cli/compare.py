@@ -93,14 +93,14 @@ def run(args: argparse.Namespace) -> int:
             f"--calibrate on plant '{args.plant}'; expected 'hybrid', whose cameras differ from"
             " throw to throw"
         )
-    wanted = args.policies or DEFAULT_POLICIES
+    names = args.policies or DEFAULT_POLICIES
     loaded = [
         load_policy(name, args.config, args.overrides, args.allow)
-        for name in wanted
+        for name in names
         if name != BASELINE
     ]
     writable(Path(args.out))
-    if BASELINE in wanted:  # an error comes before the policies throw
+    if BASELINE in names:  # an error comes before the policies throw
         rival = load_extra(
             "visthrow.paper.baseline.rival", "paper", f"the policy '{BASELINE}'", ConfigError
         )
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
         with Throwing(loaded, args.targets, args.throws, args.plant, args.seed) as throwing:
             throws = throwing.results()
     entries = entries_of(loaded, unique_names(loaded), throws)
-    if BASELINE in wanted:
+    if BASELINE in names:
         entries += rival.throw_baseline(args)
     departures = {item.name: item.departures for item in loaded if item.departures}
     notes = [
@@ -125,8 +125,8 @@ def run(args: argparse.Namespace) -> int:
         for name, of in departures.items()
     ]
     title, rows = title_of(args.plant, args.seed) + "".join(notes), rows_of(entries)
-    told = {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures}
-    return _tell(args, entries, rows, told, title)
+    figures = {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures}
+    return _tell(args, entries, rows, figures, title)
 
 
 def _tell(
@@ -167,9 +167,9 @@ def _from_runs(args: argparse.Namespace) -> int:
     rows = [row for row in rows_of(entries) if row["throws"]]
     how = ", ".join(sorted({log.meta["plant_meaning"] for log in logs}))
     title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
-    told = {"plant": "runs", "runs": args.runs, "rows": rows}
+    figures = {"plant": "runs", "runs": args.runs, "rows": rows}
     return _tell(
-        args, entries, rows, told, title, f"{len(logs)} throws of HIL runs", from_runs.NOTE
+        args, entries, rows, figures, title, f"{len(logs)} throws of HIL runs", from_runs.NOTE
     )
 
 

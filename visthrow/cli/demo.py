@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.throws < 1:
         raise ConfigError(f"--throws {args.throws}; expected 1 or more")
-    begin, few = time.perf_counter(), min(args.throws, REFERENCE_THROWS)
+    begin, count = time.perf_counter(), min(args.throws, REFERENCE_THROWS)
     loaded = [load_policy(name) for name in compare.DEFAULT_POLICIES]
     folder = Path(args.out)
     writable(folder)
@@ -63,11 +63,11 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.throws.reference_protocol import Throwing
 
         # The reference plant flies in a process of its own meanwhile.
-        throws = (loaded, REFERENCE_TARGETS, few, "reference-realistic", SEED, 1)
+        throws = (loaded, REFERENCE_TARGETS, count, "reference-realistic", SEED, 1)
         with Throwing(*throws, together=True) as throwing:
             paths = _here(loaded, folder, args.throws)
             print(
-                f"{few} throws a policy on the reference plant, which stands in for a real"
+                f"{count} throws a policy on the reference plant, which stands in for a real"
                 " vehicle ...",
                 flush=True,
             )

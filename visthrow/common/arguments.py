@@ -117,8 +117,10 @@ def add_commands(
     )
     form = argparse.RawDescriptionHelpFormatter
     for name, (text, module) in commands.items():
-        about = text[0].upper() + text[1:] + "."
-        choices.add_parser(name, module=module, help=text, description=about, formatter_class=form)
+        description = text[0].upper() + text[1:] + "."
+        choices.add_parser(
+            name, module=module, help=text, description=description, formatter_class=form
+        )
 
 
 def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
@@ -144,18 +146,18 @@ class _Lazy(argparse.ArgumentParser):
         if self._module is not None:
             module, self._module = self._module, None
             importlib.import_module(module).add_arguments(self)
-        found, unknown = super().parse_known_args(args, namespace)
+        namespace_out, unknown = super().parse_known_args(args, namespace)
         if (
             unknown and self._subparsers is None
         ):  # else the command's own parser would say it, without its options
             options = [option for option in self._option_string_actions if option.startswith("--")]
-            near = (
+            hint = (
                 f"; {suggest(unknown[0].split('=')[0], options)}"
                 if unknown[0].startswith("-")
                 else ""
             )
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{near}")
-        return found, unknown
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        return namespace_out, unknown
 
 
 class StopRequest:

@@ -74,8 +74,8 @@ def suggest(name: str, known: Iterable[str]) -> str:
     close = get_close_matches(name, names, n=1)
     listed, known = ", ".join(names), "known"
     if len(names) > MANY:
-        near = get_close_matches(name, names, n=5, cutoff=0.0)
-        listed, known = f"{', '.join(near)}; {len(names) - len(near)} more exist", "near it"
+        similar = get_close_matches(name, names, n=5, cutoff=0.0)
+        listed, known = f"{', '.join(similar)}; {len(names) - len(similar)} more exist", "near it"
     return (
         f"did you mean '{close[0]}'? {known.capitalize()}: {listed}"
         if close

@@ -15,8 +15,8 @@ def measured(
 
     The noise is the standard deviation of each, [m], and [rad] about each axis of the body; it is
     drawn for one after the other."""
-    found = {}
+    samples = {}
     for name, values in truth.items():
         error = noise[name] * rng.standard_normal((len(values), 3))
-        found[name] = turned(values, error) if name == "quat_wb" else values + error
-    return found
+        samples[name] = turned(values, error) if name == "quat_wb" else values + error
+    return samples

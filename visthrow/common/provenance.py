@@ -44,16 +44,16 @@ def commit() -> str:
     changed, else "unknown".
     """
     root = Path(__file__).resolve().parents[2]
-    told = os.environ.get(COMMIT_VARIABLE, "unknown")
+    variable = os.environ.get(COMMIT_VARIABLE, "unknown")
     if not (root / ".git").exists():  # installed, or inside somebody else's repository
-        return told
+        return variable
     try:
         head = _git(root, "rev-parse", "HEAD")
         return (
             f"{head}-dirty" if _git(root, "status", "--porcelain", "--untracked-files=no") else head
         )
     except (OSError, subprocess.SubprocessError):
-        return told
+        return variable
 
 
 def command() -> str:
@@ -79,13 +79,13 @@ def _versions() -> dict[str, str]:
     """They are looked for once: a process that records many runs has the same packages in all of
     them.
     """
-    found = {"visthrow": __version__, "python": platform.python_version()}
+    versions = {"visthrow": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def processors() -> dict[str, Any]:
@@ -95,11 +95,11 @@ def processors() -> dict[str, Any]:
     except OSError:
         text = ""
     model = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
-    found = {"cpu": model[1].strip() if model else platform.machine(), "cores": os.cpu_count()}
+    machine = {"cpu": model[1].strip() if model else platform.machine(), "cores": os.cpu_count()}
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available():
-        found["gpu"] = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    return found
+        machine["gpu"] = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return machine
 
 
 def collect() -> dict[str, Any]:

@@ -71,10 +71,10 @@ def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
     (N, 3).
     """
     x, w, half = quat[:, :3], quat[:, 3:], 0.5 * angle
-    found = np.hstack(
+    product = np.hstack(
         (x + w * half + np.cross(x, half), w - np.sum(x * half, axis=1, keepdims=True))
     )
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    return product / np.linalg.norm(product, axis=1, keepdims=True)
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:

@@ -65,13 +65,13 @@ def _resampled(groups: list[np.ndarray], rng: np.random.Generator, draws: int) -
 def _checked(groups: Groups | np.ndarray) -> list[np.ndarray]:
     """List of runs that have throws; ValueError where there is nothing to average."""
     listed = [groups] if isinstance(groups, np.ndarray) else list(groups)
-    found = [np.asarray(group, dtype=float) for group in listed if len(group)]
-    if not found or any(not np.all(np.isfinite(group)) for group in found):
+    groups_with_data = [np.asarray(group, dtype=float) for group in listed if len(group)]
+    if not groups_with_data or any(not np.all(np.isfinite(group)) for group in groups_with_data):
         raise ValueError(
-            f"{len(listed)} groups, {len(found)} of them with throws; expected finite numbers in"
-            " one or more"
+            f"{len(listed)} groups, {len(groups_with_data)} of them with throws; expected finite"
+            " numbers in one or more"
         )
-    return found
+    return groups_with_data
 
 
 def _interval(value: float, samples: np.ndarray, runs: int) -> Interval:
@@ -91,9 +91,9 @@ def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Inte
     """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so
     many bootstrap samples.
     """
-    found = _checked(groups)
-    samples = _resampled(found, np.random.default_rng(seed), draws)
-    return _interval(float(_mean(found)), samples, len(found))
+    groups_with_data = _checked(groups)
+    samples = _resampled(groups_with_data, np.random.default_rng(seed), draws)
+    return _interval(float(_mean(groups_with_data)), samples, len(groups_with_data))
 
 
 def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAWS) -> Interval:
@@ -118,8 +118,8 @@ def paired(a: np.ndarray, b: np.ndarray) -> Interval:
     """
     if len(a) != len(b):
         raise ValueError(f"pairs of {len(a)} and {len(b)} throws; expected the same throws of both")
-    both = np.asarray(a, dtype=float) - np.asarray(b, dtype=float)
-    return mean(both[np.isfinite(both)])
+    differences = np.asarray(a, dtype=float) - np.asarray(b, dtype=float)
+    return mean(differences[np.isfinite(differences)])
 
 
 def ratio(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAWS) -> Interval:
@@ -165,12 +165,12 @@ class Bias:
 
         "undershoots, lands left", or "no bias".
         """
-        found = []
+        words = []
         if 0.0 not in self.along:
-            found.append("overshoots" if self.along.value > 0.0 else "undershoots")
+            words.append("overshoots" if self.along.value > 0.0 else "undershoots")
         if 0.0 not in self.lateral:
-            found.append("left" if self.lateral.value > 0.0 else "right")
-        return ", ".join(found) or "none that shows"
+            words.append("left" if self.lateral.value > 0.0 else "right")
+        return ", ".join(words) or "none that shows"
 
 
 def bias(groups: Groups | np.ndarray) -> Bias:
@@ -179,12 +179,14 @@ def bias(groups: Groups | np.ndarray) -> Bias:
 
     Mean square = offset squared + scatter squared.
     """
-    found = _checked(groups)
-    samples = _resampled(found, np.random.default_rng(0), DRAWS)
-    center = _mean(found)
-    square = float(np.mean([(group**2).sum(1).mean() for group in found]))
+    groups_with_data = _checked(groups)
+    samples = _resampled(groups_with_data, np.random.default_rng(0), DRAWS)
+    center = _mean(groups_with_data)
+    square = float(np.mean([(group**2).sum(1).mean() for group in groups_with_data]))
     offset = float(np.hypot(*center))
-    along, lateral = (_interval(float(center[i]), samples[:, i], len(found)) for i in range(2))
+    along, lateral = (
+        _interval(float(center[i]), samples[:, i], len(groups_with_data)) for i in range(2)
+    )
     scatter = float(np.sqrt(max(square - offset**2, 0.0)))
     return Bias(along, lateral, offset, scatter, offset**2 / square if square > 0.0 else 0.0)
 

@@ -148,14 +148,14 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.n
     or more of it than its size lets expect."""
     path = Path(path)
     if not path.is_file():
-        near = (
+        hint = (
             sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}"))
             if path.parent.is_dir()
             else []
         )
         raise error(
             f"{path}: no such file; expected {what}. In that folder:"
-            f" {', '.join(near) or 'nothing of the kind'}"
+            f" {', '.join(hint) or 'nothing of the kind'}"
         )
     try:
         with np.load(path, allow_pickle=False) as archive:

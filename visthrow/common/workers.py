@@ -71,13 +71,13 @@ class Workers:
         busy, begin = list(self._running), time.monotonic()
         while busy:
             share = sum(self._shares) / len(self._shares)
-            left = (
+            remaining = (
                 f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left"
                 if share > 0.02
                 else ""
             )
             if self.label:
-                status(f"{self.label}: {100 * share:3.0f} %{left}")
+                status(f"{self.label}: {100 * share:3.0f} %{remaining}")
             for end in wait(busy, LOOK):
                 try:
                     index, result = end.recv()

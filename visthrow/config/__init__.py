@@ -66,13 +66,13 @@ def configs_root() -> Path:
     """Return the folder of shipped configs: inside the installed package, else beside it in a
     checkout; ConfigError without either.
     """
-    here = Path(__file__).resolve().parents[1]
-    for root in (here / "configs", here.parent / "configs"):
+    package = Path(__file__).resolve().parents[1]
+    for root in (package / "configs", package.parent / "configs"):
         if root.is_dir():
             return root
     raise ConfigError(
-        f"no configs folder; expected {here / 'configs'} (installed) or {here.parent / 'configs'}"
-        " (in a checkout)"
+        f"no configs folder; expected {package / 'configs'} (installed) or"
+        f" {package.parent / 'configs'} (in a checkout)"
     )
 
 
@@ -163,8 +163,8 @@ def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> Table:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        near = sorted(p.name for p in path.parent.glob("*.toml")) if path.parent.is_dir() else []
-        raise ConfigError(f"{name}: no such file; {suggest(path.name, near)}") from None
+        files = sorted(p.name for p in path.parent.glob("*.toml")) if path.parent.is_dir() else []
+        raise ConfigError(f"{name}: no such file; {suggest(path.name, files)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{name}: cannot be read as UTF-8 text: {error}") from None
     return _parse(schema, text, name, path.parent, (*stack, resolved))
@@ -192,12 +192,12 @@ def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], p
         wanted, node = dataclass_of(annotation), tree.items.get(key)
         if wanted is None or node is None:
             continue
-        here = f"{path}.{key}" if path else key
+        place = f"{path}.{key}" if path else key
         if isinstance(node, Table):
-            _include(wanted, node, folder, stack, here)
+            _include(wanted, node, folder, stack, place)
         elif _names_file(node, annotation):
             tree.items[key] = _read(
-                wanted, _lookup(wanted, node.value, folder, node.source, here), stack
+                wanted, _lookup(wanted, node.value, folder, node.source, place), stack
             )
 
 
@@ -230,19 +230,19 @@ def _override(schema: type, tree: Table, override: str) -> None:
         raise ConfigError(f"{source}; expected key.path=value, for instance vehicle.body.mass=0.25")
     current: Any = schema
     for depth, key in enumerate(keys):
-        here = ".".join(keys[:depth])
+        place = ".".join(keys[:depth])
         wanted = dataclass_of(current)
         if wanted is not None:
-            known = _schema.hints(wanted)
-            if key not in known:
-                _schema.fail(source, here, f"unknown key '{key}'; {suggest(key, known)}")
-            current = known[key]
+            fields = _schema.hints(wanted)
+            if key not in fields:
+                _schema.fail(source, place, f"unknown key '{key}'; {suggest(key, fields)}")
+            current = fields[key]
         elif (values := _schema.dict_values(current)) is not None:
             current = values
         else:
             _schema.fail(
                 source,
-                here,
+                place,
                 f"has no keys, so '{key}' cannot be set; expected {_schema.describe(current)}",
             )
         if depth < len(keys) - 1:

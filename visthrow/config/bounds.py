@@ -54,14 +54,14 @@ class Bounded:
 
 @cache
 def _bounds(schema: type) -> dict[str, Bound]:
-    found = {
+    bounds = {
         name: _bound(hint)
         for name, hint in typing.get_type_hints(schema, include_extras=True).items()
     }
-    return {name: bound for name, bound in found.items() if bound is not None}
+    return {name: bound for name, bound in bounds.items() if bound is not None}
 
 
 def _bound(hint: Any) -> Bound | None:
-    own = [note for note in getattr(hint, "__metadata__", ()) if isinstance(note, Bound)]
+    notes = [note for note in getattr(hint, "__metadata__", ()) if isinstance(note, Bound)]
     inner = [bound for part in typing.get_args(hint) if (bound := _bound(part)) is not None]
-    return next(iter([*own, *inner]), None)
+    return next(iter([*notes, *inner]), None)

@@ -39,6 +39,6 @@ def random_effects() -> tuple[Any, ...]:
 
 def chosen(names: Iterable[str]) -> dict[str, Any]:
     """Return the effects of these names; ConfigError for one that the catalogue does not hold."""
-    known = catalogue()
-    expect_known(names, known, "no effect '{}'", ConfigError)
-    return {name: known[name] for name in names}
+    effects = catalogue()
+    expect_known(names, effects, "no effect '{}'", ConfigError)
+    return {name: effects[name] for name in names}

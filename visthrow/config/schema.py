@@ -45,15 +45,15 @@ def dataclass_of(annotation: Any) -> type | None:
     if dataclasses.is_dataclass(annotation) and isinstance(annotation, type):
         return annotation
     options = typing.get_args(annotation) if is_union(annotation) else ()
-    found = [option for option in map(dataclass_of, options) if option is not None]
-    return found[0] if len(found) == 1 else None
+    classes = [option for option in map(dataclass_of, options) if option is not None]
+    return classes[0] if len(classes) == 1 else None
 
 
 def dict_values(annotation: Any) -> Any:
     """Return what the values of ``dict[str, X]`` or ``dict[str, X] | None`` are, else None."""
     options = typing.get_args(annotation) if is_union(annotation) else (annotation,)
-    found = [typing.get_args(option)[1] for option in options if typing.get_origin(option) is dict]
-    return found[0] if len(found) == 1 else None
+    types = [typing.get_args(option)[1] for option in options if typing.get_origin(option) is dict]
+    return types[0] if len(types) == 1 else None
 
 
 def is_union(annotation: Any) -> bool:
@@ -151,9 +151,9 @@ def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
         if f.init and f.default is unset and f.default_factory is unset
     ]
     if missing := [name for name in required if name not in node.items]:
-        given = ", ".join(node.items) or "nothing"
-        wanted = ", ".join(f"{name} ({describe(types_of[name])})" for name in missing)
-        fail(node.source, path, f"missing {wanted}; given: {given}")
+        keys = ", ".join(node.items) or "nothing"
+        expected = ", ".join(f"{name} ({describe(types_of[name])})" for name in missing)
+        fail(node.source, path, f"missing {expected}; given: {keys}")
     values = {key: build(types_of[key], item, _join(path, key)) for key, item in node.items.items()}
     try:
         return schema(**values)
@@ -173,24 +173,28 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
         item = node.items[key]
         if not isinstance(item, Table):
             return item
-        own = Table(item.source, {k: v for k, v in item.items.items() if k != BASE_KEY})
+        table = Table(item.source, {k: v for k, v in item.items.items() if k != BASE_KEY})
         if "name" in hints(schema):
-            given = own.items.get("name")
-            if given is not None and not (isinstance(given, Leaf) and given.value == key):
+            base_name = table.items.get("name")
+            if base_name is not None and not (
+                isinstance(base_name, Leaf) and base_name.value == key
+            ):
                 fail(
                     item.source,
                     _join(_join(path, key), "name"),
-                    f"got {_shown(given)}; expected the heading, {key!r}",
+                    f"got {_shown(base_name)}; expected the heading, {key!r}",
                 )
-            own.items["name"] = Leaf(key, item.source)
+            table.items["name"] = Leaf(key, item.source)
         base = item.items.get(BASE_KEY)
         if base is None:
-            return own
-        others = {k for k, v in node.items.items() if isinstance(v, Table)} - {key, *above}
-        if not isinstance(base, Leaf) or base.value not in others:
-            problem = f"got {_shown(base)}; expected another table; {suggest(_shown(base), others)}"
+            return table
+        siblings = {k for k, v in node.items.items() if isinstance(v, Table)} - {key, *above}
+        if not isinstance(base, Leaf) or base.value not in siblings:
+            problem = (
+                f"got {_shown(base)}; expected another table; {suggest(_shown(base), siblings)}"
+            )
             fail(item.source, _join(_join(path, key), BASE_KEY), problem)
-        return merged(row(base.value, (key, *above)), own)
+        return merged(row(base.value, (key, *above)), table)
 
     return {key: row(key, ()) for key in node.items}
 
@@ -201,13 +205,13 @@ def _shown(node: Leaf | Table) -> str:
 
 def merged(under: Table, over: Table) -> Table:
     """Return one table with another's values on top of its own, table by table."""
-    both = Table(over.source, dict(under.items))
+    combined = Table(over.source, dict(under.items))
     for key, item in over.items.items():
-        below = both.items.get(key)
-        both.items[key] = (
+        below = combined.items.get(key)
+        combined.items[key] = (
             merged(below, item) if isinstance(item, Table) and isinstance(below, Table) else item
         )
-    return both
+    return combined
 
 
 def _build_tuple(annotation: Any, node: Leaf, path: str) -> tuple:
@@ -249,12 +253,12 @@ def as_table(values: dict[str, Any], source: str) -> Table:
 
 def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:
     table = isinstance(node, Table)
-    came = (
+    actual = (
         f"a table with the keys {', '.join(node.items) or '(none)'}"
         if table
         else f"{node.value!r} ({type(node.value).__name__})"
     )
-    fail(node.source, path, f"got {came}; expected {describe(annotation)}")
+    fail(node.source, path, f"got {actual}; expected {describe(annotation)}")
 
 
 def _join(path: str, key: str) -> str:

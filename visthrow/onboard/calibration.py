@@ -214,10 +214,10 @@ class Problem:
         Raises CalibrationError: too few steps, or too few that show the ball.
         """
         count = len(hovered.time)
-        seen = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
-        if count < LEAST_STEPS or seen.mean() < LEAST_SEEN:
+        visible = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
+        if count < LEAST_STEPS or visible.mean() < LEAST_SEEN:
             raise CalibrationError(
-                f"calibration from {count} steps, the ball seen in {100 * seen.mean():.0f} % of"
+                f"calibration from {count} steps, the ball seen in {100 * visible.mean():.0f} % of"
                 f" them; expected {LEAST_STEPS} or more, and {100 * LEAST_SEEN:.0f} %"
             )
         tensor = lambda value: torch.tensor(np.asarray(value), dtype=torch.float64)  # noqa: E731
@@ -244,7 +244,7 @@ class Problem:
             _box(points[:, GOAL_KEYPOINTS:]),
             points[:, :GOAL_KEYPOINTS].mean(1),
         )
-        self.ball_seen = torch.from_numpy(seen)
+        self.ball_seen = torch.from_numpy(visible)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         s = spreads
         spread = {
@@ -312,8 +312,8 @@ class Problem:
             + GRAVITY * up
             - pushed
         )
-        falling, along = jump(swung) / dt + GRAVITY * up, mean(rope)
-        across = falling - along * (falling * along).sum(-1, keepdim=True)
+        falling, direction = jump(swung) / dt + GRAVITY * up, mean(rope)
+        perpendicular = falling - direction * (falling * direction).sum(-1, keepdim=True)
         coning = (
             torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
         )  # Magnus: of a rate that is linear in a step
@@ -324,7 +324,7 @@ class Problem:
         )
         off = (
             _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push,
-            across[..., :2] / s.pendulum,
+            perpendicular[..., :2] / s.pendulum,
             (jump(pos) - mean(vel) * dt) / 1e-4,
             (jump(swing) - mean(swing_rate) * dt) / 2e-4,
             turned / (s.rate * dt + 1e-4),
@@ -355,18 +355,18 @@ class Problem:
         bend = (
             u * (1 - u) * ((1 - u) * (rate[:, j] * dt - chord) - u * (rate[:, j + 1] * dt - chord))
         )
-        here = rot[:, j] @ rotation_from_vector(u * chord + bend)
-        at, leaning = _cubic(pos, vel, j, u, dt), _cubic(swing, swing_rate, j, u, dt)
+        attitude = rot[:, j] @ rotation_from_vector(u * chord + bend)
+        body_w, leaning = _cubic(pos, vel, j, u, dt), _cubic(swing, swing_rate, j, u, dt)
         rope, _ = _rope(leaning, torch.zeros_like(leaning))
         length = self.length * (1.0 + c["length"][:, None])
-        ball_w = at + _turned(here, self.mount.expand_as(at)) + length * rope
+        ball_w = body_w + _turned(attitude, self.mount.expand_as(body_w)) + length * rope
         goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
         corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)[:, None].expand(
-            -1, at.shape[1], -1, -1
+            -1, body_w.shape[1], -1, -1
         )
-        seen = torch.cat([corners_w, ball_w[:, :, None]], 2) - at[:, :, None]
+        seen = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
         lens = self.camera.position_b + c["lens"]
-        in_body = torch.einsum("bnji,bnkj->bnki", here, seen) - lens[:, None, None]
+        in_body = torch.einsum("bnji,bnkj->bnki", attitude, seen) - lens[:, None, None]
         rot_bc = rotation_from_vector(c["camera"]) @ self.camera.rot_cb.T
         in_camera = torch.einsum("bji,bnkj->bnki", rot_bc, in_body)
         rays = ball_extremes_c(
@@ -376,9 +376,11 @@ class Problem:
             torch.cat([in_camera[:, :, :4].flatten(0, 1), rays], -2), clip=True
         )
         size = 1.0 + c["scale"][:, None]
-        corners = size * points[:, :4].mean(1).unflatten(0, at.shape[:2]) + c["corners"][:, None]
+        corners = (
+            size * points[:, :4].mean(1).unflatten(0, body_w.shape[:2]) + c["corners"][:, None]
+        )
         ball = (
-            size * _box(box_midpoints(points[:, 4:])).unflatten(0, at.shape[:2])
+            size * _box(box_midpoints(points[:, 4:])).unflatten(0, body_w.shape[:2])
             + c["ball"][:, None]
         )
         off = torch.cat(
@@ -484,18 +486,18 @@ def calibrate(
     unit[width:] = np.eye(len(c))
     covariance = np.column_stack([solve(column)[width:] for column in unit.T])
     sigma = problem.split(torch.from_numpy(np.sqrt(np.maximum(np.diag(covariance), 0.0)))[None])
-    found = problem.split(c[None])
+    estimates = problem.split(c[None])
     of = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
     return Calibration(
-        of(found, "camera"),
+        of(estimates, "camera"),
         of(sigma, "camera"),
-        found["latency"].item(),
+        estimates["latency"].item(),
         sigma["latency"].item(),
-        1.0 + found["thrust"].item(),
+        1.0 + estimates["thrust"].item(),
         sigma["thrust"].item(),
         misfit,
         len(problem.time),
-        found["scale"].item(),
+        estimates["scale"].item(),
         sigma["scale"].item(),
     )
 

@@ -65,9 +65,9 @@ class Estimator:
         }
         parts = self.parts()
         for name, shape in expected.items():
-            came = tuple(parts[name].shape)
-            if came != shape:
-                raise PolicyError(f"estimator: {name} has shape {came}; expected {shape}")
+            actual = tuple(parts[name].shape)
+            if actual != shape:
+                raise PolicyError(f"estimator: {name} has shape {actual}; expected {shape}")
         for name, part in parts.items():
             if not bool(torch.isfinite(part).all()):
                 raise PolicyError(f"estimator: {name} holds numbers that are not finite")

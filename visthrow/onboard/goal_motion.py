@@ -236,12 +236,12 @@ def predicted(
     """
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
-    points, inside = camera.fisheye.project_normalized(corners_c, clip=True)
-    seen, end = valid[:, :GOAL_KEYPOINTS], VEHICLE + layout.goal
-    filled = inside & known & ~seen
+    points, visible = camera.fisheye.project_normalized(corners_c, clip=True)
+    measured_valid, end = valid[:, :GOAL_KEYPOINTS], VEHICLE + layout.goal
+    filled = visible & known & ~measured_valid
     corners = torch.where(filled[..., None], points, _corners(layout, frame))
     frame = torch.cat([frame[:, :VEHICLE], corners.flatten(1), frame[:, end:]], dim=-1)
-    return frame, torch.cat([seen | filled, valid[:, GOAL_KEYPOINTS:]], dim=-1)
+    return frame, torch.cat([measured_valid | filled, valid[:, GOAL_KEYPOINTS:]], dim=-1)
 
 
 def middle(points: Tensor, valid: Tensor) -> Tensor:

@@ -275,12 +275,12 @@ class FirstOrderParams(Bounded):
             not all(0.0 <= low < high for low, high in (self.free, self.latched))
             or self.final_width > self.width
         ):
-            came = (
+            actual = (
                 f"free is {self.free}, latched {self.latched}, the hazard {self.width} to"
                 f" {self.final_width} wide"
             )
             raise ConfigError(
-                f"{came}; expected ascending ranges from 0 or more, and a width that falls"
+                f"{actual}; expected ascending ranges from 0 or more, and a width that falls"
             )
 
 
@@ -320,8 +320,8 @@ class DiagnosedParams(Bounded):
         super().__post_init__()
         rows = [len(row) for row in self.covariance]
         if rows != [len(self.effects)] * len(self.effects):
-            given = f"diagnosed.covariance has rows of {rows} for {len(self.effects)} effects"
-            raise ConfigError(f"{given}; expected one row and one column for each")
+            message = f"diagnosed.covariance has rows of {rows} for {len(self.effects)} effects"
+            raise ConfigError(f"{message}; expected one row and one column for each")
 
 
 @dataclass(frozen=True)
@@ -371,11 +371,11 @@ class Experiment:
 
     def __post_init__(self) -> None:
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
-            given = (
+            message = (
                 f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius"
                 f" {self.rope.payload_radius} m"
             )
-            raise ConfigError(f"{given}; expected the same ball")
+            raise ConfigError(f"{message}; expected the same ball")
         for wrong in () if self.fleet is not None else (*_out_of_place(self), *_no_vehicle(self)):
             raise ConfigError(wrong)
 
@@ -417,12 +417,12 @@ def _no_vehicle(e: Experiment) -> Iterator[str]:
     inertia and size, thrust and speed of the rotors.
     """
     vehicle, rotors, motor = e.vehicle, e.vehicle.rotors, e.vehicle.controller.max_thrust
-    mass, asked = plant_of(e).total_mass, e.task.action.max_thrust
-    if not GRAVITY * mass < min(4.0 * motor, asked):
+    mass, thrust = plant_of(e).total_mass, e.task.action.max_thrust
+    if not GRAVITY * mass < min(4.0 * motor, thrust):
         yield (
             f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is"
             f" {4.0 * motor:g} N at most (four times vehicle.controller.max_thrust) and asked up to"
-            f" {asked:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
+            f" {thrust:g} N (task.action.max_thrust): it cannot hover; expected kg and N"
         )
     reach = max(map(math.hypot, rotors.x, rotors.y)) + rotors.radius
     if reach > e.task.bounds.horizontal:

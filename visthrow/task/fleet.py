@@ -142,8 +142,10 @@ def members(experiment: Experiment) -> list[Member]:
     fleet = experiment.fleet
     if fleet is None:
         return []
-    known = plant_of(experiment)
-    drawn = [draw(fleet, known, fleet.first + k) for k in range(fleet.count)] or [known]
+    paper_plant = plant_of(experiment)
+    vehicles = [draw(fleet, paper_plant, fleet.first + k) for k in range(fleet.count)] or [
+        paper_plant
+    ]
 
     def member(plant: PlantParams) -> Member:
         units = fleet.units_of(plant)
@@ -156,7 +158,7 @@ def members(experiment: Experiment) -> list[Member]:
             replace(stated, release=replace(stated.release, **task), sim=experiment.sim), units
         )
 
-    return [member(plant) for plant in drawn]
+    return [member(plant) for plant in vehicles]
 
 
 def alone(experiment: Experiment, number: int = 0) -> Experiment:
@@ -164,8 +166,11 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     fleet any more.
     """
     chosen = members(experiment)[number]
-    back = chosen.units.inverse
-    plant, task = in_units(chosen.plant, back), in_units(experiment.task, back, TASK)
+    inverse_units = chosen.units.inverse
+    plant, task = (
+        in_units(chosen.plant, inverse_units),
+        in_units(experiment.task, inverse_units, TASK),
+    )
     action = replace(task.action, max_thrust=4.0 * plant.vehicle.controller.max_thrust)
     task = replace(task, action=action, observation=replace(task.observation, setup="none"))
     size, camera = chosen.units.length, experiment.camera
@@ -207,12 +212,12 @@ def specialised(
     one, chosen = alone(experiment, number), members(experiment)[number]
     layout = ob.layout_of(experiment.task.observation)
     sizes, known = _sizes(layout, chosen.units), layout.dimension - layout.setup
-    spread, told = (
+    spread, stated = (
         policy.std + policy.eps,
         torch.tensor(chosen.setup(experiment.task.observation.setup)),
     )
     first = policy.weights[0]
-    bias = policy.biases[0] + first[:, known:] @ ((told - policy.mean[known:]) / spread[known:])
+    bias = policy.biases[0] + first[:, known:] @ ((stated - policy.mean[known:]) / spread[known:])
     contract = contract_of(one)
     made_by = {**policy.made_by, "config": config.to_dict(one, defaults=False)}
     return (

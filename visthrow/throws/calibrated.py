@@ -38,19 +38,19 @@ def calibrated_start(
 
     ``kept`` takes the calibration of each throw; None where there was none, and keypoints stay as
     they came."""
-    seen = experiment.task.observation
-    if seen.layout != "vision" or experiment.task.target.moves:
+    observation = experiment.task.observation
+    if observation.layout != "vision" or experiment.task.target.moves:
         raise ConfigError(
-            f"calibration in the hover: layout {seen.layout!r}; expected 'vision' and goals that"
-            " stand still"
+            f"calibration in the hover: layout {observation.layout!r}; expected 'vision' and goals"
+            " that stand still"
         )
 
     def begin(env: ThrowEnv) -> TensorDict:
-        found = _calibrations(experiment, _hovered(env))
+        estimates = _calibrations(experiment, _hovered(env))
         if kept is not None:
-            kept[:] = found
-        turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in found]
-        scale = [c.scale if c else 0.0 for c in found]
+            kept[:] = estimates
+        turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in estimates]
+        scale = [c.scale if c else 0.0 for c in estimates]
         return env.begin_throws(
             (torch.tensor(turn, device=env.device), torch.tensor(scale, device=env.device))
         )
@@ -108,7 +108,8 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
     """The calibration of each hover; None where it shows too little."""
     solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
-    found = dict(done(solve, hovered, cores() if len(hovered) > FEW else 1, "calibrations"))
+    estimates = dict(done(solve, hovered, cores() if len(hovered) > FEW else 1, "calibrations"))
     return [
-        None if isinstance(found[place], str) else found[place] for place in range(len(hovered))
+        None if isinstance(estimates[place], str) else estimates[place]
+        for place in range(len(hovered))
     ]

@@ -189,12 +189,12 @@ def throw(seconds: float | None = None) -> Phase:
     """
 
     def over(flight: "Flight") -> bool:
-        most = (
+        longest = (
             flight.pilots.experiment.task.bounds.time_limit + FALL_TIME
             if seconds is None
             else seconds
         )
-        return not np.any(flight.open) or flight.lasted(most)
+        return not np.any(flight.open) or flight.lasted(longest)
 
     return Phase(True, over)
 
@@ -240,8 +240,10 @@ class Flight:
         self.failures: list[str | None] = [None] * count
         self.commands: list[np.ndarray] = []
         self._refused: dict[int, str] = {}  # by the pilots, in the hover
-        most = pilots.experiment.task.action.max_thrust
-        limits = HoverParams(min_thrust=min(HoverParams.min_thrust, most / 70.0), max_thrust=most)
+        max_thrust = pilots.experiment.task.action.max_thrust
+        limits = HoverParams(
+            min_thrust=min(HoverParams.min_thrust, max_thrust / 70.0), max_thrust=max_thrust
+        )
         self._hover = HoverController(limits, plant.period, count)
 
     @property
@@ -286,23 +288,25 @@ class Flight:
     def _period(self, throws: bool) -> None:
         """Measure, decide, send."""
         plant = self.plant
-        seen = plant.measured()
-        held = self._held(seen)
-        self.flown = self.open & seen.attached & throws
-        sent = Decision(held, np.zeros(plant.count, bool))
+        measurement = plant.measured()
+        keypoints = self._held(measurement)
+        self.flown = self.open & measurement.attached & throws
+        sent = Decision(keypoints, np.zeros(plant.count, bool))
         if math.isnan(self.begin):
-            self._refused = self.pilots.wait(self, seen)
+            self._refused = self.pilots.wait(self, measurement)
         if throws:
-            asked = self.pilots.decide(self, seen, held)
-            command = np.where(self.flown[:, None], asked.command, held)
-            sent = Decision(command, asked.release & self.flown, asked.action, asked.observation)
-        self.recorder.before(self, seen, sent)
+            decision = self.pilots.decide(self, measurement, keypoints)
+            command = np.where(self.flown[:, None], decision.command, keypoints)
+            sent = Decision(
+                command, decision.release & self.flown, decision.action, decision.observation
+            )
+        self.recorder.before(self, measurement, sent)
         self.commands.append(sent.command)
         plant.step(sent.command, sent.release)
         self._now = None
         if throws:
             self.judge(self.now)
-        self.recorder.after(self, seen, sent)
+        self.recorder.after(self, measurement, sent)
 
     def _held(self, seen: Snapshot) -> np.ndarray:
         """Commands of the hover controller."""
@@ -380,11 +384,11 @@ class Scores(Recorder):
     def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
         if sent.action is None:
             return
-        now = flight.now
+        state = flight.now
         self.smoothness.add(sent.action, flight.flown)
-        apart = np.linalg.norm(now.payload_pos_w - now.pos_w, axis=1)
-        away = ~now.attached & ~flight.plant.landing.landed
-        self.clearance = np.where(away, np.minimum(self.clearance, apart), self.clearance)
+        distance = np.linalg.norm(state.payload_pos_w - state.pos_w, axis=1)
+        flying = ~state.attached & ~flight.plant.landing.landed
+        self.clearance = np.where(flying, np.minimum(self.clearance, distance), self.clearance)
 
     def columns(self, flight: Flight) -> dict[str, np.ndarray]:
         """A row a throw, NaN where it failed; ``goal_w`` where goals move."""

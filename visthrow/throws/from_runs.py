@@ -28,9 +28,9 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
     """Logs of all throws of some runs; LogError for a folder without throws, or a damaged log."""
     logs: list[FlightLog] = []
     for folder in map(Path, folders):
-        found = sorted(folder.glob(PATTERN))
-        if not found:
-            here = (
+        paths = sorted(folder.glob(PATTERN))
+        if not paths:
+            hint = (
                 ", ".join(sorted(path.name for path in folder.iterdir()))
                 if folder.is_dir()
                 else "no such folder"
@@ -40,10 +40,10 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
             if ticks.is_file() and '"state": "throw"' not in ticks.read_text(errors="replace"):
                 made = "No throw was begun in this run"
             raise LogError(
-                f"{folder}: no {PATTERN} in it ({here or 'empty'}); expected the folder of a run"
+                f"{folder}: no {PATTERN} in it ({hint or 'empty'}); expected the folder of a run"
                 f" with throws. {made}"
             )
-        logs += map(FlightLog.load, found)
+        logs += map(FlightLog.load, paths)
     return logs
 
 
@@ -104,12 +104,12 @@ def _row(log: FlightLog) -> tuple[float, ...]:
         return (np.nan,) * 5
     offset = _offset(log)
     distance = np.linalg.norm(offset)
-    ahead = offset / distance if distance > 0.0 else np.array([1.0, 0.0])
+    direction = offset / distance if distance > 0.0 else np.array([1.0, 0.0])
     landed = np.array(result["landing_w"][:2]) - np.array(log.meta["home_w"][:2])
-    across = ahead[0] * landed[1] - ahead[1] * landed[0]
+    side = direction[0] * landed[1] - direction[1] * landed[0]
     return (
-        float(landed @ ahead),
-        float(across),
+        float(landed @ direction),
+        float(side),
         result["error"],
         result["duration"],
         smoothness(log),

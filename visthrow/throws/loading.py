@@ -51,20 +51,22 @@ def load_policy(
     policy = Policy.load(path)
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
-        own = (
+        trained = (
             [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
         )  # of the program, not of the camera
-        experiment = config.load(Experiment, config.find("train", config_name), [*own, *overrides])
+        experiment = config.load(
+            Experiment, config.find("train", config_name), [*trained, *overrides]
+        )
     else:
         experiment = trained_in(policy, path, overrides)
-    now = contract_of(experiment)
+    contract_here = contract_of(experiment)
     for part in allow:
-        _check_part(part, (policy.contract, now, contract_of(experiment, whole=True)))
+        _check_part(part, (policy.contract, contract_here, contract_of(experiment, whole=True)))
     try:
-        within = _within(policy, experiment)
-        departures = policy.require(now, allow=(*allow, *within))
+        widened = _within(policy, experiment)
+        departures = policy.require(contract_here, allow=(*allow, *widened))
         departures = {
-            key: value for key, value in departures.items() if key.split("[")[0] not in within
+            key: value for key, value in departures.items() if key.split("[")[0] not in widened
         }
     except MismatchError as error:
         allowing = " ".join(f"--allow {key}" for key in error.keys)
@@ -86,12 +88,12 @@ def load_policy(
 def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
     """Raise ConfigError where a part that may be broken is in no contract."""
     keys = {key for contract in contracts for key in flattened(contract)}
-    known = {key[: mark.start()] for key in keys for mark in re.finditer(r"[.\[]|$", key)}
-    if part not in known:
-        sections = sorted(name for name in known if "." not in name)
+    groups = {key[: mark.start()] for key in keys for mark in re.finditer(r"[.\[]|$", key)}
+    if part not in groups:
+        sections = sorted(name for name in groups if "." not in name)
         raise ConfigError(
             f"allow '{part}': a contract has {', '.join(sections)} and their entries, but not that;"
-            f" {suggest(part, known)}"
+            f" {suggest(part, groups)}"
         )
 
 
@@ -122,11 +124,14 @@ def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
     """Keys of the contract that differ, but no further than the training went: latencies inside its
     range.
     """
-    seen, trained = experiment.task.observation, policy.contract.get("observation", {})
+    observation, trained = experiment.task.observation, policy.contract.get("observation", {})
     low, high = trained.get("latency", (0.0, 0.0))
     jitter = trained.get("latency_jitter", 0.0)
-    inside = low - jitter <= seen.latency[0] - seen.latency_jitter and seen.oldest <= high + jitter
-    return ("observation.latency", "observation.latency_jitter") if inside else ()
+    covered = (
+        low - jitter <= observation.latency[0] - observation.latency_jitter
+        and observation.oldest <= high + jitter
+    )
+    return ("observation.latency", "observation.latency_jitter") if covered else ()
 
 
 def unique_names(loaded: list[Loaded]) -> list[str]:

@@ -79,11 +79,11 @@ class LooseRope:
         before = np.diff(np.vstack((self.offset_w, np.zeros(3))), axis=0)
         weight = np.append(np.full(len(before) - 1, 2.0), 1.0)  # the ball does not give way
         for _ in range(ITERATIONS):
-            now = np.diff(np.vstack((moved, np.zeros(3))), axis=0)
-            excess = np.sum(now * now, axis=1) - self._lengths**2
-            jacobian = np.diag(2.0 * weight * np.sum(now * before, axis=1))
-            jacobian += np.diag(-2.0 * np.sum(now[1:] * before[:-1], axis=1), -1)
-            jacobian += np.diag(-2.0 * np.sum(now[:-1] * before[1:], axis=1), 1)
+            links = np.diff(np.vstack((moved, np.zeros(3))), axis=0)
+            excess = np.sum(links * links, axis=1) - self._lengths**2
+            jacobian = np.diag(2.0 * weight * np.sum(links * before, axis=1))
+            jacobian += np.diag(-2.0 * np.sum(links[1:] * before[:-1], axis=1), -1)
+            jacobian += np.diag(-2.0 * np.sum(links[:-1] * before[1:], axis=1), 1)
             push = np.linalg.solve(jacobian, excess)[:, None] * before
             moved = moved + push
             moved[1:] -= push[:-1]
@@ -101,12 +101,12 @@ def _on_link(joint: np.ndarray, end: np.ndarray, length: float, ground: float) -
     """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's
     centre [m].
     """
-    away = joint - end
-    away *= length / max(float(np.linalg.norm(away)), 1e-9)
+    offset = joint - end
+    offset *= length / max(float(np.linalg.norm(offset)), 1e-9)
     lowest = max(ground - end[2], -length)
-    if away[2] >= lowest:
-        return end + away
-    flat = max(float(np.hypot(away[0], away[1])), 1e-9)
-    away[:2] *= np.sqrt(max(length**2 - lowest**2, 0.0)) / flat
-    away[2] = lowest
-    return end + away
+    if offset[2] >= lowest:
+        return end + offset
+    flat = max(float(np.hypot(offset[0], offset[1])), 1e-9)
+    offset[:2] *= np.sqrt(max(length**2 - lowest**2, 0.0)) / flat
+    offset[2] = lowest
+    return end + offset

@@ -171,11 +171,11 @@ class HybridPlant:
             if rope is not None and not landed[e]:
                 rope.fly(self.period)
             elif rope is None and separated[e]:
-                inside = float(self._sim.get("separation_time")[e])
-                self._separation[e] = self.time + inside
+                separation_time = float(self._sim.get("separation_time")[e])
+                self._separation[e] = self.time + separation_time
                 self._ropes[e] = self._let_go(e)
-                if self.period - inside > 1e-6:
-                    self._ropes[e].fly(self.period - inside)
+                if self.period - separation_time > 1e-6:
+                    self._ropes[e].fly(self.period - separation_time)
         self.time += self.period
 
     def hold(self, names: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
@@ -218,17 +218,17 @@ class HybridPlant:
 
         from visthrow.onboard import actions as act
 
-        most, rates = (
+        max_thrust, rates = (
             self._action.max_thrust,
             torch.tensor(self._action.max_rate, dtype=torch.float64),
         )
         action = act.action_from_command(
-            torch.from_numpy(np.asarray(command, dtype=float)), most, rates
+            torch.from_numpy(np.asarray(command, dtype=float)), max_thrust, rates
         )
         error = self._command_bias + self.noise.command_step * self._rng.standard_normal(
             (self.count, 4)
         )
-        return act.command_from_action(action + torch.from_numpy(error), most, rates).numpy()
+        return act.command_from_action(action + torch.from_numpy(error), max_thrust, rates).numpy()
 
     def _let_go(self, e: int) -> LooseRope:
         """Rope of one plant at separation: the simulator keeps its directions and rates of that
@@ -390,11 +390,11 @@ def flown(
     )
 
     def acceleration(v: np.ndarray) -> np.ndarray:
-        through = v - wind
-        across = np.cross([0.0, 0.0, 1.0], through)
+        airspeed = v - wind
+        across = np.cross([0.0, 0.0, 1.0], airspeed)
         size = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        turned = side * across + lift * np.cross(through, across / size)
-        return np.linalg.norm(through, axis=1, keepdims=True) * (turned - share * through) - [
+        turned = side * across + lift * np.cross(airspeed, across / size)
+        return np.linalg.norm(airspeed, axis=1, keepdims=True) * (turned - share * airspeed) - [
             0.0,
             0.0,
             GRAVITY,
@@ -434,9 +434,9 @@ def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
     """Return measurements, linear between states one control period apart, newest first; age: in
     periods, shape (E,).
     """
-    now = states[0]
+    newest = states[0]
     if not np.any(age):
-        return now
+        return newest
     row = np.minimum(age.astype(int), len(states) - 2)
     late, share, each = {}, (age - row)[:, None], np.arange(len(age))
     for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w"):
@@ -444,7 +444,7 @@ def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
         newer, older = values[row, each], values[row + 1, each]
         late[name] = newer + share * (older - newer)
     late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
-    return replace(now, **late)
+    return replace(newest, **late)
 
 
 def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> np.ndarray:

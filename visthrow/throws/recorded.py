@@ -43,10 +43,12 @@ class Recording(Recorder):
         self.names, self.recorders = names, [FlightRecorder(meta) for _ in range(count)]
 
     def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        now = flight.now
+        state = flight.now
         for e, recorder in enumerate(self.recorders):
-            recorder.add(now.time, **{name: getattr(now, name)[e] for name in self.names})
-            recorder.add(now.time, command=sent.command[e], release_command=float(sent.release[e]))
+            recorder.add(state.time, **{name: getattr(state, name)[e] for name in self.names})
+            recorder.add(
+                state.time, command=sent.command[e], release_command=float(sent.release[e])
+            )
 
 
 class _Full(Recording):
@@ -69,22 +71,22 @@ class _Full(Recording):
 
     def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
         super().before(flight, seen, sent)
-        recorder, now, throws = self.recorders[0], flight.now, sent.action is not None
+        recorder, state, throws = self.recorders[0], flight.now, sent.action is not None
         if sent.release[0] and self.latch is None:
-            self.latch = now.time
+            self.latch = state.time
         looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
         points, valid = looked or self.pilots.pilots[0].see(
             seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w
         )
         recorder.add(
-            now.time,
+            state.time,
             goal_w=self.pilots.goal_w[0],
             mode=int(throws),
             keypoints=points[0],
             keypoints_valid=valid[0],
         )
         if sent.action is not None and sent.observation is not None:
-            recorder.add(now.time, action=sent.action[0], observation=sent.observation[0])
+            recorder.add(state.time, action=sent.action[0], observation=sent.observation[0])
         self.sample(flight)
 
     def sample(self, flight: Flight) -> None:
@@ -106,23 +108,23 @@ class _Full(Recording):
         """Rope now; after the landing it sinks to the ground instead of standing still as the
         plants leave it.
         """
-        now, landing, before, period = (
+        state, landing, before, period = (
             flight.now,
             flight.plant.landing,
             self._before,
             flight.plant.period,
         )
         if not landing.landed[0] or before is None:
-            return np.array(now.cable_points_w[0])
+            return np.array(state.cable_points_w[0])
         if self._resting is None:
             age = max(landing.time[0] - before.time, 1e-3)
-            points, ball = now.cable_points_w[0], now.payload_pos_w[0]
+            points, ball = state.cable_points_w[0], state.payload_pos_w[0]
             speed = (points - before.cable_points_w[0]) / age
             self._resting = LooseRope(points, np.clip(speed, -20.0, 20.0), ball, np.zeros(3))
-            period = now.time - landing.time[0]
+            period = state.time - landing.time[0]
         if period > 1e-6:
-            self._resting.sink(period, ROPE_ON_GROUND - now.payload_pos_w[0, 2])
-        return self._resting.points_w(now.payload_pos_w[0])
+            self._resting.sink(period, ROPE_ON_GROUND - state.payload_pos_w[0, 2])
+        return self._resting.points_w(state.payload_pos_w[0])
 
 
 def fly(
@@ -217,8 +219,8 @@ def _hovering(
 
     def over(flight: Flight) -> bool:
         nonlocal still
-        near = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
-        still = still + flight.plant.period if near and quiet(flight.now) else 0.0
+        close = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
+        still = still + flight.plant.period if close and quiet(flight.now) else 0.0
         return flight.elapsed >= least - 1e-9 and (still >= QUIET_TIME or flight.elapsed >= most)
 
     return Phase(False, over)
@@ -226,8 +228,8 @@ def _hovering(
 
 def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     """The log with the last state, and how the throw ended."""
-    plant, now, recorder = flight.plant, flight.now, recording.recorders[0]
-    recorder.add(now.time, **{name: getattr(now, name)[0] for name in recording.names})
+    plant, state, recorder = flight.plant, flight.now, recording.recorders[0]
+    recorder.add(state.time, **{name: getattr(state, name)[0] for name in recording.names})
     plant.measured()
     recording.sample(flight)
     landing, failure = plant.landing, flight.failures[0]
@@ -252,7 +254,7 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
             "duration": when - flight.begin,
         }
     result["hovering_again"] = bool(
-        np.linalg.norm(now.vel_w[0]) < 2 * QUIET_SPEED and now.pos_w[0, 2] > 0.5
+        np.linalg.norm(state.vel_w[0]) < 2 * QUIET_SPEED and state.pos_w[0, 2] > 0.5
     )
     recorder.meta |= {"times": times, "result": result}
     log = recorder.log()

@@ -139,12 +139,12 @@ def columns_of(throws: Any) -> dict[str, np.ndarray]:
     :class:`visthrow.paper.baseline.fly_plan.Flown`).
     """
     count = len(throws.success)
-    found = {
+    columns = {
         name: np.asarray(value)
         for name, value in vars(throws).items()
         if isinstance(value, np.ndarray)
     }
-    return {name: value for name, value in found.items() if value.ndim and len(value) == count}
+    return {name: value for name, value in columns.items() if value.ndim and len(value) == count}
 
 
 def save(folder: str | Path, result: Result) -> Path:
@@ -174,14 +174,14 @@ def load(path: str | Path) -> list[Result]:
 
 def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
     """Read all results in folders and files, by key; of two with one key the later place counts."""
-    found: dict[str, Result] = {}
+    results: dict[str, Result] = {}
     for place in map(Path, places):
         files = (
             sorted(place.glob("*.json")) if place.is_dir() else [place] if place.exists() else []
         )
         for path in files:
-            found.update({result.key: result for result in load(path)})
-    return found
+            results.update({result.key: result for result in load(path)})
+    return results
 
 
 def join(found: Iterable[Result]) -> list[Result]:
@@ -196,10 +196,10 @@ def join(found: Iterable[Result]) -> list[Result]:
         if "batch" not in result.unit:
             whole.append(result)
             continue
-        rest = {
+        common = {
             name: value for name, value in result.unit.items() if name not in ("batch", "throws")
         }
-        group, batch = groups.setdefault(key_of(rest), {}), result.unit["batch"]
+        group, batch = groups.setdefault(key_of(common), {}), result.unit["batch"]
         if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
             group[batch] = result
     return whole + [_joined([group[batch] for batch in sorted(group)]) for group in groups.values()]
@@ -252,8 +252,8 @@ def work(
     one = partial(finish, folder, function, provenance.commit(), provenance.command())
     for count, (_, result) in enumerate(done(one, todo, processes), 1):
         results[result.key] = result
-        left = (time.monotonic() - begin) / count * (len(todo) - count)
-        say(f"{count} of {len(todo)} sets of throws, about {left:.0f} s left")
+        remaining = (time.monotonic() - begin) / count * (len(todo) - count)
+        say(f"{count} of {len(todo)} sets of throws, about {remaining:.0f} s left")
     return {key_of(unit): results[key_of(unit)] for unit in units}
 
 

@@ -17,12 +17,12 @@ def resolve(name: str = "auto") -> str:
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     exists = ["cpu", *(f"cuda:{i}" for i in range(count))]
-    wanted = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
-    if wanted not in exists:
+    device = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
+    if device not in exists:
         raise DeviceError(
             f"device '{name}' is not there; expected auto or one of {', '.join(exists)}"
         )
-    return wanted
+    return device
 
 
 @contextmanager
@@ -34,9 +34,9 @@ def rounded_products(allowed: bool) -> Iterator[None]:
     """
     import torch
 
-    held = torch.backends.cuda.matmul.allow_tf32
+    previous = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = allowed
     try:
         yield
     finally:
-        torch.backends.cuda.matmul.allow_tf32 = held
+        torch.backends.cuda.matmul.allow_tf32 = previous

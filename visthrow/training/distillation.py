@@ -63,8 +63,13 @@ class Network(nn.Module):
 
     def frozen(self) -> Estimator:
         """The estimator that flies; it shares the parameters."""
-        mask, gru, seen = self.learnt, self.gru, self.normalizer
-        parts = [seen.mean, seen.std + seen.eps, self.encoder.weight, self.encoder.bias]
+        mask, gru, normaliser = self.learnt, self.gru, self.normalizer
+        parts = [
+            normaliser.mean,
+            normaliser.std + normaliser.eps,
+            self.encoder.weight,
+            self.encoder.bias,
+        ]
         parts += [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0]
         parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
         inner = tuple((layer.weight.detach(), layer.bias.detach()) for layer in self.inner)
@@ -88,8 +93,8 @@ class Distillation:
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         self.cfg, self.p = experiment, experiment.distillation
-        seen = experiment.task.observation
-        if experiment.task.target.moves or seen.layout != "vision":
+        observation = experiment.task.observation
+        if experiment.task.target.moves or observation.layout != "vision":
             raise ConfigError(
                 'algorithm = "distillation" takes goals that stand still and observation.layout ='
                 ' "vision"'
@@ -113,8 +118,8 @@ class Distillation:
         self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
-        kept, learnt = _passed(env.layout, self._layout)
-        self.network = Network(kept, learnt, env.layout.dimension, self.p).to(device)
+        passed, learnt = _passed(env.layout, self._layout)
+        self.network = Network(passed, learnt, env.layout.dimension, self.p).to(device)
         ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
@@ -188,12 +193,12 @@ class Distillation:
                 off = F.smooth_l1_loss(
                     estimate / self._scales, truth / self._scales, reduction="none"
                 ).mean(-1)
-                wanted, action = (
+                target, action = (
                     act.clip_action(self.teacher.decide(truth)),
                     self.teacher.decide(estimate),
                 )
                 wrong = (
-                    act.clip_action(action) - wanted
+                    act.clip_action(action) - target
                 ).detach()  # beyond the limits only the way back counts
                 acted = (wrong * action).sum(-1) if self.p.action_weight else 0.0
                 loss = (alive * (off + self.p.action_weight * acted)).sum() / alive.sum()
@@ -272,9 +277,9 @@ def _passed(seen: ob.Layout, wanted: ob.Layout) -> tuple[Tensor, Tensor]:
     )
     goal = [places, places + 1] if seen.located else [none, none]
     between = wanted.dimension - len(vehicle) - len(goal) - 1
-    kept = torch.tensor([*vehicle, *goal, *[none] * between, places - seen.validity - 1])
+    columns = torch.tensor([*vehicle, *goal, *[none] * between, places - seen.validity - 1])
     learnt = torch.ones(wanted.dimension, dtype=torch.bool)
     learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = (
         False  # the action before and the latch are known
     )
-    return kept, learnt
+    return columns, learnt

@@ -70,14 +70,18 @@ class ThrowEnv(VecEnv):
         plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
         ropes = [rope for plant in plants for rope in rope_variants(plant.rope, task.start)]
         share = len(ropes) // len(plants)
-        each = {
+        parts_of = {
             name: [getattr(plant, name) for plant in plants for _ in range(share)]
             for name in ("vehicle", "air", "release")
         }
-        many = (
-            {f"{name}s": parts for name, parts in each.items()} if fleet or len(plants) > 1 else {}
+        variants = (
+            {f"{name}s": parts for name, parts in parts_of.items()}
+            if fleet or len(plants) > 1
+            else {}
         )
-        self.sim = HybridSim(plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **many)
+        self.sim = HybridSim(
+            plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **variants
+        )
         self.views = TorchViews(self.sim)
         self.layout = ob.layout_of(task.observation)
         self._found: tuple[Tensor, Tensor] | None = None  # by a calibration
@@ -128,8 +132,16 @@ class ThrowEnv(VecEnv):
             self.num_envs,
             {"device": self.device, "dtype": torch.float32},
         )
-        seen, latency, device = task.observation, self.cfg.camera.noise.history_length, self.device
-        oldest = seen.oldest if self._clock is None else seen.oldest / float(self._clock.min())
+        observation, latency, device = (
+            task.observation,
+            self.cfg.camera.noise.history_length,
+            self.device,
+        )
+        oldest = (
+            observation.oldest
+            if self._clock is None
+            else observation.oldest / float(self._clock.min())
+        )
         memory = {
             "previous": torch.zeros(E, act.ACTIONS, **make),
             "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
@@ -376,13 +388,15 @@ class ThrowEnv(VecEnv):
         low, high = self.cfg.task.observation.latency
         if high > 0.0:
             age = memory["pose_age"]
-            drawn = low + (high - low) * torch.rand_like(age)
-            torch.where(fresh, drawn if self._clock is None else drawn / self._clock, age, out=age)
+            sample = low + (high - low) * torch.rand_like(age)
+            torch.where(
+                fresh, sample if self._clock is None else sample / self._clock, age, out=age
+            )
         slow, fast = self.cfg.task.target.speed
         if fast > 0.0:
             velocity = memory["goal_vel"]
-            drawn = torch.rand_like(velocity[:, :2])
-            speed, heading = slow + (fast - slow) * drawn[:, 0], 2.0 * math.pi * drawn[:, 1]
+            sample = torch.rand_like(velocity[:, :2])
+            speed, heading = slow + (fast - slow) * sample[:, 0], 2.0 * math.pi * sample[:, 1]
             new = torch.stack(
                 [speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)], dim=-1
             )
@@ -390,13 +404,13 @@ class ThrowEnv(VecEnv):
 
     def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Pose sample as old as the episode's latency, linear between two control steps."""
-        memory, seen = self._memory, self.cfg.task.observation
+        memory, observation = self._memory, self.cfg.task.observation
         poses, age = hist.push(memory["poses"], pose, fresh), memory["pose_age"]
         memory["poses"].copy_(poses)
-        if seen.oldest == 0.0:
+        if observation.oldest == 0.0:
             return pose
-        if seen.latency_jitter > 0.0:
-            off = seen.latency_jitter * (2.0 * torch.rand_like(age) - 1.0)
+        if observation.latency_jitter > 0.0:
+            off = observation.latency_jitter * (2.0 * torch.rand_like(age) - 1.0)
             age = age + (off if self._clock is None else off / self._clock)
         age = age / self.cfg.sim.control_period
         before = age.floor().clamp(max=poses.shape[1] - 2.0)
@@ -414,11 +428,15 @@ class ThrowEnv(VecEnv):
         attached = state["attached"].to(torch.float32)
         pose = self._late(torch.cat([vehicle, payload], dim=-1), fresh)
         late_goal = self._goal_in(-memory["pose_age"])
-        seen = torch.cat(
+        true_frame = torch.cat(
             [pose[:, : ob.VEHICLE], ob.state_part(pose[:, :3], late_goal, pose[:, ob.VEHICLE :])],
             dim=-1,
         )
-        measured = seen + torch.randn_like(seen) * noise.observation_step + memory["frame_bias"]
+        measured = (
+            true_frame
+            + torch.randn_like(true_frame) * noise.observation_step
+            + memory["frame_bias"]
+        )
         valid = None
         if self.layout.name == "vision":
             if self.cfg.task.observation.oldest > 0.0:
@@ -470,7 +488,7 @@ class ThrowEnv(VecEnv):
             true_history = hist.push(memory["true_history"], offset[:, 2:], fresh)
             memory["true_history"].copy_(true_history)
             parts = [vehicle, memory["previous"], offset[:, :2], true_history.flatten(1)]
-        known = (
+        quantities = (
             ("payload_velocity", self.views.out["payload_vel_w"]),
             ("release_timer", state["release_timer"][:, None]),
             ("time", time[:, None]),
@@ -484,7 +502,7 @@ class ThrowEnv(VecEnv):
             ("pose_age", memory["pose_age"][:, None]),
             ("vehicle", self._known),
         )
-        parts += [value for name, value in known if name in named and value is not None]
+        parts += [value for name, value in quantities if name in named and value is not None]
         return torch.cat(parts, dim=-1) if len(parts) > 1 else actor
 
     def _see(
@@ -510,9 +528,9 @@ class ThrowEnv(VecEnv):
             draw = draw._replace(wrong=torch.rand(*points.shape[:2], 3, device=points.device))
         points, valid = apply_noise(camera.noise, points, valid, memory["keypoint_bias"], draw)
         if camera.noise.held_probability > 0.0:
-            held = (torch.rand_like(points[:, 0, 0]) < camera.noise.held_probability) & ~fresh
-            points = torch.where(held[:, None, None], memory["held_points"], points)
-            valid = torch.where(held[:, None], memory["held_valid"], valid)
+            repeated = (torch.rand_like(points[:, 0, 0]) < camera.noise.held_probability) & ~fresh
+            points = torch.where(repeated[:, None, None], memory["held_points"], points)
+            valid = torch.where(repeated[:, None], memory["held_valid"], valid)
             memory["held_points"].copy_(points)
             memory["held_valid"].copy_(valid)
         return (

@@ -86,10 +86,10 @@ class TrainLog:
         """Write one iteration's figures and, where it ended in throws, what came of them; OSError
         where the disk is full.
         """
-        gone = time.perf_counter() - self._start
+        elapsed = time.perf_counter() - self._start
         figures = (
             figures
-            | {"wall_s": self._before + gone}
+            | {"wall_s": self._before + elapsed}
             | (evaluated(throws) if throws is not None else {})
         )
         self._writer.writerow(figures)
@@ -99,7 +99,7 @@ class TrainLog:
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
             f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
             f" {terminal.clock(figures['wall_s'])},"
-            f" {terminal.clock(self._left(figures['iteration'], gone))} left"
+            f" {terminal.clock(self._left(figures['iteration'], elapsed))} left"
         )
         if self._picture is not None:
             self._picture.draw(text, figures, throws)
@@ -110,8 +110,8 @@ class TrainLog:
 
     def _left(self, iteration: int, gone: float) -> float:
         """Time to the last iteration or the end of the minutes at the speed so far [s]."""
-        left = (self.last - iteration) * gone / max(iteration - self.done, 1)
-        return left if self.minutes is None else min(left, 60.0 * self.minutes - gone)
+        remaining = (self.last - iteration) * gone / max(iteration - self.done, 1)
+        return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - gone)
 
 
 class Picture:
@@ -149,7 +149,7 @@ class Picture:
 
     def lines(self) -> list[str]:
         """The picture without its head line."""
-        left = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
+        chart = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
         points, last = [], self._last
         if last is not None:
             offsets = last.landing_w - ((last.target, 0.0) if last.goal_w is None else last.goal_w)
@@ -159,7 +159,7 @@ class Picture:
             "landing error: . training, o throws at 2.0 m",
             f"landings within {REACH:g} m: {self._said}",
         )
-        return terminal.side_by_side([heads[0], *left], [heads[1], *right])
+        return terminal.side_by_side([heads[0], *chart], [heads[1], *right])
 
 
 def evaluated(throws: Throws) -> dict[str, float]:

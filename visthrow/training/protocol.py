@@ -19,9 +19,15 @@ def hover_start(experiment: Experiment) -> Experiment:
     """The experiment with its episodes started from hover; cables and payloads vary as in the
     experiment.
     """
-    kept = ("tether_variants", "tether_spread", "payload_variants", "payload_spread", "drag_spread")
+    fields = (
+        "tether_variants",
+        "tether_spread",
+        "payload_variants",
+        "payload_spread",
+        "drag_spread",
+    )
     start = dataclasses.replace(
-        pilots_hover(), **{name: getattr(experiment.task.start, name) for name in kept}
+        pilots_hover(), **{name: getattr(experiment.task.start, name) for name in fields}
     )
     return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
 
@@ -68,7 +74,7 @@ def _fly(
 ) -> Throws:
     observations, previous = begin(env), env.previous_action.clone()
     open_ = torch.ones(count, dtype=torch.bool, device=env.device)
-    kept: dict[str, torch.Tensor] = {}
+    tensors: dict[str, torch.Tensor] = {}
     change, steps = torch.zeros(2, count, device=env.device)
     for _ in range(env.max_episode_length + 1):
         observations, _, done, _ = env.step(policy(observations["actor"]))
@@ -79,13 +85,13 @@ def _fly(
         ended = open_ & (done > 0)
         for name, value in env.last.items():
             mask = ended.view(-1, *(1,) * (value.dim() - 1))
-            kept[name] = torch.where(mask, value, kept.get(name, torch.zeros_like(value)))
+            tensors[name] = torch.where(mask, value, tensors.get(name, torch.zeros_like(value)))
         open_ &= ~ended
         if not bool(open_.any()):  # most throws take a fifth of the time limit
             break
-    success = (kept["released"] & ~open_).cpu().numpy()
+    success = (tensors["released"] & ~open_).cpu().numpy()
     blank = np.where(success, 1.0, np.nan)
-    array = {k: v.cpu().numpy().astype(np.float64) for k, v in kept.items()}
+    array = {k: v.cpu().numpy().astype(np.float64) for k, v in tensors.items()}
     smoothness = (change / steps.clamp(min=1)).sqrt().cpu().numpy().astype(np.float64)
     landing_w, goal_w = (
         array[name][:, :2] * blank[:, None] if name in array else None

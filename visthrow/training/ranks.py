@@ -65,9 +65,9 @@ class Ranks:
         """Highest of the processes' numbers."""
         if self.world == 1:
             return number
-        given = torch.tensor(number, device=self.device)
-        distributed.all_reduce(given, op=distributed.ReduceOp.MAX)
-        return int(given)
+        tensor = torch.tensor(number, device=self.device)
+        distributed.all_reduce(tensor, op=distributed.ReduceOp.MAX)
+        return int(tensor)
 
     def gather(self, state: dict) -> list[Tensor]:
         """Every process' state as torch saves it, in the order of ranks; of use to the
@@ -75,10 +75,10 @@ class Ranks:
         """
         buffer = io.BytesIO()
         torch.save(state, buffer)
-        own = buffer.getvalue()
-        saved: list[bytes] = [own] * self.world
+        payload = buffer.getvalue()
+        saved: list[bytes] = [payload] * self.world
         if self.world > 1:
-            distributed.gather_object(own, saved if self.lead else None)
+            distributed.gather_object(payload, saved if self.lead else None)
         return (
             [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved]
             if self.lead

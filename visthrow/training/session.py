@@ -79,13 +79,13 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
         trainer.algorithm.take_up(policy)
     last = args.iterations or trainer.algorithm.iterations
     if ranks.lead:
-        told: dict[str, Any] = {"seed": seed, "processes": ranks.world}
+        summary: dict[str, Any] = {"seed": seed, "processes": ranks.world}
         if policy is not None:
-            made = {
+            files = {
                 k: policy.made_by[k] for k in ("commit", "command", "seed") if k in policy.made_by
             }
-            told["from"] = {"policy": Path(args.start).name, **made}
-        provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **told)
+            summary["from"] = {"policy": Path(args.start).name, **files}
+        provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **summary)
     why = _loop(args, trainer, folder, last, viewer)
     if ranks.lead:
         _report(args, trainer, folder, time.perf_counter() - start, finished=why in (DONE, REACHED))
@@ -226,7 +226,7 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
         EVALUATION_SHARE if args.until or viewer or sys.stdout.isatty() else 0.0,
     )
     checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
-    shown = (
+    picture = (
         viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
     )
     log = (
@@ -238,7 +238,7 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
         with (
             log or contextlib.nullcontext(),
             StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING) as stop,
-            shown as show,
+            picture as show,
         ):
             while trainer.iteration < last and why == DONE:
                 figures, throws = trainer.step(), None

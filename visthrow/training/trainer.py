@@ -225,14 +225,14 @@ class Trainer:
         """Write a checkpoint that a resumed run goes on from as if it had not stopped, all
         processes' in one; all or nothing.
         """
-        own = {
+        state = {
             "algorithm": self.algorithm.state_dict(),
             "rng": torch.get_rng_state(),
             "cuda_rng": (
                 torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None
             ),
         }
-        ranks = self.ranks.gather(own)
+        ranks = self.ranks.gather(state)
         if not self.ranks.lead:
             return
         content = {
@@ -266,16 +266,16 @@ class Trainer:
             )
         self.iteration = saved["iteration"]
         rank, parts = self.ranks.rank, saved["ranks"]
-        known = rank < len(parts)
-        part = io.BytesIO(parts[rank if known else 0].numpy().tobytes())
-        own = torch.load(part, map_location=self.device, weights_only=True)
-        self.algorithm.load_state_dict(own["algorithm"], own_throws=known)
-        if not known:  # with another's episodes it would collect the same data
+        has_state = rank < len(parts)
+        part = io.BytesIO(parts[rank if has_state else 0].numpy().tobytes())
+        state = torch.load(part, map_location=self.device, weights_only=True)
+        self.algorithm.load_state_dict(state["algorithm"], own_throws=has_state)
+        if not has_state:  # with another's episodes it would collect the same data
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
             return
-        torch.set_rng_state(own["rng"].cpu())
-        if own["cuda_rng"] is not None and self.device.startswith("cuda"):
-            torch.cuda.set_rng_state(own["cuda_rng"].cpu(), self.device)
+        torch.set_rng_state(state["rng"].cpu())
+        if state["cuda_rng"] is not None and self.device.startswith("cuda"):
+            torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
 
 
 def finish(trainer: Trainer, folder: Path, figures: dict, finished: bool = True) -> Policy:

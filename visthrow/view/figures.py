@@ -115,7 +115,7 @@ def marks(
     figure, axis = plt.subplots(
         figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained"
     )
-    shown = {}
+    handles = {}
     for row in rows:
         (colour, marker), value, paper = _look(row.series), row.interval, row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
@@ -128,13 +128,13 @@ def marks(
             solid_capstyle="butt",
             alpha=0.55,
         )
-        shown[row.series] = axis.plot(
+        handles[row.series] = axis.plot(
             value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3
         )[0]
         if paper is not None:
             ends = [max(paper.low, 0.1 * paper.value) if log else paper.low, paper.high]
             axis.plot(ends, [y + 0.14] * 2, "-", color=style.QUIET, lw=1.0)
-            shown[len(series)] = axis.plot(
+            handles[len(series)] = axis.plot(
                 paper.value, y + 0.14, "x", color=style.INK, ms=7, mew=1.5, zorder=4
             )[0]
     if zero is not None:
@@ -147,10 +147,10 @@ def marks(
     axis.grid(True, axis="x")
     axis.set_axisbelow(True)
     axis.set_xlabel(xlabel)
-    if len(shown) > 1:
-        keys, names = sorted(shown), [*series, "the paper's vehicle"]
+    if len(handles) > 1:
+        keys, names = sorted(handles), [*series, "the paper's vehicle"]
         figure.legend(
-            [shown[key] for key in keys], [names[key] for key in keys], loc="outside right upper"
+            [handles[key] for key in keys], [names[key] for key in keys], loc="outside right upper"
         )
     return png_of(figure)
 
@@ -174,11 +174,11 @@ def scatter(
 
     A panel is a title and, for each colour, its label and misses (N, 2) [m]: along the throw, to
     the left."""
-    far = max(
+    reach = max(
         (np.abs(points).max() for _, series in panels for _, points in series if len(points)),
         default=0.2,
     )
-    half = float(np.clip(1.06 * far, 0.12, 0.7))
+    half = float(np.clip(1.06 * reach, 0.12, 0.7))
     columns = min(columns, len(panels))
     size = WIDTH / max(columns, 3)
     wide, more = (max(size * columns, 6.4), 1.1) if heading else (size * columns, 0.8)
@@ -236,12 +236,12 @@ def _target(axis, half: float) -> None:
 def _landings(axis, points: np.ndarray, half: float, series: int, label: str) -> None:
     """Points outside the panel stand at its edge, hollow; a thick cross marks their mean."""
     colour, marker = _look(series)
-    shown = np.clip(points, -half, half)
-    inside = np.all(shown == points, axis=1)
+    clipped = np.clip(points, -half, half)
+    visible = np.all(clipped == points, axis=1)
     alpha = 0.8 if len(points) <= 40 else 0.35
     axis.scatter(
-        -points[inside, 1],
-        points[inside, 0],
+        -points[visible, 1],
+        points[visible, 0],
         s=11,
         color=colour,
         marker=marker,
@@ -250,7 +250,7 @@ def _landings(axis, points: np.ndarray, half: float, series: int, label: str) ->
         label=label,
         zorder=3,
     )
-    out = shown[~inside]
+    out = clipped[~visible]
     axis.scatter(
         -out[:, 1],
         out[:, 0],
@@ -310,7 +310,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
             labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
         empty = [label for _, label, points in panel.fronts if not len(points)]
         if empty or not panel.fronts:
-            said = (
+            caption = (
                 "no setting landed all its throws:\n" + "\n".join(empty)
                 if empty
                 else "not swept yet"
@@ -318,7 +318,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
             axis.text(
                 0.03,
                 0.02,
-                said,
+                caption,
                 transform=axis.transAxes,
                 fontsize=7.5,
                 color=style.QUIET,

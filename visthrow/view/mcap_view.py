@@ -98,9 +98,9 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     ):
         if topic not in channels:
             name = topic.removeprefix("/signals/")
-            about = {"unit": log[name].unit, "frame": log[name].frame} if name != topic else {}
+            metadata = {"unit": log[name].unit, "frame": log[name].frame} if name != topic else {}
             channels[topic] = writer.register_channel(
-                topic, "json", schemas[schema], metadata=about
+                topic, "json", schemas[schema], metadata=metadata
             )
         stamp = round((time - begin) * 1e9)
         writer.add_message(channels[topic], stamp, json.dumps(content).encode(), stamp)
@@ -160,13 +160,13 @@ def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
                 {"values": values, "valid": bool(valid)},
             )
     for time, state, reason in log.meta.get("events", ()):
-        said = {
+        message = {
             "timestamp": _stamp(time - begin),
             "level": 3 if state == "abort" else 2,
             "message": f"{state}: {reason}",
             "name": "run",
         }
-        yield max(time, begin), "/events", "foxglove.Log", said
+        yield max(time, begin), "/events", "foxglove.Log", message
 
 
 def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
@@ -220,14 +220,14 @@ def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
     ]
     for name, entity, shape in things:
         for time, row in _rows(log, name):
-            drawn = {
+            entities = {
                 "timestamp": _stamp(time - begin),
                 "frame_id": "world",
                 "id": entity,
                 "frame_locked": False,
                 **shape(row),
             }
-            yield time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [drawn]}
+            yield time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [entities]}
 
 
 def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
@@ -235,19 +235,19 @@ def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
     if "keypoints" not in log or "keypoints_valid" not in log:
         return
     camera, last = KeypointCamera(experiment.camera), -np.inf
-    seen = log["keypoints_valid"].hold(log["keypoints"].time)
+    visible = log["keypoints_valid"].hold(log["keypoints"].time)
     for time, points, valid in zip(
-        log["keypoints"].time, log["keypoints"].values, seen, strict=True
+        log["keypoints"].time, log["keypoints"].values, visible, strict=True
     ):
         if time - last < IMAGE_PERIOD - 1e-6:
             continue
         last = time
-        drawn = draw_overlay(
+        image = draw_overlay(
             camera,
             torch.from_numpy(np.array(points, dtype=float)),
             torch.from_numpy(np.array(valid, dtype=bool)),
         )
-        data = base64.b64encode(cv2.imencode(".png", drawn)[1].tobytes()).decode()
+        data = base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
         picture = {
             "timestamp": _stamp(time - begin),
             "frame_id": "camera",
@@ -260,8 +260,8 @@ def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
 def _rows(log: FlightLog, name: str) -> Iterator[tuple[float, np.ndarray]]:
     if name in log:
         channel = log[name]
-        kept = np.flatnonzero(np.asarray(channel.valid))
-        yield from zip(channel.time[kept].tolist(), channel.values[kept], strict=True)
+        rows = np.flatnonzero(np.asarray(channel.valid))
+        yield from zip(channel.time[rows].tolist(), channel.values[rows], strict=True)
 
 
 def _stamp(seconds: float) -> dict[str, int]:

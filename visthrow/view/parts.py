@@ -13,20 +13,23 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | N
     """
     cells = [header, *rows]
     width = [max(len(row[i]) for row in cells) for i in range(len(header))]
-    left = len(header) if heads is None else heads
+    text_columns = len(header) if heads is None else heads
 
     def line(row: Sequence[str]) -> str:
         return (
             "| "
             + " | ".join(
-                c.ljust(w) if i < left else c.rjust(w) for i, (c, w) in enumerate(zip(row, width))
+                c.ljust(w) if i < text_columns else c.rjust(w)
+                for i, (c, w) in enumerate(zip(row, width))
             )
             + " |"
         )
 
     rule = (
         "|"
-        + "|".join("-" * (w + 2) if i < left else "-" * (w + 1) + ":" for i, w in enumerate(width))
+        + "|".join(
+            "-" * (w + 2) if i < text_columns else "-" * (w + 1) + ":" for i, w in enumerate(width)
+        )
         + "|"
     )
     return "\n".join([line(header), rule, *map(line, rows)])
@@ -88,11 +91,11 @@ def section(
     head: str = "Not thrown yet",
 ) -> Section:
     """A section of the parts that there are; at its end what is missing."""
-    said = "; ".join(dict.fromkeys(missing))
+    reasons = "; ".join(dict.fromkeys(missing))
     return Section(
         name,
         title,
-        (*filter(None, parts), *([Text(f"{head}: {said}.", "missing")] if said else [])),
+        (*filter(None, parts), *([Text(f"{head}: {reasons}.", "missing")] if reasons else [])),
     )
 
 

@@ -63,13 +63,11 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     lens = KeypointCamera(drawn_larger(camera))
     all_seen = True
     for column, (caption, time) in enumerate(views):
-        left = LEFT + column * (PANEL + GAP)
-        axis = figure.add_axes(
-            (left / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height)
-        )
+        x = LEFT + column * (PANEL + GAP)
+        axis = figure.add_axes((x / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
         _side_view(axis, log, time, side, column)
         axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - start:.2f} s", loc="left")
-        axis = figure.add_axes((left / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
+        axis = figure.add_axes((x / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
         all_seen &= _camera_view(axis, log, lens, time, first=column == 0)
     texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
@@ -163,9 +161,9 @@ def _side_view(
     for past in np.arange(times["policy_start"], time - 0.03, GHOST_EVERY):
         _vehicle(axis, log, past, 0.16)
     payload = log["payload_pos_w"]
-    seen = (payload.time >= times["policy_start"]) & (payload.time < time)
-    path = np.vstack([payload.values[seen], log["payload_pos_w"].at(time)])
-    when = np.append(payload.time[seen], time)
+    visible = (payload.time >= times["policy_start"]) & (payload.time < time)
+    path = np.vstack([payload.values[visible], log["payload_pos_w"].at(time)])
+    when = np.append(payload.time[visible], time)
     carried, flown = when <= times["separation"] + 1e-6, when >= times["separation"] - 0.02
     axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
     if np.count_nonzero(flown) > 1:
@@ -215,9 +213,9 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     circle = Ellipse((lens.params.cx, lens.params.cy), *size, transform=axis.transData)
     axis.imshow(picture, interpolation="antialiased").set_clip_path(circle)
     axis.set_axis_off()
-    seen = bool(valid.all())
+    visible = bool(valid.all())
     if not first:
-        return seen
+        return visible
     pixels = lens.denormalize(points[0].double()).numpy()
     for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
         right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
@@ -241,4 +239,4 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
         va="bottom",
         fontsize=8,
     )
-    return seen
+    return visible

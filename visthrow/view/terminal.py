@@ -48,9 +48,9 @@ def curve(
             min(int(width * t / end), width - 1) if end > 0 else 0
         ] = mark
     levels = [top * (bottom / top) ** (i / (height - 1)) for i in range(height)]
-    shown = {0, height // 2, height - 1}
+    ticks = {0, height // 2, height - 1}
     lines = [
-        f"{f'{level:.3g}' if i in shown else '':>6} |{''.join(cells)}"
+        f"{f'{level:.3g}' if i in ticks else '':>6} |{''.join(cells)}"
         for i, (level, cells) in enumerate(zip(levels, grid))
     ]
     span = f"{end:.0f} s" if end < 600 else f"{end / 60:.0f} min"
@@ -92,6 +92,6 @@ def clock(seconds: float) -> str:
     """A duration as minutes and seconds, hours where there are any."""
     if not math.isfinite(seconds):
         return "-"
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds_left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{seconds_left:02d}" if hours else f"{minutes}:{seconds_left:02d}"

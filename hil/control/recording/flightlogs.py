@@ -144,7 +144,7 @@ class Samples:
         attached = tick.attached
         for sample in tick.samples:
             self._pose(sample, attached)
-        d, now = tick.decision, tick.line["time"]
+        d, time = tick.decision, tick.line["time"]
         values: dict[str, Any] = {
             "mode": int(d.state == State.THROW),
             "state": STATES.index(d.state),
@@ -157,10 +157,10 @@ class Samples:
         if Status(*tick.line["status"]).mode != FOLLOW:
             self._follows = None
         elif self._follows is None:
-            self._follows = now
+            self._follows = time
         if d.command is not None:
-            acts = self._follows is not None and now - self._follows >= self.spun_up - ROUNDING
-            self.recorder.add(now, acts, command=np.array(d.command, dtype=float))
+            acts = self._follows is not None and time - self._follows >= self.spun_up - ROUNDING
+            self.recorder.add(time, acts, command=np.array(d.command, dtype=float))
         for name in ("action", "observation", "keypoints"):
             if getattr(d, name) is not None:
                 values[name] = np.array(getattr(d, name), dtype=float)
@@ -169,7 +169,7 @@ class Samples:
         for name, seconds in tick.line["times"].items():
             self.recorder.declare(f"tick_{name}", "s")
             values[f"tick_{name}"] = seconds
-        self.recorder.add(now, **values)
+        self.recorder.add(time, **values)
 
     def _pose(self, sample: Sample, attached: bool) -> None:
         pose = sample.pose
@@ -228,12 +228,12 @@ def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dic
 
 def events(ticks: list[Tick]) -> list[list]:
     """Return time, state and reason of each change."""
-    found: list[list] = []
+    phases: list[list] = []
     for tick in ticks:
-        now = [tick.line["time"], tick.decision.state, tick.decision.reason]
-        if not found or found[-1][1:] != now[1:]:
-            found.append(now)
-    return found
+        phase = [tick.line["time"], tick.decision.state, tick.decision.reason]
+        if not phases or phases[-1][1:] != phase[1:]:
+            phases.append(phase)
+    return phases
 
 
 def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
@@ -256,13 +256,13 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
     latch = next(
         (t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None
     )
-    apart = (
+    distance = (
         np.inf
         if latch is None
         else (landing.separation if landing and landing.separation else latch + runner.latch.lag)
     )
     for tick in ticks:
-        samples.add(replace(tick, attached=tick.line["time"] < apart))
+        samples.add(replace(tick, attached=tick.line["time"] < distance))
     meta = samples.recorder.meta
     meta["events"] = events(ticks)
     meta["goal_w"] = list(
@@ -288,14 +288,14 @@ def _judge(
     ended = next((tick for tick in after if tick.decision.state != State.THROW), after[-1])
     times: dict[str, Any] = {"policy_start": start, "latch": latch, "recovery": ended.line["time"]}
     times["end"] = ticks[-1].line["time"]
-    over = (
+    landed = (
         np.inf if landing is None else landing.time
     )  # what happens once it is down takes nothing from the throw
     stopped = next(
         (
             t.decision.reason
             for t in after
-            if t.decision.state == State.ABORT and t.line["time"] < over
+            if t.decision.state == State.ABORT and t.line["time"] < landed
         ),
         None,
     )

@@ -106,11 +106,11 @@ class Stages:
             if pose.measured is not None:
                 self.stages["transport"].add(pose.arrival - pose.measured)
                 continue
-            apart = pose.arrival - pose.stamp
-            if self._fastest is None or abs(apart - self._fastest) > CLOCK_STEP:
-                self._fastest = apart
-            self._fastest = min(self._fastest, apart)
-            self.stages["transport"].add(apart - self._fastest)
+            delay = pose.arrival - pose.stamp
+            if self._fastest is None or abs(delay - self._fastest) > CLOCK_STEP:
+                self._fastest = delay
+            self._fastest = min(self._fastest, delay)
+            self.stages["transport"].add(delay - self._fastest)
         return {} if newest is None else {"arrival": now - newest}
 
     def summary(self) -> dict[str, dict[str, float]]:
@@ -154,8 +154,8 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     style.use()
     import matplotlib.pyplot as plt
 
-    shown = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
-    rows = max(len(shown), 1)
+    stages_with_data = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
+    rows = max(len(stages_with_data), 1)
     height = _BELOW + _ROW * rows + _ABOVE
     figure, axis = plt.subplots(figsize=(_WIDTH, height))
     figure.subplots_adjust(
@@ -164,12 +164,12 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
         bottom=_BELOW / height,
         top=1.0 - _ABOVE / height,
     )
-    for row, (name, stage) in enumerate(shown.items()):
+    for row, (name, stage) in enumerate(stages_with_data.items()):
         _histogram(axis, row, name, stage)
     axis.set_xscale("log")
     axis.set_xlabel("time [ms]; thin lines: p50, p95, p99; triangle: the longest")
     axis.set_ylim(rows - 1.0, -1.0)
-    axis.set_yticks(range(len(shown)), list(shown))
+    axis.set_yticks(range(len(stages_with_data)), list(stages_with_data))
     axis.tick_params("y", length=0.0)
     axis.spines[["left", "bottom"]].set_visible(False)
     figure.suptitle(title, x=0.02, ha="left", fontsize=11.5)

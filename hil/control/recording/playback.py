@@ -60,18 +60,23 @@ class Playback:
 
     def feed(self, line: dict[str, Any], poses: list[Pose]) -> Tick:
         """Run one recorded tick."""
-        self._samples, runner, now = [], self.runner, line["time"]
+        self._samples, runner, time = [], self.runner, line["time"]
         if line.get("seen") is not None:
             runner.look([Detection.of(line["seen"])])
         if (found := line.get("calibration")) is not None:
             runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
         runner.hear(line.get("rivals") or [])
         decision = runner.tick(
-            now, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
+            time, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
         )
-        ages = {name: track.gate.age(now) for name, track in runner.tracks.items()}
+        ages = {name: track.gate.age(time) for name, track in runner.tracks.items()}
         return Tick(
-            line, decision, self._samples, ages, not runner.latch.separated(now), runner.seen_goal_w
+            line,
+            decision,
+            self._samples,
+            ages,
+            not runner.latch.separated(time),
+            runner.seen_goal_w,
         )
 
 
@@ -100,26 +105,26 @@ def replay(folder: str | Path) -> dict[str, Any]:
     for line in ticks:
         decision = playback.feed(line, poses.get(line["n"], [])).decision
         actions += decision.action is not None
-        seen = {
+        fields = {
             "time": decision.time,
             "state": decision.state,
             "reason": decision.reason,
             "since": decision.time,
         }
         if last is not None and decision.state == last["state"]:
-            seen["since"] = last["since"]
-        seen["vehicle"] = playback.runner.tracks[VEHICLE].state(decision.time)
+            fields["since"] = last["since"]
+        fields["vehicle"] = playback.runner.tracks[VEHICLE].state(decision.time)
         if turn is None and decision.state == State.ABORT.value:
             turn = {
-                **seen,
+                **fields,
                 **({} if last is None else {"state": last["state"], "since": last["since"]}),
             }
-        last = seen
+        last = fields
         for name in COMPARED:
-            was, now = line[name], getattr(decision, name)
-            now = list(now) if isinstance(now, tuple) else now
-            if was != now:
-                differences.append((line["n"], name, was, now))
+            was, value = line[name], getattr(decision, name)
+            value = list(value) if isinstance(value, tuple) else value
+            if was != value:
+                differences.append((line["n"], name, was, value))
     cut = _cut(folder, len(ticks))
     return {
         "ticks": len(ticks),
@@ -152,13 +157,13 @@ def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str 
     ``since`` when [s], ``reason``, ``vehicle`` as it was seen), the last tick in the same form, and
     what is missing of the recording.
     """
-    at = turn or (last if cut else None)
+    turn_number = turn or (last if cut else None)
     if last is None:
         return "Whether it went wrong is not known: no tick is recorded."
-    if at is None:
+    if turn_number is None:
         return f"It did not go wrong: it ended in {last['state']} ({last['reason']})."
     why = turn["reason"] if turn else "the recording ends"
-    vehicle: BodyState | None = at["vehicle"]
+    vehicle: BodyState | None = turn_number["vehicle"]
     where = "had not been seen"
     if vehicle is not None:
         place, speed = (
@@ -167,8 +172,8 @@ def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str 
         )
         where = f"was at ({place}) m with {speed:.1f} m/s, its pose {1e3 * vehicle.age:.0f} ms old"
     return (
-        f"It went wrong {at['time'] - at['since']:.2f} s into '{at['state']}': {why}; the vehicle"
-        f" {where}."
+        f"It went wrong {turn_number['time'] - turn_number['since']:.2f} s into"
+        f" '{turn_number['state']}': {why}; the vehicle {where}."
     )
 
 
@@ -177,18 +182,18 @@ def again(args: argparse.Namespace) -> int:
     else 0: ``visthrow hil replay``.
     """
     with opened(args.folder) as folder:
-        found = replay(folder)
-    for n, name, was, now in found["differences"][:10]:
+        comparison = replay(folder)
+    for n, name, was, now in comparison["differences"][:10]:
         print(f"tick {n}: {name} was {was}, is {now}")
     same = (
         "all bit for bit the same"
-        if not found["differences"]
-        else f"{len(found['differences'])} DIFFERENCES"
+        if not comparison["differences"]
+        else f"{len(comparison['differences'])} DIFFERENCES"
     )
-    print(f"{found['ticks']} ticks, {found['actions']} actions of the policy: {same}")
-    if found["cut"]:
-        print(f"CUT: {found['cut']}")
+    print(f"{comparison['ticks']} ticks, {comparison['actions']} actions of the policy: {same}")
+    if comparison["cut"]:
+        print(f"CUT: {comparison['cut']}")
         if Path(args.folder).is_dir():
             print(f"{pack(args.folder)}  what there is of the run, in one file")
-    print(found["story"])
-    return 1 if found["differences"] or found["cut"] else 0
+    print(comparison["story"])
+    return 1 if comparison["differences"] or comparison["cut"] else 0

@@ -177,14 +177,14 @@ def pose_of(row: list) -> tuple[int, Pose]:
 
 def read_poses(folder: Path) -> dict[int, list[Pose]]:
     """Return raw poses of a run by tick; raises `RunError` where the file is missing or damaged."""
-    found: dict[int, list[Pose]] = {}
+    poses: dict[int, list[Pose]] = {}
     try:
         for row in lines(folder / POSES):
             index, pose = pose_of(row)
-            found.setdefault(index, []).append(pose)
+            poses.setdefault(index, []).append(pose)
     except (TypeError, ValueError) as error:
         raise RunError(f"{folder / POSES}: not a list of poses: {error}") from error
-    return found
+    return poses
 
 
 def require_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> None:
@@ -261,12 +261,12 @@ def pack(folder: str | Path) -> Path:
     folder = Path(folder).resolve()
     require_run(folder)
     path = folder.with_name(folder.name + ENDING)
-    found = [folder / name for name in PARTS if (folder / name).is_file()]
-    found += sorted(file for pattern in RECORDS for file in folder.glob(pattern))
+    paths = [folder / name for name in PARTS if (folder / name).is_file()]
+    paths += sorted(file for pattern in RECORDS for file in folder.glob(pattern))
     part = path.with_name(f".{path.name}.tmp")
     try:
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as bundle:
-            for file in found:
+            for file in paths:
                 bundle.write(file, file.name)
         part.replace(path)
     except OSError as error:
@@ -309,6 +309,6 @@ def opened(path: str | Path) -> Iterator[Path]:
                 f"{path}: {error}; expected a folder of a run, or the bundle of one"
             ) from error
         if not is_run(Path(folder)):
-            held = ", ".join(entry.filename for entry in entries) or "nothing"
-            raise RunError(f"{path}: no bundle of a run, it holds {held}; {EXPECTED}")
+            names = ", ".join(entry.filename for entry in entries) or "nothing"
+            raise RunError(f"{path}: no bundle of a run, it holds {names}; {EXPECTED}")
         yield Path(folder)

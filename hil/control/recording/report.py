@@ -73,7 +73,7 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
     """
     from visthrow.view import strip
 
-    folder, said = Path(folder), []
+    folder, lines = Path(folder), []
     try:
         if stages is not None:
             draw(
@@ -81,11 +81,11 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
                 stages,
                 f"Times of each stage, run {folder.name}{slowed(speed)}",
             )
-            said.append(f"{folder / LATENCY_PICTURE}  times of each stage")
+            lines.append(f"{folder / LATENCY_PICTURE}  times of each stage")
         played = read(folder)
         if not played.throws:
             whole(played).save(folder / WHOLE)
-            said.append(f"{folder / WHOLE}  flight log of the whole run")
+            lines.append(f"{folder / WHOLE}  flight log of the whole run")
         for number, log in enumerate(throws(played), start=1):
             path = throw_path(folder, number, ".npz")
             log.save(path)
@@ -93,9 +93,9 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
             how = f"no landing counted: {result['failure']}"
             if result["success"]:
                 how = f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s"
-            said.append(f"{path}  throw {number}: {how}")
+            lines.append(f"{path}  throw {number}: {how}")
             if "landing" in log:
                 strip.draw(throw_path(folder, number, ".png"), log, played.playback.params.camera)
     except VisthrowError as error:
-        said.append(f"not all could be written: {error}")
-    return said
+        lines.append(f"not all could be written: {error}")
+    return lines

@@ -68,16 +68,16 @@ class Show:
                 if sample.body in self._trails:
                     self._trails[sample.body].append(sample.pose.pos)
         log = self._samples.flush()
-        shown = events(ticks)
-        if shown and self._said is not None and shown[0][1:] == self._said[1:]:
-            shown = shown[1:]
-        self._said = shown[-1] if shown else self._said
-        log.meta["events"] = shown
+        phases = events(ticks)
+        if phases and self._said is not None and phases[0][1:] == self._said[1:]:
+            phases = phases[1:]
+        self._said = phases[-1] if phases else self._said
+        log.meta["events"] = phases
         self._view.send(self._stream, log)
-        now = ticks[-1].line["time"] - self._meta["times"]["policy_start"]
+        time = ticks[-1].line["time"] - self._meta["times"]["policy_start"]
         for body, points in self._trails.items():
             if len(points) > 1:
-                self._view.trail(self._stream, BODY_CHANNELS[body], now, np.array(points))
+                self._view.trail(self._stream, BODY_CHANNELS[body], time, np.array(points))
 
 
 def sizes(pilot: Any) -> SimpleNamespace:
@@ -97,9 +97,9 @@ def tail(path: Path) -> Generator[list[Any], None, None]:
     while not path.is_file():
         yield []
     with path.open(encoding="utf-8") as file:
-        rest = ""
+        partial = ""
         while True:
-            *whole, rest = (rest + file.read()).split("\n")
+            *whole, partial = (partial + file.read()).split("\n")
             yield [json.loads(row) for row in whole]
 
 
@@ -124,13 +124,13 @@ class Follower:
             index, pose = pose_of(row)
             self._poses.setdefault(index, []).append(pose)
         self._lines.extend(next(self._tails[TICKS]))
-        found = []
+        lines = []
         while (
             self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]
         ):
             line = self._lines.popleft()
-            found.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
-        return found
+            lines.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
+        return lines
 
     def close(self) -> None:
         """Close its files."""
@@ -145,7 +145,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
     follower, show, dropped = Follower(Path(folder)), None, 0
     try:
         while going():
-            over = (follower.folder / SUMMARY).is_file()
+            finished = (follower.folder / SUMMARY).is_file()
             ticks = follower.ticks()
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:
@@ -154,7 +154,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
                         stream, follower.playback, follower.provenance, ticks[0].line["time"]
                     )
                 show.take(ticks[-MOST_SHOWN:])
-            elif over:
+            elif finished:
                 break
             time.sleep(EVERY)
     finally:

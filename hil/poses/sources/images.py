@@ -87,12 +87,12 @@ class Eyes:
             raise ConfigError(f"images.by '{params.by}'; {suggest(params.by, DETECTORS)}")
         self._params = params
         lens, mount = params.fisheye or training.fisheye, params.mount or training.mount
-        apart = math.dist(mount.position_b, training.mount.position_b)
-        if apart > SAME_PLACE:
+        distance = math.dist(mount.position_b, training.mount.position_b)
+        if distance > SAME_PLACE:
             raise ConfigError(
-                f"images.mount.position_b is {1e3 * apart:.0f} mm from that of training; expected"
-                f" {1e3 * SAME_PLACE:g} at most: another lens at the same place can be converted,"
-                " another place cannot"
+                f"images.mount.position_b is {1e3 * distance:.0f} mm from that of training;"
+                f" expected {1e3 * SAME_PLACE:g} at most: another lens at the same place can be"
+                " converted, another place cannot"
             )
         self.detector = DETECTORS[params.by](
             Fisheye(lens), training.payload_radius, training.goal_side, params.detector
@@ -107,27 +107,27 @@ class Eyes:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of
         another size.
         """
-        known, rot_wc, hint = Known(), None, self.hint
+        prior, rot_wc, hint = Known(), None, self.hint
         if hint is not None:
             rot_wb = rotation_of(hint.quat)
             rot_wc = rot_wb @ self._rot_cb.T
             eye_w = np.array(hint.pos_w) + rot_wb @ self._position_b
-            known = self._followed.known(rot_wc, rot_wb[:, 2], eye_w, hint.ball_distance, stamp)
+            prior = self._followed.known(rot_wc, rot_wb[:, 2], eye_w, hint.ball_distance, stamp)
         try:
-            seen = self._followed.take(self.detector.detect(picture, known), rot_wc, stamp)
+            frame = self._followed.take(self.detector.detect(picture, prior), rot_wc, stamp)
         except ValueError as error:
             raise SourceError(
                 f"{error}: the pictures' size is not that of images.fisheye"
             ) from error
         corners = (
             None
-            if seen.goal is None
-            else tuple(map(tuple, (seen.goal.rays_c @ self._turn.T).tolist()))
+            if frame.goal is None
+            else tuple(map(tuple, (frame.goal.rays_c @ self._turn.T).tolist()))
         )
         ball = (
             None
-            if seen.ball is None
-            else (*(self._turn @ seen.ball.ray_c).tolist(), seen.ball.half_angle)
+            if frame.ball is None
+            else (*(self._turn @ frame.ball.ray_c).tolist(), frame.ball.half_angle)
         )
         return Detection(stamp, corners, ball)
 
@@ -286,15 +286,15 @@ def _stamps(path: Path, header: tuple[str, str]) -> list[tuple[str, float]]:
     """
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-        found = [(name.strip(), float(time)) for name, time in rows[1:]]
+        stamps = [(name.strip(), float(time)) for name, time in rows[1:]]
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise SourceError(
             f"{path}: cannot be read: {error}; expected lines of {','.join(header)}"
         ) from error
-    times = [time for _, time in found]
-    if not found or [cell.strip() for cell in rows[0]] != list(header) or times != sorted(times):
+    times = [time for _, time in stamps]
+    if not stamps or [cell.strip() for cell in rows[0]] != list(header) or times != sorted(times):
         raise SourceError(
             f"{path}; expected a first line {','.join(header)}, then a picture a line, times [s]"
             " ascending"
         )
-    return found
+    return stamps

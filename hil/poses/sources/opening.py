@@ -48,14 +48,14 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
     """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks
     MAVLink, or both.
     """
-    found = []
+    bodies = []
     if poses:
         for ids in params.source.senders:
             kinds = frozenset(COMPANIONS.get(ids.message, (ids.message,)))
-            found.append(Party(ids.body, ids.system, ids.component, kinds))
+            bodies.append(Party(ids.body, ids.system, ids.component, kinds))
     if autopilot and params.backend in AUTOPILOTS:
         vehicle = getattr(params, params.backend)
-        found.append(
+        bodies.append(
             Party(
                 "autopilot",
                 vehicle.system,
@@ -63,7 +63,7 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
                 autopilot=AUTOPILOTS[params.backend].autopilot,
             )
         )
-    return found
+    return bodies
 
 
 def open_source(
@@ -88,7 +88,7 @@ def open_source(
                 f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)"
             )
         return Recorded(poses, roster), None, True
-    own = source.kind == "mavlink" and source.device is not None
+    has_port = source.kind == "mavlink" and source.device is not None
 
     def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
         port = open_port(
@@ -104,12 +104,12 @@ def open_source(
         return link
 
     link = None
-    if (source.kind == "mavlink" and not own) or params.backend in AUTOPILOTS:
+    if (source.kind == "mavlink" and not has_port) or params.backend in AUTOPILOTS:
         link = opened(
             "link.device",
             params.link.device,
             TLOG,
-            parties(params, source.kind == "mavlink" and not own, True),
+            parties(params, source.kind == "mavlink" and not has_port, True),
         )
     if source.kind == "mocap":
         return (
@@ -117,7 +117,7 @@ def open_source(
             link,
             False,
         )
-    if not own:
+    if not has_port:
         return MavlinkSource(link, source.senders, clock.now), link, False
     poses = opened("source.device", source.device, POSES_TLOG, parties(params, True, False))
     return MavlinkSource(poses, source.senders, clock.now, link), link, False
@@ -179,17 +179,17 @@ def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict
     # A clock may be set in between: stamps that do not ascend are left to the gate.
     ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]
     times = np.array([p.stamp for p in ours])
-    ahead = (
+    rest_of_path = (
         np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
         if len(times)
         else np.zeros(0, bool)
     )
-    if np.sum(ahead) < LEAST:
+    if np.sum(rest_of_path) < LEAST:
         return {}
-    found = {}
+    channels = {}
     for name, (kind, (unit, frame)) in zip(names, _KINDS.items()):
-        values = [getattr(p, kind) for p, good in zip(ours, ahead) if good]
+        values = [getattr(p, kind) for p, good in zip(ours, rest_of_path) if good]
         unknown = any(value is None or not np.all(np.isfinite(value)) for value in values)
         if not unknown and (kind != "quat" or all(map(known, values))):
-            found[name] = Channel(times[ahead], np.array(values), unit, frame)
-    return found
+            channels[name] = Channel(times[rest_of_path], np.array(values), unit, frame)
+    return channels

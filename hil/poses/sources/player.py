@@ -323,12 +323,14 @@ def _in_world(
         return vel
     from scipy.spatial.transform import Rotation
 
-    own = frame == BODY_FRAME
-    known = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
-    turned = np.where((own & ~known)[:, None], np.nan, vel)
-    both = own & known
-    if np.any(both):
-        turned[both] = Rotation.from_quat(quat[both][:, [1, 2, 3, 0]]).apply(vel[both])
+    body_frame = frame == BODY_FRAME
+    usable = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
+    turned = np.where((body_frame & ~usable)[:, None], np.nan, vel)
+    turned_rows = body_frame & usable
+    if np.any(turned_rows):
+        turned[turned_rows] = Rotation.from_quat(quat[turned_rows][:, [1, 2, 3, 0]]).apply(
+            vel[turned_rows]
+        )
     return turned
 
 
@@ -339,8 +341,10 @@ def _known(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
     """Return north, east and down [m] from the estimator's origin, else from the first position."""
-    at = np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
-    lat, lng = (origins[n][at[-1]] if len(at) else data[n][0] for n in ("Lat", "Lng"))
+    index = (
+        np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
+    )
+    lat, lng = (origins[n][index[-1]] if len(index) else data[n][0] for n in ("Lat", "Lng"))
     return {
         "N": np.radians(data["Lat"] - lat) * EARTH_RADIUS,
         "E": np.radians(data["Lng"] - lng) * EARTH_RADIUS * math.cos(math.radians(lat)),

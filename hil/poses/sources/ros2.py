@@ -98,10 +98,10 @@ def domain(params: MocapParams) -> Any:
             f"source.mocap.settings.domain '{number}'; expected ROS_DOMAIN_ID, 0 to 232"
         )
     try:
-        own = dds.Domain(
+        participant = dds.Domain(
             int(number), LOOPBACK if params.host.startswith("127.") else NETWORK.format(params.host)
         )
-        return own, dds.DomainParticipant(int(number))
+        return participant, dds.DomainParticipant(int(number))
     except Exception as error:  # of the package
         raise SourceError(
             f"DDS on {params.host}, domain {number}: {error}; expected the address of a network"
@@ -117,16 +117,16 @@ def placed(
     """
     parent, _, child = frames.rpartition("/")
     if kind == KINDS[2]:
-        wanted = [
+        transforms = [
             t
             for t in message.transforms
             if (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/")) == (parent, child)
         ]
-        found = [(t.header, t.transform.translation, t.transform.rotation) for t in wanted]
+        placements = [(t.header, t.transform.translation, t.transform.rotation) for t in transforms]
     else:
         pose = message.pose if kind == KINDS[0] else message.pose.pose
-        found = [(message.header, pose.position, pose.orientation)]
-    for header, p, q in found:
+        placements = [(message.header, pose.position, pose.orientation)]
+    for header, p, q in placements:
         yield (
             float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec),
             (p.x, p.y, p.z),
@@ -163,7 +163,7 @@ class Ros2Source(MocapSource):
         name that is no ``TYPE:TOPIC``.
         """
         super().__init__(clock, link, tell)
-        wanted = [(*_topic(name), body) for name, body in body_names(bodies).items()]
+        topics = [(*_topic(name), body) for name, body in body_names(bodies).items()]
         types, self._domain = message_types(), domain(params)
         core, sub, topic = (
             load_extra(f"cyclonedds.{name}", "ros2", "ROS 2 topics", SourceError)
@@ -171,7 +171,7 @@ class Ros2Source(MocapSource):
         )
         quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(10))
         self._readers = []
-        for kind, place, frames, body in wanted:
+        for kind, place, frames, body in topics:
             described = topic.Topic(self._domain[1], f"rt{place}", types[kind])
             self._readers.append(
                 sub.DataReader(

@@ -44,12 +44,16 @@ class FirstOrder:
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         self.cfg, self.p, self._ranks = experiment, experiment.first_order, ranks
-        seen, p, on_gpu = experiment.task.observation, experiment.ppo, device.startswith("cuda")
+        observation, p, on_gpu = (
+            experiment.task.observation,
+            experiment.ppo,
+            device.startswith("cuda"),
+        )
         late, others = (
-            seen.oldest > experiment.sim.control_period,
+            observation.oldest > experiment.sim.control_period,
             experiment.task.target.moves or experiment.fleet is not None,
         )
-        if seen.layout != "state" or late or others:
+        if observation.layout != "state" or late or others:
             expected = (
                 'observation.layout = "state", a latency of one period at most, one vehicle and'
                 " goals that stand still"
@@ -188,13 +192,13 @@ class FirstOrder:
             x.pos[1:, :, 2],
             x.load_pos[1:, :, 2],
         )
-        now = act.clip_action(x.action)
-        now, before = (
+        action = act.clip_action(x.action)
+        action, before = (
             a.flatten(0, 1)
-            for a in (now, torch.cat([env._start_action.expand_as(now[:1]), now[:-1]]))
+            for a in (action, torch.cat([env._start_action.expand_as(action[:1]), action[:-1]]))
         )
-        acting = rewards.command(p, now, env._rate_weights) + rewards.change(
-            p, now, before, env._change_weights
+        acting = rewards.command(p, action, env._rate_weights) + rewards.change(
+            p, action, before, env._change_weights
         )
         inside = [
             height - bounds.altitude[0] - ALTITUDE,
@@ -221,10 +225,10 @@ class FirstOrder:
             T - lag - 1,
         )  # the cubic looks a step past the separation
         reward, error, fall = self._rewards_at_release(x, K)
-        asked = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
-        smooth, cut = torch.sigmoid(asked / self._width), k[:K] + lag + 2 > steps
+        latch_input = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
+        smooth, cut = torch.sigmoid(latch_input / self._width), k[:K] + lag + 2 > steps
         hazard = (
-            smooth + self._latched * ((asked > 0.0).float() - smooth).detach()
+            smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
         )  # the slope stays that of the smooth one
         hazard = torch.where(k[:K] > steps, 1.0, hazard * (k[:K] >= self._first))
         reward = torch.where(cut, -p.termination, reward)
@@ -267,12 +271,12 @@ class FirstOrder:
             cost, figures = self._cost(
                 SimpleNamespace(**{name: leaf.requires_grad_() for name, leaf in leaves.items()})
             )
-        by = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()))))
+        gradients = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()))))
         for name in states:
-            self.adjoint[name][: T + 1] = by[name]
-        self.adjoint["turn"][: T + 1] = torch.linalg.cross(by["tilt"], tilt)
+            self.adjoint[name][: T + 1] = gradients[name]
+        self.adjoint["turn"][: T + 1] = torch.linalg.cross(gradients["tilt"], tilt)
         self.adjoint["command"].zero_()
-        self.layers.by_action[:T] = by["action"]
+        self.layers.by_action[:T] = gradients["action"]
         self.layers.prepare(T)
         self.backward()
         return {name: figure.detach() for name, figure in (figures | {"cost": cost}).items()}
@@ -294,12 +298,12 @@ class FirstOrder:
         }
         for name, tensor in (self.surrogate | plants).items():
             setattr(p, name, wp.from_torch(tensor, dtype=Setting.vars[name].type.dtype))
-        rest = map(
+        remainder = map(
             wp.from_torch,
             (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action),
         )
         given, how = (
-            (adjoint, flights.course, *rest),
+            (adjoint, flights.course, *remainder),
             {
                 "device": env.device,
                 "block_dim": 64,

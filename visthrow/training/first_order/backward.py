@@ -77,19 +77,21 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
     arm = arm - 0.5 * (wp.quat_rotate(rot, mount) + wp.quat_rotate(rot_next, mount))
     length, n = wp.length(arm), wp.normalize(arm)
     u = 0.5 * (x.load_vel[k, e] - x.vel[k, e] + x.load_vel[k + 1, e] - x.vel[k + 1, e])
-    across = u - wp.dot(n, u) * n
+    perpendicular = u - wp.dot(n, u) * n
     pull = -load_mass * wp.dot(n, (x.load_vel[k + 1, e] - x.load_vel[k, e]) / dt + GRAVITY * up)
 
     g_f = dt / mass * g_vel
     g_u, g_arm = wp.vec3(), wp.vec3()
     if pull > TAUT * GRAVITY * load_mass:
-        both = g_f - dt / load_mass * g_load_vel
-        g_pull = wp.dot(n, both) * mass * load_mass / (mass + load_mass)
+        combined = g_f - dt / load_mass * g_load_vel
+        g_pull = wp.dot(n, combined) * mass * load_mass / (mass + load_mass)
         swing = g_pull * p.tension[1] / length
-        g_n = pull * both - g_pull * p.tension[0] / mass * f - 2.0 * swing * wp.dot(n, u) * u
-        g_u = 2.0 * swing * across
+        g_n = pull * combined - g_pull * p.tension[0] / mass * f - 2.0 * swing * wp.dot(n, u) * u
+        g_u = 2.0 * swing * perpendicular
         g_f = g_f - g_pull * p.tension[0] / mass * n
-        g_arm = (g_n - wp.dot(n, g_n) * n - swing * wp.dot(across, across) * n) / length
+        g_arm = (
+            g_n - wp.dot(n, g_n) * n - swing * wp.dot(perpendicular, perpendicular) * n
+        ) / length
 
     g_z = 0.5 * thrust * g_f
     g_turn += turned(rot_next, up, g_z)
@@ -235,12 +237,12 @@ class Layers:
         that flew it, shape (E,).
         """
         rows = _picked(flown)
-        by = self.by_action[k, rows]
+        gradient = self.by_action[k, rows]
         for layer, slope, by_inner in reversed(
             list(zip(self._linear[1:], self._slope, self._by_inner))
         ):
-            by = by_inner[k, rows] = (by @ layer.weight).mul_(slope[k, rows])
-        self.by_seen[rows] = by @ self._first
+            gradient = by_inner[k, rows] = (gradient @ layer.weight).mul_(slope[k, rows])
+        self.by_seen[rows] = gradient @ self._first
 
     def gradients(self, seen: Tensor, flown: Tensor, shares: Tensor) -> None:
         """Give the weights their derivatives: seen, shape (T, E, D), at steps that were flown, (T,
@@ -252,8 +254,8 @@ class Layers:
             shares.expand(flown.shape).flatten()[rows, None],
         )
         for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
-            by = by_inner.flatten(0, 1)[rows] * shares
-            layer.weight.grad, layer.bias.grad = by.mT @ x, by.sum(0)
+            gradient = by_inner.flatten(0, 1)[rows] * shares
+            layer.weight.grad, layer.bias.grad = gradient.mT @ x, gradient.sum(0)
             x = self._network.mlp[1](inner.flatten(0, 1)[rows])
 
 

@@ -121,7 +121,7 @@ class Flights:
         env, x, state, out = self.env, self.x, self.env.views.state, self.env.views.out
         loads = {"load_pos": out["payload_pos_w"], "load_vel": out["payload_vel_w"]}
         sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"]} | loads
-        seen = env.reset()["actor"]
+        observation = env.reset()["actor"]
         torch.add(self._body * state["mass_scale"], self._rope, out=self.mass)
         self.flying[:], self.steps[:] = 1, 0
         for k in range(len(self.obs) + 1):
@@ -140,11 +140,11 @@ class Flights:
             self.last = k
             if k == len(self.obs):
                 break
-            self.obs[k] = seen
-            if (action := act(k, seen)) is None:
+            self.obs[k] = observation
+            if (action := act(k, observation)) is None:
                 break
             self.steps.add_(self.flying)
-            seen = env.carry(action, self._mask)["actor"]
+            observation = env.carry(action, self._mask)["actor"]
             x["command"][k] = env.views.command
         flown = (
             x["pos"][1:],
@@ -191,8 +191,8 @@ def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
     tension = _solve(
         torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"]
     )
-    found = (("response", torch.stack(response, -1)), ("force", force), ("tension", tension))
-    return {name: value.float().contiguous() for name, value in found}
+    samples = (("response", torch.stack(response, -1)), ("force", force), ("tension", tension))
+    return {name: value.float().contiguous() for name, value in samples}
 
 
 def _solve(features: Tensor, target: Tensor) -> Tensor:

@@ -59,8 +59,8 @@ class _Layer(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
         x, weight = ctx.saved_tensors
-        through = gradient @ weight if ctx.needs_input_grad[0] else None
-        return through, gradient.T @ x, (gradient.new_ones(1, len(gradient)) @ gradient)[0]
+        input_gradient = gradient @ weight if ctx.needs_input_grad[0] else None
+        return input_gradient, gradient.T @ x, (gradient.new_ones(1, len(gradient)) @ gradient)[0]
 
 
 class Network(MLPModel):

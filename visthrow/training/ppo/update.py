@@ -85,11 +85,11 @@ class CapturedPPO(PPO):
         works beside the simulation.
         """
         storage = self.storage
-        seen = storage.observations[storage.step]
+        observation = storage.observations[storage.step]
         for group, values in obs.items():  # one by one: copied at once they took four times as long
-            seen[group].copy_(values)
+            observation[group].copy_(values)
         with self._beside():
-            storage.values[storage.step].copy_(self.critic(seen).detach())
+            storage.values[storage.step].copy_(self.critic(observation).detach())
         actions = self.actor(obs, stochastic_output=True).detach()
         storage.actions[storage.step].copy_(actions)
         storage.distribution_params[0][storage.step].copy_(self.actor.output_mean)
@@ -146,12 +146,12 @@ class CapturedPPO(PPO):
 
     def _launch(self, kernel: wp.Kernel, count: int, *arguments: Tensor | float | int) -> None:
         """Launch a kernel on torch's stream."""
-        given = [
+        inputs = [
             wp.from_torch(a.detach(), requires_grad=False) if isinstance(a, Tensor) else a
             for a in arguments
         ]
         with on_torch_stream(self.device):
-            wp.launch(kernel, count, given, device=self.device)
+            wp.launch(kernel, count, inputs, device=self.device)
 
     def update(self) -> dict[str, float]:
         """All epochs over the stored samples; returns mean losses.

@@ -98,7 +98,7 @@ def calibrate(args: argparse.Namespace) -> int:
         board = board_of(args.board)
         paths, images = pictures_of(args.source)
         lens, report = calibrate_from_boards(images, board, args.fov_deg or 180.0)
-        said = (
+        notes = (
             f"calibrated on {len(images)} pictures of a {board.pattern}, reprojection error"
             f" {report.rms_px:.3f} px rms"
         )
@@ -110,23 +110,23 @@ def calibrate(args: argparse.Namespace) -> int:
                 " --board)"
             )
         name, lens, fit = read(first, args.camera, args.fov_deg, args.model)
-        said = f"from {first.name} ({name})"
+        notes = f"from {first.name} ({name})"
         if fit.points:
-            said += (
+            notes += (
                 f", its {fit.model} model fitted to {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at"
                 f" most over the image, {HOLDS_PX:g} px out to {fit.holds_deg / 2.0:.1f} deg off"
                 " the axis"
             )
         else:
-            said += ", the same model: nothing was fitted"
-        said = "; ".join([said, *fit.remarks])
+            notes += ", the same model: nothing was fitted"
+        notes = "; ".join([notes, *fit.remarks])
     text = (
-        f"# Camera {said}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
+        f"# Camera {notes}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
     )
     params = dataclasses.replace(like, fisheye=lens)
     atomic_write(out, (text + config.dumps(params)).encode())
     print(
-        f"{said}\n{sentence(lens)}\n{out}  train with it: visthrow train vision --set camera={out}"
+        f"{notes}\n{sentence(lens)}\n{out}  train with it: visthrow train vision --set camera={out}"
     )
     return 0
 
@@ -136,13 +136,13 @@ def check(args: argparse.Namespace) -> int:
     camera = config.load(CameraParams, config.find("camera", args.config))
     board = board_of(args.board)
     paths, images = pictures_of(args.pictures)
-    given = check_boards(images, board, camera.fisheye)
+    residuals = check_boards(images, board, camera.fisheye)
     _, best = calibrate_from_boards(images, board, camera.fisheye.fov_deg)
-    print("\n".join(_by_picture(paths, given)))
-    fits, why = verdict(camera, given, best)
+    print("\n".join(_by_picture(paths, residuals)))
+    fits, why = verdict(camera, residuals, best)
     print(
-        f"reprojection error {given.rms_px:.3f} px rms; of the lens that fits these pictures best"
-        f" {best.rms_px:.3f} px\n{why}"
+        f"reprojection error {residuals.rms_px:.3f} px rms; of the lens that fits these pictures"
+        f" best {best.rms_px:.3f} px\n{why}"
     )
     return 0 if fits else 1
 
@@ -162,9 +162,9 @@ def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tupl
 
     lens = camera.fisheye
     views = int(np.isfinite(given.image_rms_px).sum())
-    left = max(2 * given.points - 8 - 6 * views, 1)
+    freedom = max(2 * given.points - 8 - 6 * views, 1)
     excess = math.sqrt(max(given.rms_px**2 - best.rms_px**2, 0.0))
-    noise = best.rms_px * math.sqrt(8.0 * float(f.isf(SIGNIFICANT, 8, left)) / left)
+    noise = best.rms_px * math.sqrt(8.0 * float(f.isf(SIGNIFICANT, 8, freedom)) / freedom)
     learnt = camera.noise.bias_std * math.sqrt(lens.fx * lens.fy) * Fisheye(lens).edge_radius
     limit = max(noise, learnt)
     reason = (
@@ -218,20 +218,21 @@ def show(args: argparse.Namespace) -> int:
         else _rendered(params, pos_w, rot_wb, ball_w, goal_w)
     )
     points, valid = keypoints(camera, pos_w[None], rot_wb[None], goal_w[None], ball_w[None])
-    drawn = draw_overlay(camera, points[0], valid[0], image)
+    image_out = draw_overlay(camera, points[0], valid[0], image)
     if args.board:
-        _draw_board(drawn, image, lens, args)
-    pictures = {out: drawn}
+        _draw_board(image_out, image, lens, args)
+    pictures = {out: image_out}
     if args.straight:
         pictures[out.with_name(f"{out.stem}_straight{out.suffix}")] = _straight(
-            drawn, lens, args.straight
+            image_out, lens, args.straight
         )
     for path, picture in pictures.items():
         atomic_write(path, cv2.imencode(path.suffix, picture)[1].tobytes())
-    seen = valid[0].tolist()
+    visible = valid[0].tolist()
     print(sentence(params.fisheye))
     print(
-        f"in view: {sum(seen[:4])} of 4 keypoints of the goal, {sum(seen[4:])} of 4 of the payload"
+        f"in view: {sum(visible[:4])} of 4 keypoints of the goal, {sum(visible[4:])} of 4 of the"
+        " payload"
     )
     print("\n".join(map(str, pictures)))
     return 0
