@@ -51,12 +51,14 @@ def require_fake(params: HilParams) -> None:
         else []
     )
     loopback = lambda text: check_device(text, remote=True).host.startswith(("127.", "::1"))  # noqa: E731
-    far = [text for text in devices if text.startswith(("serial:", *CFLIB)) or not loopback(text)]
+    remote = [
+        text for text in devices if text.startswith(("serial:", *CFLIB)) or not loopback(text)
+    ]
     if params.source.kind == "mocap":
-        far.append(f"source.kind {params.source.kind}")
-    if far:
+        remote.append(f"source.kind {params.source.kind}")
+    if remote:
         raise RunError(
-            f"--auto-arm with {', '.join(far)}; it is for `visthrow hil fake` on this machine"
+            f"--auto-arm with {', '.join(remote)}; it is for `visthrow hil fake` on this machine"
             " alone: type 'arm' instead"
         )
 

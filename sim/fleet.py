@@ -91,8 +91,8 @@ def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
     known plant.
     """
     low, high = np.log(list(fleet.ranges.values())).T
-    drawn = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
-    x = dict(zip(fleet.ranges, drawn.tolist()))
+    factors = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
+    x = dict(zip(fleet.ranges, factors.tolist()))
     ratio = known.vehicle.body.mass / x["mass"]
     alike = Units(
         ratio ** (1 / 3), ratio
@@ -101,9 +101,9 @@ def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
     vehicle = _vehicle(usual, x)
     if fleet.yaw_loop is not None:
         vehicle = _calm(vehicle, fleet.yaw_loop * yaw_rate(usual) / yaw_rate(vehicle))
-    own = vehicle.body.mass + rope.rope_mass * x["rope"] * x["rope_mass"]
-    most = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - own
-    x["payload"] = min(x["payload"], most / rope.payload_mass)
+    bare_mass = vehicle.body.mass + rope.rope_mass * x["rope"] * x["rope_mass"]
+    margin = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - bare_mass
+    x["payload"] = min(x["payload"], margin / rope.payload_mass)
     return replace(
         known, vehicle=vehicle, rope=_rope(rope, x), release=replace(known.release, lag=x["lag"])
     )

@@ -341,7 +341,7 @@ class HybridSim:
             battery_used: fraction of charge used.
         """
         zero, rows = np.zeros(3), np.zeros((self.params.rope.segments, 3))
-        given = {
+        values = {
             "pos_w": (pos_w, zero),
             "quat_wb": (quat_wb, st.LEVEL),
             "vel_w": (vel_w, zero),
@@ -349,7 +349,7 @@ class HybridSim:
             "cable_dir_w": (cable_dir_w, rows - [0.0, 0.0, 1.0]),
             "cable_vel_w": (cable_vel_w, rows),
         }
-        st.put(self.types, self.state, given, self.count)
+        st.put(self.types, self.state, values, self.count)
         self.state.mass_scale.fill_(1.0)
         self._used.fill_(battery_used)
         inputs = [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used]
@@ -398,11 +398,11 @@ class HybridSim:
 
         Raises ValueError: another shape.
         """
-        asked = np.zeros(self.count) if release is None else np.asarray(release)
-        if asked.shape != (self.count,):
-            raise ValueError(f"release of shape {asked.shape}; expected {(self.count,)}")
+        release_input = np.zeros(self.count) if release is None else np.asarray(release)
+        if release_input.shape != (self.count,):
+            raise ValueError(f"release of shape {release_input.shape}; expected {(self.count,)}")
         st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
-        self.release.assign(asked.astype(np.int32))
+        self.release.assign(release_input.astype(np.int32))
 
     def get(self, name: str) -> np.ndarray:
         """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L,

@@ -26,11 +26,11 @@ def require(
         (not_negative, "0 or more", 0.0),
         (finite, "a finite value", -sys.float_info.max),
     )
-    for names, expected, least in kinds:
+    for names, expected, lowest in kinds:
         for name in names.split():
             value = getattr(of, name)
             for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not least <= number < math.inf:  # true for NaN
+                if number is not None and not lowest <= number < math.inf:  # true for NaN
                     raise ValueError(f"{owner}.{name} is {number}; expected {expected}")
 
 

@@ -116,21 +116,22 @@ def in_units(
             f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients"
             " have no dimension"
         )
-    own = dimensions.get(type(value).__name__, {})
-    known = {name: dimension for dimension, names in own.items() for name in names.split()}
+    kinds = dimensions.get(type(value).__name__, {})
+    dimension_of = {name: dimension for dimension, names in kinds.items() for name in names.split()}
 
     def stated(name: str, item: Any) -> Any:
         if dataclasses.is_dataclass(item) and not isinstance(item, type):
             return in_units(item, units, dimensions)
         if item == ():
             return item
-        if name not in known:
+        if name not in dimension_of:
             raise ValueError(
-                f"{type(value).__name__}.{name}: no dimension told; there are {sorted(known)}"
+                f"{type(value).__name__}.{name}: no dimension told; there are"
+                f" {sorted(dimension_of)}"
             )
-        if known[name] == NONE:
+        if dimension_of[name] == NONE:
             return item
-        size = units.size(known[name])
+        size = units.size(dimension_of[name])
         return tuple(x / size for x in item) if isinstance(item, tuple) else item / size
 
     fields = {f.name: stated(f.name, getattr(value, f.name)) for f in dataclasses.fields(value)}  # type: ignore[arg-type]

@@ -126,8 +126,8 @@ class SettingEffect(Effect):
         """Return the effect with the lower bound that this setting's own numbers set."""
         if not self.lowest:
             return self
-        most = min(x.share * _read(setting, x.path) / x.factor - x.least for x in self.lowest)
-        return dataclasses.replace(self, bounds=(max(self.bounds[0], -most), self.bounds[1]))
+        limit = min(x.share * _read(setting, x.path) / x.factor - x.least for x in self.lowest)
+        return dataclasses.replace(self, bounds=(max(self.bounds[0], -limit), self.bounds[1]))
 
 
 @dataclass(frozen=True)

@@ -45,17 +45,17 @@ def numbers(settings: Mapping[str, str], name: str, default: str = "0") -> list[
 
 def left_out(settings: Mapping[str, str]) -> list[str]:
     """List the firmware's features under these settings that the block lacks."""
-    told = []
+    features = []
     for name, does in NOT_SAID.items():
         values = numbers(settings, name)
         plain = numbers(settings, "rollPID")[2:] + numbers(settings, "pitchPID")[2:]
-        more = (
+        filters = (
             values[:2] != plain
             if name == "d_max" and any(values)
             else name != "d_max" and values[0] > 0.0
         )
-        told += [f"{name} {settings[name]}: {does}"] if more else []
-    return told
+        features += [f"{name} {settings[name]}: {does}"] if filters else []
+    return features
 
 
 def calibrated_voltage(

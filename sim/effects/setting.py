@@ -42,10 +42,10 @@ def generalised(setting: Setting) -> Setting:
     equal lags."""
     vehicle = setting.plant.vehicle
     if vehicle.aero.kind == "none":
-        still = dataclasses.replace(
+        frozen = dataclasses.replace(
             vehicle.aero, kind="rotor_drag", **dict.fromkeys(AERODYNAMICS, 0.0)
         )
-        vehicle = dataclasses.replace(vehicle, aero=still)
+        vehicle = dataclasses.replace(vehicle, aero=frozen)
     if vehicle.motor.kind == "first_order":
         even = dataclasses.replace(
             vehicle.motor, kind="asymmetric", time_constant_down=vehicle.motor.time_constant

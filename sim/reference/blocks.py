@@ -91,7 +91,7 @@ def mixer(
 
     Convention: yaw takes the largest part of what is asked for that keeps the spread of the four
     within the limits."""
-    tilting, spin, clockwise, other = _layout(rotors)
+    tilting, spin, clockwise, layout_order = _layout(rotors)
     tilt = torque[:, :2] @ tilting
     room = f_max - f_min
     extent = tilt.max(axis=1) - tilt.min(axis=1)
@@ -99,19 +99,19 @@ def mixer(
     tilt = tilt * scale[:, None]
     # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between
     # the two kinds only.
-    rising, falling = tilt.take(clockwise, 1), tilt.take(other, 1)
-    most = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
-    least = -(room - (falling.max(axis=1) - rising.min(axis=1))) / 2.0
+    rising, falling = tilt.take(clockwise, 1), tilt.take(layout_order, 1)
+    highest = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
+    lowest = -(room - (falling.max(axis=1) - rising.min(axis=1))) / 2.0
     amount = torque[:, 2] / (4.0 * torque_ratio)
-    clipped = np.minimum(np.maximum(amount, np.minimum(least, 0.0)), np.maximum(most, 0.0))
+    clipped = np.minimum(np.maximum(amount, np.minimum(lowest, 0.0)), np.maximum(highest, 0.0))
     clipped_yaw = spin * clipped[:, None]
-    wanted = thrust[:, None] / 4.0 + tilt + clipped_yaw
-    raise_by = np.maximum(f_min - wanted.min(axis=1), 0.0)
-    lower_by = np.maximum(wanted.max(axis=1) - f_max, 0.0)
+    demand = thrust[:, None] / 4.0 + tilt + clipped_yaw
+    raise_by = np.maximum(f_min - demand.min(axis=1), 0.0)
+    lower_by = np.maximum(demand.max(axis=1) - f_max, 0.0)
     yaw_share = np.where(
         clipped == amount, 1.0, np.abs(clipped) / np.maximum(np.abs(amount), 1e-300)
     )
-    return wanted + (raise_by - lower_by)[:, None], scale, yaw_share
+    return demand + (raise_by - lower_by)[:, None], scale, yaw_share
 
 
 def betaflight(
@@ -179,13 +179,13 @@ def motor_mixing(
     """
     gains: ControllerParams = vehicle.controller
     low, gyro, integral = np.split(filters, 3, axis=1)
-    asked = command[:, 1:]
-    low_dot = (asked - low) / gains.setpoint_time_constant
+    rate_command = command[:, 1:]
+    low_dot = (rate_command - low) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
-    error = asked - rate - np.array(gains.gyro_share) * (gyro - rate)
+    error = rate_command - rate - np.array(gains.gyro_share) * (gyro - rate)
     torque = np.array(gains.p_gain) * error + integral
     torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * low_dot
-    relaxed = np.clip(1.0 - np.abs(asked - low) / gains.relax_threshold, 0.0, None)
+    relaxed = np.clip(1.0 - np.abs(rate_command - low) / gains.relax_threshold, 0.0, None)
     relaxed[:, 2] = 1.0
     integral_dot = np.array(gains.i_gain) * error * relaxed
     windup = (np.abs(integral) >= np.array(gains.integral_limit)) & (integral_dot * integral > 0.0)
@@ -397,10 +397,10 @@ def payload_force(
         lift_w: force of the rotors on the vehicle [N], shape (E, 3).
         hanging: shape (E,), bool.
     """
-    through = velocity_w - wind_w
-    total = -drag * length(through) * through
-    across = velocity_w - np.sum(velocity_w * along_w, axis=1, keepdims=True) * along_w
-    return total - hanging[:, None] * (rope.swing_damping * across + rope.downwash * lift_w)
+    airspeed = velocity_w - wind_w
+    total = -drag * length(airspeed) * airspeed
+    normal = velocity_w - np.sum(velocity_w * along_w, axis=1, keepdims=True) * along_w
+    return total - hanging[:, None] * (rope.swing_damping * normal + rope.downwash * lift_w)
 
 
 def release_lag(params: ReleaseParams, pull: np.ndarray, payload_mass: np.ndarray) -> np.ndarray:

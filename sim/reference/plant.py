@@ -466,7 +466,7 @@ class ReferencePlant:
         """Keep the state for the motion capture; environments reach the same instant in different
         columns.
         """
-        now = self.state
+        state = self.state
         if self._samples[-1][0] == time:
             older = self._samples.pop()[1]
             keep = {}
@@ -479,10 +479,10 @@ class ReferencePlant:
                 "payload_vel_w",
                 "cable_points_w",
             ):
-                new, old = getattr(now, name), getattr(older, name)
+                new, old = getattr(state, name), getattr(older, name)
                 keep[name] = np.where(reached.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-            now = replace(older, **keep)
-        self._samples.append((time, replace(now, time=time)))
+            state = replace(older, **keep)
+        self._samples.append((time, replace(state, time=time)))
 
     def _prune(self, now: float) -> None:
         while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= now):

@@ -254,11 +254,11 @@ class RopeDynamics:
         as of :meth:`points`.
         """
         n, n_dot, elongation, elongation_dot = rope
-        along = (
+        direction_rate = (
             self.length[:, None] * n_dot.sum(axis=1)
             + (self.offset + elongation)[:, None] * n_dot[:, -1]
         )
-        return root_vel + along + elongation_dot[:, None] * n[:, -1]
+        return root_vel + direction_rate + elongation_dot[:, None] * n[:, -1]
 
 
 def _from_above(rates: np.ndarray, above: np.ndarray) -> np.ndarray:

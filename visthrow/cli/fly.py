@@ -170,11 +170,11 @@ def summary_text(log) -> str:
         f"hover   {start:.2f} s until the swing was quiet",
     ]
     if "separation" in times:
-        at = log["separation"].values[0]
+        separation_time = log["separation"].values[0]
         lines.append(
             f"throw   release asked for {times['latch'] - start:.2f} s and done"
-            f" {times['separation'] - start:.2f} s after the start, payload at x {at[0]:.2f} m, z"
-            f" {at[2]:.2f} m"
+            f" {times['separation'] - start:.2f} s after the start, payload at x"
+            f" {separation_time[0]:.2f} m, z {separation_time[2]:.2f} m"
         )
     if "landing" in log:
         x, y, _ = log["landing"].values[0]

@@ -187,8 +187,8 @@ def throw(args: argparse.Namespace) -> int:
         min(args.throws, args.jobs) < 1
         or loaded.policy.contract["observation"]["layout"] != "vision"
     ):
-        given = f"--throws {args.throws}, --jobs {args.jobs} with policy '{loaded.name}'"
-        raise VisthrowError(f"{given}; expected 1 or more of each, and a vision policy")
+        options = f"--throws {args.throws}, --jobs {args.jobs} with policy '{loaded.name}'"
+        raise VisthrowError(f"{options}; expected 1 or more of each, and a vision policy")
     looks = {
         "device": resolve(args.device),
         "by": args.by,
@@ -203,17 +203,17 @@ def throw(args: argparse.Namespace) -> int:
         )
     ]
     columns = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
-    found = {name: sum(part[1][name] for part in parts) for name in parts[0][1]}
-    share = {name: found[name] / max(found["frames"], 1) for name in ("ball", "goal")}
-    figures = Throws(args.target, **columns).summary() | share | {"refused": found["refused"]}
+    counts = {name: sum(part[1][name] for part in parts) for name in parts[0][1]}
+    share = {name: counts[name] / max(counts["frames"], 1) for name in ("ball", "goal")}
+    figures = Throws(args.target, **columns).summary() | share | {"refused": counts["refused"]}
     error = columns["error"][np.isfinite(columns["error"])]
     width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error)) if len(error) > 1 else math.nan
     print(
         f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of"
-        f" {args.throws} landed, {found['refused']} refused, error"
+        f" {args.throws} landed, {counts['refused']} refused, error"
         f" {error.mean() if len(error) else math.nan:.3f} +- {width:.3f} m (95 %), ball found in"
         f" {100 * figures['ball']:.1f} %, goal in {100 * figures['goal']:.1f} % of"
-        f" {found['frames']} frames"
+        f" {counts['frames']} frames"
     )
     if args.json is not None:
         from visthrow.common.storage import write_json
@@ -259,12 +259,12 @@ def train(args: argparse.Namespace) -> int:
     folder = Path(args.out)
     saved = folder / CHECKPOINT
     if saved.exists() != args.resume:
-        there = (
+        present = (
             "holds a training; go on with --resume, or name another folder"
             if saved.exists()
             else "no checkpoint to resume from"
         )
-        raise VisthrowError(f"{folder}: {there}")
+        raise VisthrowError(f"{folder}: {present}")
     files = None if args.textures is None else photographs(args.textures)
     fit = Fit(
         params,
@@ -368,7 +368,7 @@ def mistaken(detectors: dict) -> dict[str, Any]:
 
     from visthrow.detector_training.scenes.textures import HELD_OUT, TRAINING, photographs
 
-    found: dict[str, Any] = {"looks": 0} | {name: {"ball": 0, "goal": 0} for name in detectors}
+    counts: dict[str, Any] = {"looks": 0} | {name: {"ball": 0, "goal": 0} for name in detectors}
     for path in photographs(names=TRAINING + HELD_OUT):
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
         height, width = picture.shape[0] * 2 // 3, picture.shape[1] * 2 // 3
@@ -382,12 +382,12 @@ def mistaken(detectors: dict) -> dict[str, Any]:
                 (640, 640),
                 interpolation=cv2.INTER_AREA,
             )
-            found["looks"] += 1
+            counts["looks"] += 1
             for name, detector in detectors.items():
-                seen = detector.detect(np.ascontiguousarray(cut))
+                detection = detector.detect(np.ascontiguousarray(cut))
                 for kind in ("ball", "goal"):
-                    found[name][kind] += getattr(seen, kind) is not None
-    return found
+                    counts[name][kind] += getattr(detection, kind) is not None
+    return counts
 
 
 def figures_of(
@@ -401,24 +401,24 @@ def figures_of(
             mean error of its points [px], and the probability that was reported.
         spent: times of the frames [s].
     """
-    found: dict[str, float] = {}
+    figures: dict[str, float] = {}
     hits = np.array([there and reported and off < HIT for _, there, reported, off, _ in rows])
     _, was_there, reports, errors, probabilities = map(np.array, zip(*rows))
     for kind in ("ball", "goal"):
-        own = np.array([row[0] == kind for row in rows])
-        off = errors[own & hits] if np.any(own & hits) else np.array([math.nan])
-        there, reported, hit = (int(np.sum(own & of)) for of in (was_there, reports, hits))
-        found |= {
+        of_kind = np.array([row[0] == kind for row in rows])
+        off = errors[of_kind & hits] if np.any(of_kind & hits) else np.array([math.nan])
+        there, reported, hit = (int(np.sum(of_kind & of)) for of in (was_there, reports, hits))
+        figures |= {
             f"{kind}_there": there,
             f"{kind}_recall": hit / max(there, 1),
             f"{kind}_precision": hit / max(reported, 1),
             f"{kind}_median_px": float(np.median(off)),
             f"{kind}_p95_px": float(np.percentile(off, 95)),
         }
-    over = (
+    ratio = (
         float(probabilities[reports].mean() - hits[reports].mean()) if np.any(reports) else math.nan
     )
-    return found | {"seconds": float(np.median(spent)), "overconfidence": over}
+    return figures | {"seconds": float(np.median(spent)), "overconfidence": ratio}
 
 
 def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator):
@@ -479,17 +479,17 @@ def counted(
             )
             for name, detector in detectors.items():
                 begin = time.perf_counter()
-                seen = detector.detect(image, knows)
+                detection = detector.detect(image, knows)
                 spent[name].append(time.perf_counter() - begin)
                 points, valid = detected_keypoints(
-                    eyes, seen, rot_wc @ nominal_rot_cb(camera.mount).numpy()
+                    eyes, detection, rot_wc @ nominal_rot_cb(camera.mount).numpy()
                 )
                 off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)
                 for kind, part in (
                     ("ball", slice(GOAL_KEYPOINTS, None)),
                     ("goal", slice(0, GOAL_KEYPOINTS)),
                 ):
-                    thing, there = getattr(seen, kind), bool(getattr(truth, f"{kind}_seen")[e])
+                    thing, there = getattr(detection, kind), bool(getattr(truth, f"{kind}_seen")[e])
                     rows[name].append(
                         (
                             kind,

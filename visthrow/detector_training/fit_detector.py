@@ -186,19 +186,22 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
         torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy"), -1
     ).to(grids)
     for k, kind in enumerate(KINDS):
-        pixels, inside = lens.project(labels.rays[kind])
-        at = (pixels + 0.5) / CELL
-        cell = at.floor().long()
-        inside = inside & (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
-        cell = torch.where(inside[:, None], cell, 0)
-        seen = labels.seen[kind] & inside
-        away = (cells + 0.5 - at[:, None, None]).square().sum(-1)
-        here = (cells.long() == cell[:, None, None]).all(-1)
-        soft = torch.where(here, 1.0, torch.exp(-away / (2 * 0.7**2))) * seen[:, None, None]
+        pixels, visible = lens.project(labels.rays[kind])
+        position = (pixels + 0.5) / CELL
+        cell = position.floor().long()
+        visible = visible & (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+        cell = torch.where(visible[:, None], cell, 0)
+        present = labels.seen[kind] & visible
+        distance = (cells + 0.5 - position[:, None, None]).square().sum(-1)
+        same_cell = (cells.long() == cell[:, None, None]).all(-1)
+        soft = (
+            torch.where(same_cell, 1.0, torch.exp(-distance / (2 * 0.7**2)))
+            * present[:, None, None]
+        )
         logits = grids[:, k, 0]
         probability = logits.sigmoid().clamp(1e-5, 1 - 1e-5)
-        cut = inside & ~seen  # half in view: neither a place nor none
-        counts = 1.0 - (cut[:, None, None] & (away < 9.0)).float()
+        cut = visible & ~present  # half in view: neither a place nor none
+        counts = 1.0 - (cut[:, None, None] & (distance < 9.0)).float()
         negative = -((1 - soft) ** 4 * probability**2 * (1 - probability).log() * counts).sum(
             (1, 2)
         )
@@ -206,10 +209,10 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
         peak = grids[rows, k, :, cell[:, 1], cell[:, 0]]
         p = peak[:, 0].sigmoid().clamp(1e-5, 1 - 1e-5)
         positive = -((1 - p) ** 2 * p.log())
-        off = (peak[:, 1:3] - (at - cell - 0.5)).abs().sum(-1) + 0.5 * (
+        off = (peak[:, 1:3] - (position - cell - 0.5)).abs().sum(-1) + 0.5 * (
             peak[:, 3] - log_size(labels.sizes[kind], lens)
         ).abs()
-        total = total + (negative + seen * (positive + off)).mean()
+        total = total + (negative + present * (positive + off)).mean()
     return total
 
 
@@ -235,13 +238,13 @@ def looks(
     ray = labels.rays[kind][index]
     ray = F.normalize(ray + 0.45 * size[:, None] * draw(count, 3), dim=-1)
     source = torch.randint(8, (count,), generator=generator, device=device)
-    other = "goal" if kind == "ball" else "ball"
+    other_kind = "goal" if kind == "ball" else "ball"
     anywhere = F.normalize(draw(count, 3), dim=-1)
     anywhere[:, 2] = anywhere[:, 2].abs()
     for number, rays in (
         (4, labels.distractor[index]),
         (5, anywhere),
-        (6, labels.rays[other][index]),
+        (6, labels.rays[other_kind][index]),
     ):
         ray = torch.where((source == number)[:, None], rays, ray)
     if peaks is not None:
@@ -269,26 +272,26 @@ def look_loss(
     )
     views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH[kind], 1.0), north)
     patches = patches_of(frames, index, views, lens, PATCH[kind])
-    found = getattr(networks, kind)(augment(patches))
+    outputs = getattr(networks, kind)(augment(patches))
     true = labels.rays[kind][index]
-    inside = views.points(true[:, None])[:, 0]
-    apart = inside.norm(dim=-1)
-    ahead = (views.axes[:, 2] * true).sum(-1) > 0.2
+    point = views.points(true[:, None])[:, 0]
+    radius = point.norm(dim=-1)
+    in_front = (views.axes[:, 2] * true).sum(-1) > 0.2
     ratio = (labels.sizes[kind][index] / size).log().abs()
-    there = labels.seen[kind][index] & ahead & (apart < 0.75) & (ratio < 0.8)
-    gone = ~ahead | (apart > 1.2)
-    judged = there | gone
-    known = F.binary_cross_entropy_with_logits(found[:, 0], there.float(), reduction="none")
-    known = (known * judged).sum() / judged.sum().clamp(min=1)
-    off = offsets(kind, views, found, labels, index)
+    present = labels.seen[kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
+    absent = ~in_front | (radius > 1.2)
+    judged = present | absent
+    loss = F.binary_cross_entropy_with_logits(outputs[:, 0], present.float(), reduction="none")
+    loss = (loss * judged).sum() / judged.sum().clamp(min=1)
+    off = offsets(kind, views, outputs, labels, index)
     where = off.abs().mean(1)
     error = (
         off[:, :2].norm(dim=-1) if kind == "ball" else off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
     )
-    spread = found[:, 1].clamp(-8.0, 3.0)
+    spread = outputs[:, 1].clamp(-8.0, 3.0)
     accuracy = (error.detach() / spread.exp()).clamp(max=50.0) + spread  # of a Laplace distribution
-    there = there.float()
-    return known + ((8.0 * where + 0.2 * accuracy) * there).sum() / there.sum().clamp(min=1)
+    present = present.float()
+    return loss + ((8.0 * where + 0.2 * accuracy) * present).sum() / present.sum().clamp(min=1)
 
 
 def offsets(kind: str, views: Views, found: Tensor, labels: Labels, index: Tensor) -> Tensor:
@@ -441,7 +444,7 @@ class Fit:
         not trained on; returns figures.
         """
         self.networks.eval()
-        made = {kind: [] for kind in KINDS}
+        samples = {kind: [] for kind in KINDS}
         done = 0
         while done < self.params.calibration:
             count = min(16, self.params.calibration - done)
@@ -450,11 +453,11 @@ class Fit:
                 for kind, rows in findings(
                     self.networks, frames[e : e + 1], _chosen(labels, torch.tensor([e])), lens
                 ).items():
-                    made[kind].append(rows)
+                    samples[kind].append(rows)
             done += count
         figures = {}
         for kind in KINDS:
-            rows = torch.cat(made[kind]).cpu().double()
+            rows = torch.cat(samples[kind]).cpu().double()
             factor, offset = platt(rows[:, 0], rows[:, 1])
             hits = rows[rows[:, 1] > 0.5]
             scale = float((hits[:, 2] / hits[:, 3]).median() / math.log(2.0)) if len(hits) else 1.0
@@ -473,7 +476,7 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
     """Score the places of one frame: logit, whether it is of the thing, error [rad], told
     accuracy [rad]; a row each.
     """
-    places, found = places_of(networks.search(halved(frame)), lens), {}
+    places, scores = places_of(networks.search(halved(frame)), lens), {}
     for kind in KINDS:
         rays, sizes = places[kind]
         views, out, rays, sizes = looked(networks, kind, frame, rays, sizes, lens, labels.north)
@@ -491,8 +494,8 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
             _apart(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
         )  # else half in view
         rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
-        found[kind] = rows[clear.expand(len(rows))]
-    return found
+        scores[kind] = rows[clear.expand(len(rows))]
+    return scores
 
 
 def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:

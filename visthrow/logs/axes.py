@@ -42,13 +42,13 @@ def turn_of(axes: str) -> np.ndarray:
     matrix = matrix_of(axes)
     if is_mirror(axes):
         signs = [np.where(np.arange(3) == row, -1.0, 1.0)[:, None] * matrix for row in range(3)]
-        near = " ".join(
+        hint = " ".join(
             next(name for name, known in zip(EVERY, MATRICES) if np.array_equal(known, one))
             for one in signs
         )
         raise ValueError(
             f"axes '{axes}' mirror the world: no rotation turns them into ours; expected one sign"
-            f" less or more: {near}"
+            f" less or more: {hint}"
         )
     return matrix
 

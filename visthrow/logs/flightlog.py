@@ -145,11 +145,13 @@ class Channel:
         Returns:
             Values, shape (N, ...).
         """
-        known = np.flatnonzero(np.asarray(self.valid))
-        if not len(known):
+        valid_rows = np.flatnonzero(np.asarray(self.valid))
+        if not len(valid_rows):
             raise LogError("no sample of the channel is valid")
-        at = np.searchsorted(self.time[known], np.asarray(time, dtype=float), side="right") - 1
-        return self.values[known[np.maximum(at, 0)]]
+        rows = (
+            np.searchsorted(self.time[valid_rows], np.asarray(time, dtype=float), side="right") - 1
+        )
+        return self.values[valid_rows[np.maximum(rows, 0)]]
 
 
 @dataclass(frozen=True)
@@ -167,10 +169,11 @@ class FlightLog:
             spec = STANDARD_CHANNELS.get(name)
             if spec is None:
                 continue
-            came, wanted = (channel.unit, channel.frame), (spec.unit, spec.frame)
-            if came != wanted:
+            actual, expected = (channel.unit, channel.frame), (spec.unit, spec.frame)
+            if actual != expected:
                 raise LogError(
-                    f"channel '{name}' is in unit and frame {came}; its name stands for {wanted}"
+                    f"channel '{name}' is in unit and frame {actual}; its name stands for"
+                    f" {expected}"
                 )
             shape = channel.values.shape[1:]
             fits = len(shape) == len(spec.shape) and all(
@@ -259,9 +262,9 @@ class FlightLog:
         except LogError as error:
             raise LogError(f"{path}: {error}") from error
         except (KeyError, TypeError, ValueError) as error:
-            came = f"no entry {error}" if isinstance(error, KeyError) else str(error)
+            reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)
             raise LogError(
-                f"{path}: incomplete: {came}; expected a flight log, it holds"
+                f"{path}: incomplete: {reason}; expected a flight log, it holds"
                 f" {', '.join(sorted(arrays))}"
             ) from error
 

@@ -37,26 +37,26 @@ def join(logs: Sequence[FlightLog]) -> FlightLog:
 
     Raises LogError: nothing was measured in both, or it does not go together.
     """
-    whole, *others = logs
+    whole, *other_logs = logs
     channels, meta, estimated = (
         dict(whole.channels),
         dict(whole.meta),
         set(whole.meta.get("estimated", ())),
     )
     meta["joined"] = []
-    for log in others:
-        offset, correlation, by = offset_of(FlightLog(channels, {"estimated": estimated}), log)
-        own = set(log.meta.get("estimated", ()))
+    for log in other_logs:
+        offset, correlation, signal = offset_of(FlightLog(channels, {"estimated": estimated}), log)
+        estimated_names = set(log.meta.get("estimated", ()))
         new = {
             name
             for name in log.channels
-            if name not in channels or (name in estimated and name not in own)
+            if name not in channels or (name in estimated and name not in estimated_names)
         }
         channels |= {name: replace(log[name], time=log[name].time + offset) for name in new}
-        estimated = estimated - new | own & new
+        estimated = estimated - new | estimated_names & new
         source = str(log.meta.get("source", ""))
         meta["joined"].append(
-            {"source": source, "offset_s": offset, "correlation": correlation, "by": by}
+            {"source": source, "offset_s": offset, "correlation": correlation, "by": signal}
         )
         notes = log.meta.get("ingest", {})
         meta["ingest"] = {
@@ -97,12 +97,12 @@ def _turning(log: FlightLog) -> Signal | None:
     if "rate_b" not in log:
         return relations.rates_of(*log["quat_wb"].samples(), _SPAN) if "quat_wb" in log else None
     time, rate = log["rate_b"].samples()
-    inside = (
+    overlap = (
         time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
         if len(time)
         else time
     )
-    return (inside, relations.mean_over(time, rate, inside, _SPAN)) if len(inside) else None
+    return (overlap, relations.mean_over(time, rate, overlap, _SPAN)) if len(overlap) else None
 
 
 def _velocity(log: FlightLog) -> Signal | None:
@@ -140,10 +140,10 @@ def _lag(a: Signal, b: Signal) -> tuple[float, float]:
     coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(correlate(x, y, method="fft"))]) / RATE
     near = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
     scores = np.array([_alignment(*_both(a, b, offset)) for offset in near])
-    at = int(np.argmax(scores))
-    offset = float(near[at] + _STEP * relations.peak(scores, at)[0])
-    both = _both(*sizes, offset)
-    return offset, float(np.corrcoef(np.hstack(both).T)[0, 1]) if len(both[0]) >= RATE else -1.0
+    best = int(np.argmax(scores))
+    offset = float(near[best] + _STEP * relations.peak(scores, best)[0])
+    pairs = _both(*sizes, offset)
+    return offset, float(np.corrcoef(np.hstack(pairs).T)[0, 1]) if len(pairs[0]) >= RATE else -1.0
 
 
 def _both(a: Signal, b: Signal, offset: float) -> tuple[np.ndarray, np.ndarray]:

@@ -68,10 +68,10 @@ class ChannelMap:
         to_si(self.unit, where)
         if not self.columns:
             raise ConfigError(f"{where}: no columns")
-        wanted = _WIDTH[self.kind]
-        if wanted and len(self.columns) not in wanted:
+        width = _WIDTH[self.kind]
+        if width and len(self.columns) not in width:
             raise ConfigError(
-                f"{where}: {self.kind} of {len(self.columns)} columns; expected {wanted[0]}"
+                f"{where}: {self.kind} of {len(self.columns)} columns; expected {width[0]}"
             )
         if self.order not in _ORDERS:
             raise ConfigError(f"{where}: order '{self.order}'; {suggest(self.order, _ORDERS)}")
@@ -116,11 +116,11 @@ class TableMap:
     split: Split | None = None
 
     def __post_init__(self) -> None:
-        seen: set[str] = set()
+        names: set[str] = set()
         for channel in self.channels:
-            if channel.name in seen:
+            if channel.name in names:
                 raise ConfigError(f"channel '{channel.name}' is mapped twice")
-            seen.add(channel.name)
+            names.add(channel.name)
             if channel.clock and channel.clock not in (self.clocks or {}):
-                known = suggest(channel.clock, self.clocks or {})
-                raise ConfigError(f"channel '{channel.name}': no clock '{channel.clock}'; {known}")
+                hint = suggest(channel.clock, self.clocks or {})
+                raise ConfigError(f"channel '{channel.name}': no clock '{channel.clock}'; {hint}")

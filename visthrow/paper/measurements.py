@@ -40,12 +40,12 @@ def origin(record: dict[str, Any]) -> str:
     """Provenance of a record in a few lines of Markdown."""
     if "source" in record:
         return f"From {record['source']}."
-    came = record["provenance"]
-    processors = came["processors"]
+    provenance = record["provenance"]
+    processors = provenance["processors"]
     machine = f"{processors['cpu']}, {processors['cores']} cores"
     if processors.get("gpu"):
         machine += f"; {', '.join(processors['gpu'])}"
-    versions = ", ".join(f"{name} {version}" for name, version in came["versions"].items())
+    versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
     return f"{made_by(record)}\n\n{machine}\n\n{versions}"
 
 
@@ -53,8 +53,8 @@ def made_by(record: dict[str, Any]) -> str:
     """Command, time and commit of a record, and the command that measures it today where that is
     another.
     """
-    came = record["provenance"]
-    text = f"`{came['command']}`, {came['time']}, commit {came['commit'][:12]}"
+    provenance = record["provenance"]
+    text = f"`{provenance['command']}`, {provenance['time']}, commit {provenance['commit'][:12]}"
     return f"{text}; today, from a clone: `{record['today']}`" if record.get("today") else text
 
 

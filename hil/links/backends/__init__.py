@@ -94,11 +94,11 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
             f" weight that the policy was trained with, {mass * GRAVITY:.3f} N; expected it within"
             f" {vehicle.thrust.tolerance:g}: train a policy for this vehicle"
         )
-    most, wanted = vehicle.thrust.most, float(action["max_thrust"])
-    if most < THRUST_SHORT * wanted:
+    available, trained = vehicle.thrust.most, float(action["max_thrust"])
+    if available < THRUST_SHORT * trained:
         raise RunError(
-            f"{params.backend}.thrust gives {most:.2f} N at most, the policy was trained with"
-            f" {wanted:g} N; check weight, hover and slope, or train a policy for this vehicle"
+            f"{params.backend}.thrust gives {available:.2f} N at most, the policy was trained with"
+            f" {trained:g} N; check weight, hover and slope, or train a policy for this vehicle"
         )
     ends = Sticks(vehicle.rates).most if params.backend == "betaflight" else action["max_rate"]
     if any(end < THRUST_SHORT * rate for end, rate in zip(ends, action["max_rate"])):

@@ -133,20 +133,20 @@ class Audit:
             return
         self._begun = now if self._begun is None else self._begun
         waited = now - self._begun
-        told = self.found.keys() | self.refused.keys()
+        answered = self.found.keys() | self.refused.keys()
         missing = [
             r.name
             for r in self.rules.values()
-            if r.name not in told and not (r.optional and waited > GIVE_UP_OPTIONAL)
+            if r.name not in answered and not (r.optional and waited > GIVE_UP_OPTIONAL)
         ]
         if not missing or waited > GIVE_UP:
             self.done = True
-            found = {
+            values = {
                 name: f" is {self.rules[name].text(value)}" for name, value in self.found.items()
             }
-            found |= {name: f": {why}" for name, why in self.refused.items() if name not in found}
+            values |= {name: f": {why}" for name, why in self.refused.items() if name not in values}
             self.problems = [
-                f"{r.name}{found.get(r.name, ' was not told')}; expected {r.expected}"
+                f"{r.name}{values.get(r.name, ' was not told')}; expected {r.expected}"
                 for r in self._wrong()
                 if not r.warns
             ]
@@ -159,11 +159,11 @@ class Audit:
                 self._ask(name)
 
     def _wrong(self) -> list[Rule]:
-        found = self.found
+        values = self.found
         return [
             r
             for r in self.rules.values()
-            if not (r.good(found[r.name]) if r.name in found else r.optional)
+            if not (r.good(values[r.name]) if r.name in values else r.optional)
         ]
 
     def fault(self) -> str | None:
@@ -171,8 +171,10 @@ class Audit:
         if not self.problems:
             return None
         names = [rule.name for rule in self._wrong() if not rule.warns]
-        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        return f"parameter audit: {', '.join(names[:MOST_NAMED])}{more} wrong, see the table"
+        rest_of_names = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        return (
+            f"parameter audit: {', '.join(names[:MOST_NAMED])}{rest_of_names} wrong, see the table"
+        )
 
     def table(self) -> str:
         """Return parameter, found, expected, why, a line each."""

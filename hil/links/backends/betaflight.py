@@ -386,8 +386,8 @@ class Betaflight(OnPort):
         if not self._box(BOX_OVERRIDE):
             self._pilots_us = channels[3]
         self.share = min(max((channels[3] - p.minimum_us) / (HIGH - p.minimum_us), 0.0), 1.0)
-        at = STICKS + p.release_channel - 1
-        if at < len(channels) and abs(channels[at] - HIGH) <= NEAR:
+        index = STICKS + p.release_channel - 1
+        if index < len(channels) and abs(channels[index] - HIGH) <= NEAR:
             self.release_record.answer(True)
 
     def _write_setting(self, name: str, value: float) -> None:
@@ -455,22 +455,22 @@ def blocked(flags: int) -> str:
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     """Return settings that an answer tells; what is cut short tells nothing."""
     mine = {name: setting for name, setting in SETTINGS.items() if setting.command == frame.command}
-    found = {
+    values = {
         name: float(setting.scale * n)
         for name, setting in mine.items()
         if (n := frame.number(setting.code, setting.at)) is not None
     }
-    for name in {"api_version", "fc_version"} & found.keys():
+    for name in {"api_version", "fc_version"} & values.keys():
         minor = frame.number("B", SETTINGS[name].at + 1)
-        found = {} if minor is None else {name: found[name] + 0.01 * minor}
-    if "channel_forwarding" in found:
-        found["channel_forwarding"] = float(bool(int(found["channel_forwarding"]) & FORWARDING))
+        values = {} if minor is None else {name: values[name] + 0.01 * minor}
+    if "channel_forwarding" in values:
+        values["channel_forwarding"] = float(bool(int(values["channel_forwarding"]) & FORWARDING))
     if frame.command == msp.MODE_RANGES:
-        found = {
+        values = {
             "arm_aux": _aux(frame, BOX_ARM, params.arm_channel),
             "override_aux": _aux(frame, BOX_OVERRIDE, 0),
         }
-    return found
+    return values
 
 
 def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
@@ -480,5 +480,7 @@ def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
     size = FACTS["range_bytes"]
     starts = range(0, len(frame.payload) - size + 1, size)
     entries = [frame.payload[start : start + size] for start in starts]
-    found = [channel + 1 for of, channel, first, last in entries if of == box and first < last]
-    return float(preferred if preferred in found else found[0] if found else 0)
+    channels = [
+        channel + 1 for box_id, channel, first, last in entries if box_id == box and first < last
+    ]
+    return float(preferred if preferred in channels else channels[0] if channels else 0)

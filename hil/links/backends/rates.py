@@ -83,12 +83,10 @@ class Sticks:
         """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole
         microseconds allow.
         """
-        table, wanted = self._tables[axis], abs(rate)
-        above = min(bisect_left(table, wanted), TRAVEL)
-        near = (
-            above if above == 0 or table[above] - wanted <= wanted - table[above - 1] else above - 1
-        )
-        return MIDDLE + int(math.copysign(near, self.SIGNS[axis] * rate))
+        table, size = self._tables[axis], abs(rate)
+        above = min(bisect_left(table, size), TRAVEL)
+        index = above if above == 0 or table[above] - size <= size - table[above - 1] else above - 1
+        return MIDDLE + int(math.copysign(index, self.SIGNS[axis] * rate))
 
     def rate(self, axis: int, us: float) -> float:
         """Return the body rate [rad/s] about our axis at a position [us]."""

@@ -119,15 +119,15 @@ def rate_controller_motor_mixing(
     """
     c = p.controller
     zero, one = voltage - voltage, type(voltage)(1.0)
-    asked = type(rate_b)(command[1], command[2], command[3])
-    setpoint_rate = (asked - setpoint) / c.setpoint_time_constant
+    rate_command = type(rate_b)(command[1], command[2], command[3])
+    setpoint_rate = (rate_command - setpoint) / c.setpoint_time_constant
     gyro_rate = (rate_b - gyro) / c.gyro_time_constant
-    error = asked - rate_b - wp.cw_mul(c.gyro_share, gyro - rate_b)
+    error = rate_command - rate_b - wp.cw_mul(c.gyro_share, gyro - rate_b)
     integral_rate = wp.cw_mul(c.i_gain, error)
     for i in range(3):
         if i < 2:
             integral_rate[i] = integral_rate[i] * wp.max(
-                one - wp.abs(asked[i] - setpoint[i]) / c.relax_threshold, zero
+                one - wp.abs(rate_command[i] - setpoint[i]) / c.relax_threshold, zero
             )
         if integral_rate[i] * integral[i] > zero and wp.abs(integral[i]) >= c.integral_limit[i]:
             integral_rate[i] = zero
@@ -170,8 +170,8 @@ def rate_controller_geometric(
     quarter = command[0] / type(voltage)(4.0)
     for i in range(4):
         f[i] = wp.clamp(f[i] + quarter, p.controller.min_thrust, p.controller.max_thrust)
-    still = rate_b - rate_b
-    return speeds_of_thrusts(p, f), still, still, still
+    zero = rate_b - rate_b
+    return speeds_of_thrusts(p, f), zero, zero, zero
 
 
 @wp.func
@@ -181,5 +181,5 @@ def motor_speeds(
     """The controller by-passed: commands are motor-speed set-points [rad/s], shape (4,), from
     outside.
     """
-    still = rate_b - rate_b
-    return command, still, still, still
+    zero = rate_b - rate_b
+    return command, zero, zero, zero

@@ -19,8 +19,12 @@ def hover_speed(p: Any, thrust: Any, voltage: Any):
     one = type(thrust)(1.0)
     two = type(thrust)(2.0)
     t = p.thrust
-    wanted = thrust / (one + t.voltage_coefficient * (voltage - p.battery.reference_voltage))
-    return (wp.sqrt(t.k_1 * t.k_1 + two * two * t.k_f * wanted) - t.k_1) / (two * t.k_f)
+    thrust_at_reference = thrust / (
+        one + t.voltage_coefficient * (voltage - p.battery.reference_voltage)
+    )
+    return (wp.sqrt(t.k_1 * t.k_1 + two * two * t.k_f * thrust_at_reference) - t.k_1) / (
+        two * t.k_f
+    )
 
 
 @wp.func

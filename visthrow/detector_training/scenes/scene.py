@@ -294,7 +294,7 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
         [angle.cos(), angle.sin()], -1
     )
     size = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), d.uniform(0.02, 0.14, THINGS))
-    other = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), size)
+    random_size = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), size)
     alike = torch.tensor(
         [[0.75, 0.80, 0.25], [0.20, 0.50, 0.28], [0.85, 0.75, 0.20], [0.9, 0.9, 0.88]]
     )[d.one_of(4, THINGS).long()]
@@ -305,8 +305,10 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     )
     height = torch.where(kind == 3, size + d.uniform(0.0, 0.4, THINGS), torch.zeros(()))
     off = (place - scenes.goal[:, None, :2]).norm(dim=-1)
-    near = (place - scenes.ball[:, None, :2]).norm(dim=-1)
-    stays = (off > 0.22 + torch.maximum(size, other)) & ((kind != 3) | (near > 0.25 + size))
+    distance = (place - scenes.ball[:, None, :2]).norm(dim=-1)
+    stays = (off > 0.22 + torch.maximum(size, random_size)) & (
+        (kind != 3) | (distance > 0.25 + size)
+    )
     rim = torch.where(d.chance(0.3, THINGS), d.uniform(0.6, 0.9, THINGS), torch.full((), 9.0))
     return torch.cat(
         [
@@ -314,7 +316,7 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
             place,
             height[..., None],
             size[..., None],
-            other[..., None],
+            random_size[..., None],
             d.uniform(0.0, 3.14, THINGS, 1),
             colour.clamp(0.0, 1.0),
             rim[..., None],
@@ -367,14 +369,14 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
     time = torch.zeros(*points.shape[:2], 1, dtype=torch.float64)
     for _ in range(3):
         world = points + speed * time - eye - vel * time
-        still = world @ rot
-        seen = torch.einsum("ekji,ekj->eki", rotation_from_vector(rate * time), still)
-        pixels, inside = lens.project(seen)
+        static = world @ rot
+        seen = torch.einsum("ekji,ekj->eki", rotation_from_vector(rate * time), static)
+        pixels, visible = lens.project(seen)
         time = ((pixels[..., 1:2] + 0.5) / lens.params.height - 0.5) * scenes.shutter[
             :, None, 1:2
         ].double()
-    inside = inside & lens.on_sensor(pixels)
+    visible = visible & lens.on_sensor(pixels)
     _, sides = lens.project_normalized(
         ball_extremes_c(lens, seen[:, 4], float(scenes.ball[0, 3])), clip=False
     )
-    return Truth(seen[:, 4], seen[:, :4], rot, sides.all(1) & inside[:, 4], inside[:, :4].all(1))
+    return Truth(seen[:, 4], seen[:, :4], rot, sides.all(1) & visible[:, 4], visible[:, :4].all(1))

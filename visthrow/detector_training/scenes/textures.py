@@ -26,13 +26,13 @@ def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAIN
         names: of scikit-image's.
     """
     if folder is None:
-        found = find_spec("skimage")
-        if found is None or found.origin is None:
+        spec = find_spec("skimage")
+        if spec is None or spec.origin is None:
             raise ValueError(
                 "textures: scikit-image is not installed; install visthrow[detector], or name a"
                 " folder of photographs"
             )
-        folder = Path(found.origin).parent / "data"
+        folder = Path(spec.origin).parent / "data"
         files = [
             path
             for name in names

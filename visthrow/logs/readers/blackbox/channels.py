@@ -63,7 +63,7 @@ def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
 
 def _decoded_factor(name: str, unit: str, path: str | Path) -> float:
     """Factor from the bracketed unit to what the raw log holds."""
-    known = {
+    factors = {
         "": 1.0,
         "us": 1.0,
         "ms": 1e3,
@@ -81,9 +81,9 @@ def _decoded_factor(name: str, unit: str, path: str | Path) -> float:
         "raw": 1.0,
         "%": 1.0,
     }
-    if unit not in known:
-        raise LogError(f"{path}: column '{name}' is in '{unit}'; known: {', '.join(known)}")
-    return known[unit]
+    if unit not in factors:
+        raise LogError(f"{path}: column '{name}' is in '{unit}'; known: {', '.join(factors)}")
+    return factors[unit]
 
 
 def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:

@@ -108,14 +108,14 @@ def _three(one: tuple, two: tuple) -> Callable[["Reader", int], list[int]]:
 def _tag8_4s16(r: Reader, count: int) -> list[int]:
     """Four fields of 0, 4, 8 or 16 bits each, packed nibble to nibble."""
     tag, values = r.byte(), []
-    rest, have = 0, 0  # bits read and not used yet
+    pending, have = 0, 0  # bits read and not used yet
     for i in range(4):
         need = (0, 4, 8, 16)[tag >> (2 * i) & 3]
         while have < need:
-            rest, have = rest << 8 | r.byte(), have + 8
+            pending, have = pending << 8 | r.byte(), have + 8
         have -= need
-        values.append(extend(rest >> have, need) if need else 0)
-        rest &= (1 << have) - 1
+        values.append(extend(pending >> have, need) if need else 0)
+        pending &= (1 << have) - 1
     return values
 
 
