@@ -289,14 +289,14 @@ class Flight:
         """Measure, decide, send."""
         plant = self.plant
         measurement = plant.measured()
-        keypoints = self._held(measurement)
+        hold_command = self._held(measurement)
         self.flown = self.open & measurement.attached & throws
-        sent = Decision(keypoints, np.zeros(plant.count, bool))
+        sent = Decision(hold_command, np.zeros(plant.count, bool))
         if math.isnan(self.begin):
             self._refused = self.pilots.wait(self, measurement)
         if throws:
-            decision = self.pilots.decide(self, measurement, keypoints)
-            command = np.where(self.flown[:, None], decision.command, keypoints)
+            decision = self.pilots.decide(self, measurement, hold_command)
+            command = np.where(self.flown[:, None], decision.command, hold_command)
             sent = Decision(
                 command, decision.release & self.flown, decision.action, decision.observation
             )
