@@ -16,9 +16,9 @@ def thrown(policy: str, solver: str | None, args) -> list[dict]:
     """Throws of one policy on one solver, a row a target; without a solver on the policy's own."""
     changes = overrides(solver, args.substep) if solver else []
     item = load_policy(policy, args.config, [*changes, *args.overrides], args.allow)
-    actor = item.policy.to(args.device).actor(args.throws)
-    rows = []
+    flown, rows = item.policy.to(args.device), []
     for target in args.targets:
+        actor = flown.actor(args.throws)  # with a memory of its own
         found = throw(item.experiment, actor, target, args.throws, args.device, args.seed)
         row = {
             "policy": Path(policy).stem,
