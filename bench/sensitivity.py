@@ -4,6 +4,7 @@ at which they miss by the paper's 0.10 m.
     python -m bench.sensitivity state vision --out out/sensitivity --record sensitivity
 
 ``OUT/points.jsonl`` keeps every point; the same command goes on where it stopped.
+``OUT/sensitivity.png`` is the picture of it.
 """
 
 import argparse
@@ -126,6 +127,7 @@ def run(args: argparse.Namespace) -> int:
             "effects": _effects(name, loaded.experiment, loaded.policy, points),
         }
     status("")
+    picture(figures, Path(args.out) / "sensitivity.png")
     return finish(_report(figures), args)
 
 
