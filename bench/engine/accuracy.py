@@ -5,6 +5,7 @@ up on a rope that hangs askew."""
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -122,7 +123,12 @@ def not_wild(found: dict) -> bool:
     return not found["failed"] and float(found["rates"].max()) < CALM
 
 
-if __name__ == "__main__":
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
     parser = start.parser_of(__doc__)
     parser.add_argument("--solvers", nargs="+", default=list(STEPS), choices=list(STEPS))
-    raise SystemExit(start.main(parser, run))
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

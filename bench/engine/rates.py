@@ -6,6 +6,7 @@ Chains run from a CUDA graph of 20 control steps; the others are launched step b
 import dataclasses
 import json
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -86,10 +87,15 @@ def run(args) -> int:
     return finish(Report("engine", title, (table,), notes, {"rows": rows}), args)
 
 
-if __name__ == "__main__":
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
     parser = start.parser_of(__doc__)
     parser.add_argument("--solvers", nargs="+", default=list(SUBSTEPS), choices=list(SUBSTEPS))
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 64, 1024])
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     parser.add_argument("--device", default="cpu")
-    raise SystemExit(start.main(parser, run))
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,6 +1,7 @@
 """Landings of policies on each solver, from the same starts and with the same noise."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,8 @@ def run(args) -> int:
     return finish(report, args)
 
 
-if __name__ == "__main__":
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command."""
     parser = start.parser_of(__doc__)
     parser.add_argument("policies", nargs="+")
     parser.add_argument("--solvers", nargs="+", default=[])
@@ -86,4 +88,8 @@ if __name__ == "__main__":
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--raw", metavar="FILE", help="rows as JSON")
-    raise SystemExit(start.main(parser, run))
+    return start.main(parser, run, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -21,6 +21,7 @@ MOST = 12
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN = {
+    "long: visthrow.training.first_order.algorithm.__init__",
     "long: hil.control.runner.__init__",
     "long: hil.flight.fly",
     "long: hil.params.__post_init__",

@@ -10,6 +10,7 @@ import pytest
 from bench.diagnose import ledger, sealed
 from bench.diagnose.sealed import NOT_WAITED
 from bench.worlds.world import ALL_FLOORS, FLOORS, ONE_SIDED, dust_of, world_of
+from visthrow.paper import measurements
 
 TRUTH = math.exp((math.log(9.0) + 6.0) / 3.5)
 """Size of the made-up curve at 90 %."""
@@ -177,8 +178,11 @@ SHIPPED = {
     ]
     for name in ("ledger.jsonl", "ledger-earlier.jsonl")
 }
-PAGE = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis_trust.md").read_text()
-TRUST = PAGE.split("## Hidden worlds")[1].split("\n## ")[0]
+RECORD = measurements.load(measurements.PAGES / "diagnosis-trust-page.json")
+"""The figures of the ledgers, as `visthrow bench records` prints them."""
+HIDDEN = [table for table in RECORD["tables"] if table["title"].startswith("Hidden worlds")]
+ROWS = ["| " + " | ".join(row) + " |" for table in HIDDEN for row in table["rows"]]
+TRUST = "\n".join([*ROWS, *(table["title"] for table in HIDDEN), *RECORD["notes"]])
 KINDS = {
     "nothing; noise": "null",
     "one effect, 15": "1x15",
@@ -197,7 +201,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize(("begins", "kind"), KINDS.items())
-def test_the_page_says_what_the_shipped_ledger_says(begins, kind):
+def test_the_record_says_what_the_shipped_ledger_says(begins, kind):
     """Worlds, found, names up to class, exact, more names than causes: cell by cell; none is left
     out of any row.
     """
@@ -232,7 +236,7 @@ def test_the_page_says_what_the_shipped_ledger_says(begins, kind):
     assert [cell.replace(" [99, 100]", "") for cell in cells[1:]] == expected
 
 
-def test_the_page_says_what_the_ledgers_intervals_hold_and_whose_worlds_are_counted():
+def test_the_record_says_what_the_ledgers_intervals_hold_and_whose_worlds_are_counted():
     kept = SHIPPED["ledger.jsonl"]
     for group in ([w for w in kept if not ledger.dusty(w)], [w for w in kept if ledger.dusty(w)]):
         (line,) = [line for line in ledger.coverage(group) if line.startswith("- 95")]

@@ -55,8 +55,8 @@ def test_growth_of_memory():
 def test_a_policy_that_never_releases_is_the_same_otherwise(tmp_path):
     import torch
 
-    shipped = Policy.load(find_policy("vision"))
-    made = Policy.load(hil_soak.never_releasing("vision", tmp_path / "p.npz"))
+    shipped = Policy.load(find_policy("vision_located"))
+    made = Policy.load(hil_soak.never_releasing("vision_located", tmp_path / "p.npz"))
     seen = torch.randn(200, shipped.obs_dim)
     torch.testing.assert_close(made.act(seen)[:, :4], shipped.act(seen)[:, :4], rtol=0, atol=0)
     assert (made.act(seen)[:, 4] == -1.0).all()

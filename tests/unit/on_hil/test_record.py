@@ -155,7 +155,7 @@ def test_a_view_is_a_recording(run_folder, tmp_path, capsys):
 def test_the_folder_holds_config_policy_and_hash(run_folder):
     wanted, policy, ticks, poses = load_run(run_folder)
     assert wanted == params("policy=vision", "observe=true")
-    assert policy.obs_dim == 155
+    assert policy.obs_dim == Policy.load(find_policy("vision")).obs_dim
     record = json.loads((run_folder / "provenance.json").read_text())
     assert record["policy"] == "vision"
     assert len(record["policy_sha256"]) == 64

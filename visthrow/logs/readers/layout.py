@@ -137,15 +137,16 @@ def _separator(lines: list[str]) -> str:
 
 
 def _holds_numbers(cells: list[str]) -> bool:
-    """Whether at least half of a line's cells that hold something are numbers, or lists of them."""
+    """Whether at least half of a line's filled cells are numbers or lists, one of the first three
+    among them; behind more columns of text two thirds must be.
+    """
     filled = [cell for cell in cells if cell]
     good = sum(
         is_number(cell) or cell.lower() in _WORDS or (cell[:1] in "[(" and cell[-1:] in "])")
         for cell in filled
     )
-    return 2 * good >= len(filled) > 0 and any(
-        map(is_number, (c.strip("[]() ") or c for c in filled[:3]))
-    )
+    early = any(map(is_number, (c.strip("[]() ") or c for c in filled[:3])))
+    return 2 * good >= len(filled) > 0 and (early or 3 * good >= 2 * len(filled))
 
 
 def _commas(mark: str, body: list[tuple[int, list[str]]]) -> bool:
