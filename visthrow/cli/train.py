@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " state   on two GPUs\n"
     )
     names = (
-        "a name of configs/train (state, vision, laptop, laptop_vision, paper, ...) or a TOML file"
-        " of your own"
+        "a name of configs/train (state, vision, vision_located, laptop, laptop_vision, paper, ...)"
+        " or a TOML file of your own"
     )
     parser.add_argument(
         "config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder"
