@@ -3,7 +3,7 @@
 import argparse
 import hashlib
 import json
-import os
+import multiprocessing
 import queue
 import re
 import shutil
@@ -13,16 +13,18 @@ import tempfile
 import threading
 import time
 import tomllib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+
+from bench.mutations import process
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(__file__).parent
 LEDGER = ROOT / "out" / "mutations.jsonl"
 DIGITS = re.compile(r"bits|digest|byte_for_byte|recorded")
 """Names of tests that compare with recorded digits rather than with behaviour."""
-LIMIT = 600  # s, for the tests of one mutation
-FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+STATES = ("killed", "survived", "equivalent", "broken", "not run")
 
 
 @dataclass(frozen=True)
@@ -33,40 +35,45 @@ class Mutation:
     file: str
     old: str
     new: str
-    tests: tuple[str, ...]
+    tests: tuple[str, ...]  # that should notice first
+    room_tests: tuple[str, ...]
     equivalent: str = ""
 
     @property
     def key(self) -> str:
-        """Digest of the mutation and of the file that it changes."""
-        text = (ROOT / self.file).read_text(encoding="utf-8")
-        parts = (self.file, self.old, self.new, *self.tests, text)
-        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+        """Digest of what is changed."""
+        text = "\0".join((self.file, self.old, self.new))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def load(rooms: list[str]) -> list[Mutation]:
     """Read the mutations of rooms, of all rooms where none is named.
 
-    Raises ValueError where ``old`` does not stand in its file exactly once."""
-    found = []
+    Raises ValueError where an old text does not stand in its file exactly once.
+    """
+    mutations, wrong = [], []
     for path in sorted(FOLDER.glob("*.toml")):
         if rooms and path.stem not in rooms:
             continue
-        for row in tomllib.loads(path.read_text(encoding="utf-8"))["mutation"]:
-            tests = tuple(row.pop("tests", ()))
-            mutation = Mutation(path.stem, tests=tests, **row)
-            count = (ROOT / mutation.file).read_text(encoding="utf-8").count(mutation.old)
-            if count != 1:
-                raise ValueError(f"{path.name}: {mutation.old!r} is {count} times in {row['file']}")
-            found.append(mutation)
-    return found
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        for entry in table["file"]:
+            source = ROOT / entry["path"]
+            text = source.read_text(encoding="utf-8") if source.exists() else ""
+            tests = tuple(entry["tests"]), tuple(table["tests"])
+            for old, new, *reason in entry["mutations"]:
+                mutation = Mutation(path.stem, entry["path"], old, new, *tests, *reason)
+                mutations.append(mutation)
+                if text.count(old) != 1:
+                    wrong.append(f"{path.name}: {text.count(old)} times in {source}: {old!r}")
+    if wrong:
+        raise ValueError("expected each old text once in its file\n" + "\n".join(wrong))
+    return mutations
 
 
-def copy_of_checkout(folder: Path) -> None:
+def copy_checkout(folder: Path) -> None:
     """Copy the tracked files."""
-    names = subprocess.run(
-        ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True, check=True
-    ).stdout
+    command = ["git", "-C", str(ROOT), "ls-files", "-z"]
+    names = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     for name in filter(None, names.split("\0")):
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -78,37 +85,28 @@ def judge(mutation: Mutation, folder: Path) -> dict:
     path = folder / mutation.file
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-    environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-    start, killer = time.time(), ""
-    try:
-        done = subprocess.run(
-            [*command, *mutation.tests],
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=LIMIT,
-        )
-        state = "survived" if done.returncode == 0 else "killed"
-        match = FAILED.search(done.stdout)
-        killer = match[1] if match else ""
-        if state == "killed" and not killer:
-            state = "broken"
-    except subprocess.TimeoutExpired:
-        state, killer = "killed", "time limit"
-    finally:
-        path.write_text(text, encoding="utf-8")
-    seconds = round(time.time() - start, 1)
-    line = {"key": mutation.key, "room": mutation.room, "file": mutation.file}
-    return {**line, "new": mutation.new, "state": state, "by": killer, "seconds": seconds}
+    start = time.time()
+    state, test = process.outcome(folder, mutation.tests)
+    if state == "survived":
+        state, test = process.outcome(folder, mutation.room_tests)
+    path.write_text(text, encoding="utf-8")
+    return {
+        "key": mutation.key,
+        "room": mutation.room,
+        "file": mutation.file,
+        "old": mutation.old,
+        "new": mutation.new,
+        "state": state,
+        "by": test,
+        "seconds": round(time.time() - start, 1),
+    }
 
 
 def work(todo: "queue.Queue[Mutation]", ledger: Path, lock: threading.Lock) -> None:
     """Judge mutations until none is left, in a copy of the checkout."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "visthrow"
-        copy_of_checkout(folder)
+        copy_checkout(folder)
         while True:
             try:
                 mutation = todo.get_nowait()
@@ -117,11 +115,12 @@ def work(todo: "queue.Queue[Mutation]", ledger: Path, lock: threading.Lock) -> N
             line = judge(mutation, folder)
             with lock, open(ledger, "a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
-                print(f"{line['state']:9} {line['seconds']:6.1f} s  {mutation.file}  {line['by']}")
+                shown = f"{line['state']:9} {line['seconds']:6.1f} s  {mutation.file}"
+                print(f"{shown}  {mutation.new!r}  {line['by']}", flush=True)
 
 
-def known(ledger: Path) -> dict[str, dict]:
-    """Read the ledger by key."""
+def read_ledger(ledger: Path) -> dict[str, dict]:
+    """Read the last line of each mutation, by key."""
     if not ledger.exists():
         return {}
     lines = map(json.loads, ledger.read_text(encoding="utf-8").splitlines())
@@ -130,32 +129,28 @@ def known(ledger: Path) -> dict[str, dict]:
 
 def summary(mutations: list[Mutation], lines: dict[str, dict]) -> str:
     """Return a table by room, and each survivor."""
-    rows = ["room            killed  by digits  survived  equivalent  not run"]
+    rooms: dict[str, Counter[str]] = {}
     survivors = []
-    for room in sorted({m.room for m in mutations}):
-        own = [m for m in mutations if m.room == room]
-        states = [
-            ("equivalent" if m.equivalent else lines.get(m.key, {}).get("state")) for m in own
-        ]
-        digits = sum(bool(DIGITS.search(lines.get(m.key, {}).get("by", ""))) for m in own)
-        rows.append(
-            f"{room:15} {states.count('killed'):6}  {digits:9}  {states.count('survived'):8}"
-            f"  {states.count('equivalent'):10}  {states.count(None):7}"
-        )
-        survivors += [
-            f"survived: {m.file}: {m.old!r} -> {m.new!r}"
-            for m, s in zip(own, states)
-            if s == "survived"
-        ]
+    for mutation in mutations:
+        line = lines.get(mutation.key, {"state": "not run", "by": ""})
+        state = "equivalent" if mutation.equivalent else line["state"]
+        for room in (mutation.room, "all"):
+            counts = rooms.setdefault(room, Counter())
+            counts[state] += 1
+            counts["by digits"] += bool(DIGITS.search(line["by"]))
+        if state in ("survived", "broken"):
+            survivors.append(f"{state}: {mutation.file}: {mutation.old!r} -> {mutation.new!r}")
+    columns = [*STATES, "by digits"]
+    rows = [f"{'room':15}" + "".join(f"{name:>12}" for name in columns)]
+    for room, counts in rooms.items():
+        rows.append(f"{room:15}" + "".join(f"{counts[name]:12}" for name in columns))
     return "\n".join([*rows, *survivors])
 
 
 def main() -> int:
     """Run the command; exit status 1 where a mutation survived."""
     parser = argparse.ArgumentParser(prog="python -m bench.mutations", description=__doc__)
-    parser.add_argument(
-        "rooms", nargs="*", metavar="ROOM", help="files of bench/mutations, by stem"
-    )
+    parser.add_argument("rooms", nargs="*", metavar="ROOM", help="TOML files, by stem")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--ledger", type=Path, default=LEDGER)
     parser.add_argument("--summary", action="store_true", help="print the table alone")
@@ -163,11 +158,13 @@ def main() -> int:
     mutations = load(args.rooms)
     args.ledger.parent.mkdir(parents=True, exist_ok=True)
     if not args.summary:
-        done, todo = known(args.ledger), queue.Queue()
+        done = {key for key, line in read_ledger(args.ledger).items() if line["state"] == "killed"}
+        todo: queue.Queue[Mutation] = queue.Queue()
         for mutation in mutations:
             if not mutation.equivalent and mutation.key not in done:
                 todo.put(mutation)
-        print(f"{todo.qsize()} of {len(mutations)} mutations to run")
+        print(f"{todo.qsize()} of {len(mutations)} mutations to run", flush=True)
+        multiprocessing.get_context("forkserver").set_forkserver_preload(process.HEAVY)
         lock = threading.Lock()
         workers = [
             threading.Thread(target=work, args=(todo, args.ledger, lock)) for _ in range(args.jobs)
@@ -176,7 +173,7 @@ def main() -> int:
             worker.start()
         for worker in workers:
             worker.join()
-    lines = known(args.ledger)
+    lines = read_ledger(args.ledger)
     print(summary(mutations, lines))
     return int(any(lines.get(m.key, {}).get("state") == "survived" for m in mutations))
 

@@ -414,69 +414,12 @@ class TestTables:
 class TestAutopilots:
     """Files written byte by byte."""
 
-    def test_ulog(self, tmp_path):
-        path, quarter = tmp_path / "a.ulg", math.sqrt(0.5)
-        logfiles.write_ulg(
-            path,
-            {
-                ("vehicle_local_position", 0): (
-                    [
-                        "uint64_t timestamp",
-                        "float x",
-                        "float y",
-                        "float z",
-                        "float vx",
-                        "float vy",
-                        "float vz",
-                    ],
-                    [
-                        (1_000_000 + 20_000 * i, 1.0, 2.0, -3.0 - i, 0.1, 0.2, -0.3)
-                        for i in range(5)
-                    ],
-                ),
-                ("vehicle_attitude", 0): (
-                    ["uint64_t timestamp", "float[4] q"],
-                    [(1_000_000 + 10_000 * i, quarter, 0.0, 0.0, quarter) for i in range(10)],
-                ),
-            },
-        )
+    def test_the_first_imu_alone_is_read(self, tmp_path):
+        path, imu = tmp_path / "a.BIN", ("QBfff", "TimeUS,I,GyrX,GyrY,GyrZ")
+        rows = [("IMU", (1000 * i, i % 2, 0.1 + i % 2, 0.2, 0.3)) for i in range(10)]
+        logfiles.write_bin(path, {"IMU": imu}, rows)
         (log,) = read(path)
-        assert log["pos_w"].values[2] == pytest.approx([1.0, -2.0, 5.0])
-        assert log["vel_w"].values[2] == pytest.approx([0.1, -0.2, 0.3])
-        assert log["pos_w"].time[1] == pytest.approx(0.02)
-        nose = Rotation.from_quat(log["quat_wb"].values[0]).apply([1.0, 0.0, 0.0])
-        assert nose == pytest.approx(
-            [0.0, -1.0, 0.0], abs=1e-6
-        )  # a quarter turn to the right, east is our -y
-
-    def test_dataflash(self, tmp_path):
-        path = tmp_path / "a.BIN"
-        imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
-        rows = [("IMU", (1000 * i, i % 2, 0.1, 0.2, 0.3, 0.0, 0.0, -9.81)) for i in range(10)]
-        rows += [("ATT", (1000 * i, 0, 0.0, 0, 0.0, 0, 90.0)) for i in range(5)]
-        logfiles.write_bin(path, {"IMU": imu, "ATT": logfiles.ATT}, rows)
-        (log,) = read(path)
-        assert log["rate_b"].values == pytest.approx(
-            np.tile([0.1, -0.2, -0.3], (5, 1))
-        )  # the first IMU alone
-        assert log["acc_b"].values[0] == pytest.approx([0.0, 0.0, 9.81], rel=1e-6)
-        nose = Rotation.from_quat(log["quat_wb"].values[0]).apply([1.0, 0.0, 0.0])
-        assert nose == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
-
-    def test_telemetry(self, tmp_path):
-        from pymavlink.dialects.v20 import common
-
-        sender, data = common.MAVLink(None), b""
-        for i in range(5):
-            message = common.MAVLink_local_position_ned_message(
-                20 * i, 1.0, 2.0, -3.0, 0.0, 0.0, 0.5
-            )
-            data += struct.pack(">Q", 1_700_000_000_000_000 + 20_000 * i) + message.pack(sender)
-        path = tmp_path / "a.tlog"
-        path.write_bytes(data)
-        (log,) = read(path)
-        assert log["pos_w"].values[0] == pytest.approx([1.0, -2.0, 3.0])
-        assert np.diff(log["pos_w"].time) == pytest.approx(0.02)
+        assert log["rate_b"].values == pytest.approx(np.tile([0.1, -0.2, -0.3], (5, 1)))
 
     @pytest.mark.parametrize("ending", ["ulg", "BIN", "tlog", "bbl", "npz"])
     @pytest.mark.parametrize("data", [b"", b"nonsense" * 50, bytes(2000)])

@@ -191,7 +191,6 @@ TELEMETRY = (
     _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV"),
     _t("SERVO_OUTPUT_RAW", _motors("servo+*_raw"), "motor_output", "1"),
     _t("ESC_TELEMETRY_1_TO_4", _motors("rpm[*]"), "motor_speed", "rpm"),
-    _t("ESC_STATUS", _motors("rpm[*]"), "motor_speed", "rpm"),
 )
 
 FLYING: dict[str, tuple[tuple[str, str, float, float], ...]] = {
