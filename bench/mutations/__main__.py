@@ -80,14 +80,16 @@ def copy_checkout(folder: Path) -> None:
         shutil.copy2(ROOT / name, target)
 
 
-def judge(mutation: Mutation, folder: Path) -> dict:
-    """Run the tests on the mutated copy; returns a line of the ledger."""
+def judge(mutation: Mutation, folder: Path, room: bool) -> dict:
+    """Run the tests on the mutated copy, of a survivor those of its ``room`` too; returns a line of
+    the ledger.
+    """
     path = folder / mutation.file
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
     start = time.time()
     state, test = process.outcome(folder, mutation.tests)
-    if state == "survived":
+    if state == "survived" and room:
         state, test = process.outcome(folder, mutation.room_tests)
     path.write_text(text, encoding="utf-8")
     return {
@@ -102,7 +104,7 @@ def judge(mutation: Mutation, folder: Path) -> dict:
     }
 
 
-def work(todo: "queue.Queue[Mutation]", ledger: Path, lock: threading.Lock) -> None:
+def work(todo: "queue.Queue[Mutation]", ledger: Path, room: bool, lock: threading.Lock) -> None:
     """Judge mutations until none is left, in a copy of the checkout."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "visthrow"
@@ -112,7 +114,7 @@ def work(todo: "queue.Queue[Mutation]", ledger: Path, lock: threading.Lock) -> N
                 mutation = todo.get_nowait()
             except queue.Empty:
                 return
-            line = judge(mutation, folder)
+            line = judge(mutation, folder, room)
             with lock, open(ledger, "a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
                 shown = f"{line['state']:9} {line['seconds']:6.1f} s  {mutation.file}"
@@ -153,6 +155,7 @@ def main() -> int:
     parser.add_argument("rooms", nargs="*", metavar="ROOM", help="TOML files, by stem")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--ledger", type=Path, default=LEDGER)
+    parser.add_argument("--first", action="store_true", help="run no tests but the file's")
     parser.add_argument("--summary", action="store_true", help="print the table alone")
     args = parser.parse_args()
     mutations = load(args.rooms)
@@ -166,9 +169,8 @@ def main() -> int:
         print(f"{todo.qsize()} of {len(mutations)} mutations to run", flush=True)
         multiprocessing.get_context("forkserver").set_forkserver_preload(process.HEAVY)
         lock = threading.Lock()
-        workers = [
-            threading.Thread(target=work, args=(todo, args.ledger, lock)) for _ in range(args.jobs)
-        ]
+        task = (todo, args.ledger, not args.first, lock)
+        workers = [threading.Thread(target=work, args=task) for _ in range(args.jobs)]
         for worker in workers:
             worker.start()
         for worker in workers:
