@@ -80,10 +80,17 @@ def test_what_invalid_and_dropped_points_read(reads, expected):
     assert torch.allclose(points[0], torch.tensor([*expected, [0.11, 0.21]]))
 
 
-def test_same_seed_same_noise():
-    draws = [draw_step(4, 8, torch.Generator().manual_seed(9)) for _ in range(2)]
-    assert torch.equal(draws[0].normals, draws[1].normals)
-    assert torch.equal(draws[0].uniforms, draws[1].uniforms)
+def test_wrong_points_lie_anywhere_in_the_image_and_count_as_seen():
+    params = KeypointNoiseParams(wrong_probability=0.25)
+    generator = torch.Generator().manual_seed(1)
+    wrong = torch.rand(SAMPLES, 8, 3, generator=generator)
+    draw = draw_step(SAMPLES, 8, generator)._replace(wrong=wrong)
+    exact, unseen = torch.full((SAMPLES, 8, 2), 0.3), torch.zeros(SAMPLES, 8, dtype=torch.bool)
+    points, seen = apply_noise(params, exact, unseen, torch.zeros_like(exact), draw)
+    assert seen.float().mean() == pytest.approx(0.25, abs=0.006)
+    # Uniform in -1 to 1: mean 0, spread 1 / sqrt(3); 40,000 of them.
+    assert points[seen].mean(0).abs().max() < 0.015
+    assert points[seen].std(0) == pytest.approx([3**-0.5, 3**-0.5], rel=0.015)
 
 
 @pytest.mark.parametrize(

@@ -63,8 +63,12 @@ def test_what_is_held_back_and_when_it_is_given_up():
     assert aim.astray(1.0, good, goal) is None
     assert "2.00 m from the goal, within 0.5 m expected" in aim.astray(1.1, bad, goal)
     assert aim.astray(1.2, good, goal) is None, "the policy may ask again"
+    for x, y in ((2.51, 0.0), (1.49, 0.0), (2.0, 0.51), (2.0, -0.51), (2.36, 0.36)):
+        near = at((2.0 + 0.95 * (x - 2.0), 0.95 * y, 1.0), (0.0, 0.0, 0.0))
+        assert aim.astray(1.25, near, goal) is None
+        assert aim.astray(1.25, at((x, y, 1.0), (0.0, 0.0, 0.0)), goal)
     assert aim.astray(1.3, bad, goal)
-    assert (aim.given_up(1.49), aim.given_up(1.51), aim.held) == (False, True, 2)
+    assert (aim.given_up(1.49), aim.given_up(1.51), aim.held) == (False, True, 7)
     aim.begin()
     assert not aim.given_up(9.0)
     assert Aim(None, AHEAD, HEIGHT, ROPE).astray(1.0, bad, goal) is None, (
