@@ -23,7 +23,7 @@ def test_a_faster_mechanism_is_commanded_so_much_later(later, wait):
 
 def test_a_mechanism_as_slow_as_the_lag_is_taken_and_a_slower_one_refused():
     assert latch_of(mechanism_lag=LAG + 0.004).trip(1.0, ORIGIN) == 1.0
-    with pytest.raises(RunError, match="trained with 0.05 s"):
+    with pytest.raises(RunError, match="trained with 0"):
         latch_of(mechanism_lag=LAG + 0.006)
 
 
