@@ -534,8 +534,8 @@ class RandomizationParams:
     attitude_deg: tuple[float, float, float]  # +- roll, pitch, yaw [deg]
     rate_deg: tuple[float, float, float]  # +- body rates [deg/s]
     mass: float  # +- fraction of the vehicle's mass
-    cable_angle_deg: float  # +- yaw and roll of the cable [deg]
-    cable_rate_deg: float  # +- their rates [deg/s]
+    cable_angle_deg: float  # +- roll of the cable [deg]
+    cable_rate_deg: float  # +- rates of its roll and yaw [deg/s]
     tether_variants: int  # number of cable lengths, one for each environment for good
     tether_spread: float  # the lengths span +- this fraction
     battery_used: float  # fraction of charge used is drawn from 0 to this
@@ -547,3 +547,4 @@ class RandomizationParams:
     )
     payload_spread: float = 0.0  # the masses span +- this fraction
     drag_spread: float = 0.0  # the payload's drags span +- this fraction
+    cable_yaw_deg: float = 15.0  # +- yaw of the cable [deg]

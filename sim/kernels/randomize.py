@@ -120,7 +120,7 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
             )
             state.rate_b[env] = rate
             state.mass_scale[env] = real(1.0) + z.mass * real(wp.randf(rng, -1.0, 1.0))
-            azimuth = z.cable_angle_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
+            azimuth = z.cable_yaw_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
             tilt = z.cable_angle_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
             azimuth_rate = z.cable_rate_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
             tilt_rate = z.cable_rate_deg * real(wp.randf(rng, -1.0, 1.0)) * degree

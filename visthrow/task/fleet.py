@@ -43,8 +43,8 @@ TASK: dict[str, dict[Dimension, str]] = PLANT | {
         (1, 0, -1): "velocity",
         RATE: "rate_deg cable_rate_deg",
         NONE: (
-            "attitude_deg mass cable_angle_deg tether_variants tether_spread battery_used"
-            " payload_variants payload_spread drag_spread"
+            "attitude_deg mass cable_angle_deg cable_yaw_deg tether_variants tether_spread"
+            " battery_used payload_variants payload_spread drag_spread"
         ),
     },
     "BoundsParams": {LENGTH: "altitude horizontal", NONE: "tilt_deg", TIME: "time_limit"},

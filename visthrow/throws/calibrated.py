@@ -24,7 +24,7 @@ from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
 
-SETTLE = 3.0  # after the sway, until the swing that it leaves has died down [s]
+SETTLE = 3.0  # after the sway [s]; of its swing some 10 deg remain
 FEW = (
     8  # calibrations of half a second each: here they are done before other processes have started
 )

@@ -29,10 +29,10 @@ def spreads():
 
 
 @lru_cache
-def started() -> HybridSim:
-    plant = paper_plant()
-    sim = HybridSim(plant, COUNT, seed=5, ropes=tether_lengths(plant.rope, spreads()))
-    sim.randomize(spreads())
+def started(**changes: float) -> HybridSim:
+    plant, start = paper_plant(), dataclasses.replace(spreads(), **changes)
+    sim = HybridSim(plant, COUNT, seed=5, ropes=tether_lengths(plant.rope, start))
+    sim.randomize(start)
     return sim
 
 
@@ -83,11 +83,11 @@ def test_attitude():
         assert_uniform(np.degrees(angle), -bound, bound)
 
 
-def cable_angles() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Azimuth and tilt [rad] of the cable in the body frame and the cable's own velocity there
-    [1/s].
+def cable_angles(**changes: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return azimuth and tilt [rad] of the cable in the body frame, its direction, and its velocity
+    [1/s] beyond the body's turn there.
     """
-    sim = started()
+    sim = started(**changes)
     quat = sim.get("quat_wb").astype(float)
     back = quat * [-1.0, -1.0, -1.0, 1.0]
     down = rotate(back, sim.get("cable_dir_w")[:, 0].astype(float))
@@ -111,6 +111,14 @@ def test_cable_hangs_yawed_then_rolled():
     np.testing.assert_allclose(rebuilt, down, atol=1e-6)
     assert_uniform(np.degrees(tilt), -bound, bound)
     assert_uniform(np.degrees(azimuth[np.abs(tilt) > 0.01]), -bound, bound)
+
+
+def test_a_cable_of_any_yaw_swings_fore_and_aft_as_far_as_sideways():
+    down = cable_angles(cable_yaw_deg=180.0)[2]
+    fore, side = np.abs(down[:, :2]).mean(0)
+    np.testing.assert_allclose(fore, side, rtol=0.1)
+    narrow = np.abs(cable_angles()[2][:, :2]).mean(0)
+    assert narrow[0] < 0.2 * narrow[1]
 
 
 def test_cable_rates_come_on_top_of_the_bodys():
