@@ -1,9 +1,10 @@
-"""All that needs GPUs, side by side on four cards in some seven minutes: throughput by solver,
+"""All that needs GPUs, side by side on four cards in some eight minutes: throughput by solver,
 trainings through each, their policies thrown crosswise.
 
-Writes a file for each card's work, and what the jobs said, into a folder."""
+Writes a zip of policies for each training, and one of rates, throws and logs, into a folder."""
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -15,10 +16,13 @@ from pathlib import Path
 from typing import TextIO
 
 COUNTS = ("1024", "4096", "16384", "65536")
-SAME_MASS = "task.start.mass=0.0"
-"""A change for an engine that cannot take other masses on a GPU: tried where it failed."""
-
 CROSSED = ("chain", "physx", "mujoco_warp")
+CHANGES: tuple[tuple[str, ...], ...] = ((), ("sim.substep=0.001",), ("task.start.mass=0.0",))
+"""Of a training through PhysX: the first with which the shipped policy lands on this card."""
+
+LANDS = 0.1  # [m], mean landing error of a policy whose plant is in order
+STARTUP = 30.0  # [s] of a training, before its clock begins
+PROBE = "probe"
 
 
 def rates(*solvers: str, counts: tuple[str, ...] = COUNTS) -> list[str]:
@@ -28,75 +32,109 @@ def rates(*solvers: str, counts: tuple[str, ...] = COUNTS) -> list[str]:
     return ["bench.engine.rates", "--solvers", *solvers, "--counts", *counts, *places]
 
 
-def training(config: str, solver: str, seconds: int) -> list[str]:
+def training(config: str, solver: str) -> list[str]:
     """Command that trains."""
-    place = ["--out", f"{{out}}/{config}-{solver}", "--seconds", str(seconds)]
-    return ["bench.engine.training", config, "--solver", solver, *place]
+    out = f"{{out}}/{config}-{solver}"
+    return ["bench.engine.training", config, "--solver", solver, "--out", out]
 
 
-def throws(config: str, trained: str, solver: str) -> list[str]:
-    """Command that throws a policy trained here."""
-    place = f"{{out}}/{config}-{trained}"
-    raw = ["--raw", f"{place}/throws-{solver}.json", "--device", "cuda:0"]
-    return ["bench.engine.throws", f"{place}/policy.npz", "--solvers", solver, *raw]
+def throws(policy: str, solver: str, name: str = "") -> list[str]:
+    """Command that throws a shipped policy, or the one of a folder of this work."""
+    place = f"{{out}}/{policy}/policy.npz" if not name else policy
+    raw = ["--raw", f"{{out}}/throws-{name or policy}-on-{solver}.json", "--device", "cuda:0"]
+    return ["bench.engine.throws", place, "--solvers", solver, *raw]
 
 
-WORK: list[list[tuple[list[str], int]]] = [
+def crossed(trained: str) -> list[list[str]]:
+    """Commands that throw a policy trained here on each solver."""
+    return [throws(f"state_fast-{trained}", solver) for solver in CROSSED]
+
+
+Work = list[tuple[list[list[str]], float, float]]
+WORK: list[Work] = [
     [
-        (training("state_fast", "chain", 60), 110),
-        (rates("chain", "exchanged_chain"), 60),
-        *[(rates("physx", counts=(count,)), 100) for count in COUNTS],
-        (throws("state_fast", "chain", "chain"), 40),
-        (throws("state_fast", "chain", "physx"), 60),
-        (throws("state_fast", "chain", "mujoco_warp"), 100),
+        ([training("state_fast", "chain")], 110.0, 0.0),
+        ([rates("chain", "exchanged_chain")], 80.0, 0.0),
+        *[([rates("physx", counts=(n,))], 130.0, 0.0) for n in ("16384", "65536", "4096", "1024")],
+        ([rates("mujoco_warp")], 130.0, 0.0),
+        (crossed("chain"), 110.0, 0.0),
     ],
     [
-        (training("state_fast", "physx", 270), 320),
-        *[(throws("state_fast", "physx", solver), 60) for solver in CROSSED],
+        ([throws("state", "physx", PROBE)], 90.0, 0.0),
+        ([training("state_fast", "physx")], 900.0, 80.0),
+        (crossed("physx"), 110.0, 0.0),
     ],
     [
-        (training("state_fast", "mujoco_warp", 270), 360),
-        *[(throws("state_fast", "mujoco_warp", solver), 60) for solver in CROSSED],
+        ([training("state_fast", "mujoco_warp")], 900.0, 80.0),
+        (crossed("mujoco_warp"), 110.0, 0.0),
     ],
     [
-        (training("state_box", "mujoco_warp", 100), 200),
-        (training("state_two_cables", "mujoco_warp", 100), 150),
-        (throws("state_box", "mujoco_warp", "mujoco_warp"), 60),
-        (throws("state_two_cables", "mujoco_warp", "mujoco_warp"), 60),
-        (rates("mujoco_warp"), 100),
+        ([training("state_box", "mujoco_warp")], 220.0, 0.0),
+        ([training("state_two_cables", "mujoco_warp")], 900.0, 60.0),
+        ([throws(f"{x}-mujoco_warp", "mujoco_warp") for x in ("state_box", "state_two_cables")],)
+        + (110.0, 0.0),
     ],
 ]
-"""Of each card: commands, and the time that each may take [s]."""
+"""Of each card: commands that run at once, the time that they may take [s], and the time that they
+must leave for what comes after them [s]."""
 
 
 def work(card: int, out: Path, until: float) -> None:
-    """Do one card's commands, one after another; what outlasts its time is ended."""
+    """Do one card's commands, group after group; what outlasts its time is ended."""
     env = {**os.environ, "CUDA_VISIBLE_DEVICES": str(card), "PYTHONUNBUFFERED": "1"}
+    changes: list[str] = []
     with open(out / f"card{card}.log", "w") as log:
-        for command, most in WORK[card]:
-            line = [sys.executable, "-m", *(part.format(out=out) for part in command)]
-            for changes in ([], ["--set", SAME_MASS]):
-                limit, begin = min(most, until - time.time()), time.time()
-                state = run([*line, *changes], limit, env, log)
-                words = " ".join([*command[:4], *changes])
-                told = f"card {card}: {words}: {state}, {time.time() - begin:.0f} s"
-                print(told, file=log, flush=True)
-                print(told, flush=True)
-                if state != "status 1" or "physx" not in line:
-                    break
+        for group, most, reserve in WORK[card]:
+            limit = min(most, until - time.time() - reserve)
+            if f"throws-{PROBE}" in " ".join(group[0]):
+                changes = probe(group[0], limit, out, env, log)
+                continue
+            lines = [[part.format(out=out) for part in command] for command in group]
+            for line in lines:
+                if line[0].endswith("training"):
+                    line += ["--seconds", f"{limit - STARTUP:.0f}", *changes]
+            run(lines, limit, env, log)
 
 
-def run(line: list[str], limit: float, env: dict[str, str], log: TextIO) -> str:
-    """Run a command for a limited time [s]; returns how it ended."""
+def probe(command: list[str], limit: float, out: Path, env: dict, log: TextIO) -> list[str]:
+    """Options of the first changes with which the shipped policy lands; else of the last ones."""
+    options: list[str] = []
+    for changes in CHANGES:
+        options = [part for change in changes for part in ("--set", change)]
+        line = [part.format(out=out) for part in command]
+        run([[*line, *options]], limit, env, log)
+        found = out / f"throws-{PROBE}-on-physx.json"
+        row = json.loads(found.read_text())[0] if found.exists() else {"success": 0.0}
+        if row["success"] > 0.9 and row["error_mean"] < LANDS:
+            break
+        found.unlink(missing_ok=True)
+    return options
+
+
+def run(lines: list[list[str]], limit: float, env: dict[str, str], log: TextIO) -> None:
+    """Run commands side by side for a limited time [s], and say how each ended."""
+    begin = time.time()
     if limit < 5.0:
-        return "not begun: no time left"
-    process = subprocess.Popen(line, env=env, stdout=log, stderr=subprocess.STDOUT)
-    try:
-        return f"status {process.wait(limit)}"
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-        return f"ended after {limit:.0f} s"
+        say(f"not begun: {lines[0][:4]}", env, log)
+        return
+    started = [
+        subprocess.Popen([sys.executable, "-m", *line], env=env, stdout=log, stderr=log)
+        for line in lines
+    ]
+    for line, process in zip(lines, started):
+        try:
+            state = f"status {process.wait(max(0.0, begin + limit - time.time()))}"
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            state = "ended at its limit"
+        say(f"{' '.join(line)}: {state}, {time.time() - begin:.0f} s", env, log)
+
+
+def say(words: str, env: dict[str, str], log: TextIO) -> None:
+    """Print what became of a command, and log it."""
+    for place in (log, sys.stdout):
+        print(f"card {env['CUDA_VISIBLE_DEVICES']}: {words}", file=place, flush=True)
 
 
 def main() -> int:
@@ -108,21 +146,18 @@ def main() -> int:
     until = time.time() + args.seconds
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        cards = [
-            threading.Thread(target=work, args=(card, place, until)) for card in range(len(WORK))
-        ]
+        cards = [threading.Thread(target=work, args=(n, place, until)) for n in range(len(WORK))]
         for card in cards:
             card.start()
         for card in cards:
             card.join()
-        for item in sorted(place.iterdir()):
-            if item.is_dir():
-                with zipfile.ZipFile(args.out / f"{item.name}.zip", "w") as packed:
-                    for file in sorted(item.iterdir()):
-                        packed.write(file, file.name)
-        with zipfile.ZipFile(args.out / "rest.zip", "w", zipfile.ZIP_DEFLATED) as packed:
-            for file in sorted(place.glob("*.*")):
-                packed.write(file, file.name)
+        folders = [item for item in sorted(place.iterdir()) if item.is_dir()]
+        files = {item.name: sorted(item.iterdir()) for item in folders}
+        files["rest"] = sorted(place.glob("*.*"))
+        for name, packed in files.items():
+            with zipfile.ZipFile(args.out / f"{name}.zip", "w", zipfile.ZIP_DEFLATED) as file:
+                for item in packed:
+                    file.write(item, item.name)
     return 0
 
 

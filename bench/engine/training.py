@@ -2,7 +2,6 @@
 afterwards."""
 
 import json
-import math
 import time
 from pathlib import Path
 
@@ -14,33 +13,35 @@ from visthrow.common.storage import write_json
 from visthrow.task import Experiment, contract_of
 from visthrow.training.trainer import Trainer
 
-FIRST = 4  # iterations after which the time of one is known; the first loads kernels
-KEPT = 10  # policies
+FIRST = 4  # iterations after which the pace is known; the first loads kernels
+KEPT = 9  # policies on the way
 
 
 def train(experiment: Experiment, out: Path, seconds: float, device: str, seed: int) -> None:
-    """Train for so many seconds at most, with a schedule that ends then.
+    """Train for so many seconds at most; schedules follow the iterations that the pace allows.
 
     Writes ``policy-K.npz``, the last of them as ``policy.npz``, and with each ``training.json``."""
     begin = time.perf_counter()
     trainer, curve, spent = Trainer(experiment, device, seed), [], 0.0
     built = time.perf_counter() - begin
     made_by = {"seed": seed, "config": config.to_dict(experiment, defaults=False)}
-    last = experiment.iterations
+    last, kept_at, pace = experiment.iterations, 0.0, None
     while trainer.iteration < last:
         step = time.perf_counter()
         figures = trainer.step()
-        step = time.perf_counter() - step
+        now = time.perf_counter()
+        step, left = now - step, seconds - (now - begin)
         spent += step
-        if trainer.iteration == FIRST:
-            left = seconds - (time.perf_counter() - begin)
-            last = min(last, FIRST + max(1, math.floor(0.97 * left / step)))
+        if trainer.iteration >= FIRST:
+            pace = step if pace is None else 0.9 * pace + 0.1 * step
+            last = min(experiment.iterations, trainer.iteration + max(0, int(left / pace)))
             trainer.algorithm.iterations = last
         steps = trainer.iteration * trainer.algorithm.samples
-        kept = trainer.iteration == last or trainer.iteration % math.ceil(last / KEPT) == 0
+        kept = trainer.iteration == last or spent - kept_at > seconds / KEPT
         row = {name: float(figures[name]) for name in ("landing_error", "released", "episodes")}
         curve.append({"seconds": spent, "steps": steps, "kept": kept, **row})
         if kept:
+            kept_at = spent
             policy = trainer.algorithm.export(contract_of(experiment), made_by)
             policy.save(out / f"policy-{trainer.iteration}.npz")
             policy.save(out / "policy.npz")

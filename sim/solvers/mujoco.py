@@ -129,7 +129,7 @@ def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
         there = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(wide, count))
         for name, value in wide.items():
             getattr(there, name).assign(value.astype(np.float32))
-        data = mujoco_warp.make_data(model, nworld=count, njmax=CONSTRAINTS)
+        data = mujoco_warp.make_data(model, nworld=count, njmax=CONSTRAINTS, naconmax=1)
         mujoco_warp.step(there, data)  # modules load, which a capture cannot
         with wp.ScopedCapture(device=device, force_module_load=False) as captured:
             mujoco_warp.step(there, data)
