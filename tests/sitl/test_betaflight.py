@@ -19,6 +19,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.sitl import override
+from bench.sitl.direct import opened, throw
 from hil.links.backends.base import FOLLOW
 from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight, version_text
 from hil.links.device import Device, UdpPort, check_device, open_port
@@ -29,8 +31,6 @@ from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.loopback import test_endings as endings
-from tests.sitl import override
-from tests.sitl.direct import opened, throw
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors

@@ -1,7 +1,7 @@
 """Run a command in a network of its own, loopback alone: a firmware in software listens on every
 address it finds.
 
-    python tests/sitl/alone.py COMMAND ...
+    python bench/sitl/alone.py COMMAND ...
 
 Where the system grants no network namespace it says so and runs the command on this machine's
 network."""

@@ -3,9 +3,9 @@ firmware's settings, by what was named.
 
     visthrow diagnose explain out/firmware/10*/... --plant out/doc.toml --out out/explain
         # of other throws
-    python -m tests.sitl.landings out/firmware/11* --diagnosis out/explain/diagnosis.json
+    python -m bench.sitl.landings out/firmware/11* --diagnosis out/explain/diagnosis.json
 
-Each folder is a throw of `tests.sitl.direct`, with its run and its blackbox. The settings are those
+Each folder is a throw of `bench.sitl.direct`, with its run and its blackbox. The settings are those
 in the first blackbox's header, with the hover's share of throttle and the commands' delay; nothing
 is fitted to these throws but the state from which a prediction begins."""
 

@@ -1,11 +1,11 @@
 """What our controller block gets wrong of Betaflight's: rate doublets through the firmware, the
 block fitted to them, the rest.
 
-    python tests/sitl/alone.py python tests/sitl/identify.py --out out/identify --seconds 36
+    python bench/sitl/alone.py python bench/sitl/identify.py --out out/identify --seconds 36
 
 Writes ``flight.npz``, ``vehicle.toml`` and ``fit.json``: relative rms of the rates on doublets that
 were not fitted, by the shipped block and by the fitted one. ``python -m bench.direct --plant
-tests.sitl.identify:make_fitted`` throws with the fitted vehicle. ``doublets.npz`` is the flight as
+bench.sitl.identify:make_fitted`` throws with the fitted vehicle. ``doublets.npz`` is the flight as
 motion capture and runner see it: `diagnose explain` takes it with the firmware's blackbox. Commands
 wait as in a throw."""
 
@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from bench.sitl.direct import FlightClock, set_up
 from hil.links.backends.base import Held
 from hil.params import HilParams
 from hil.poses.pose import PAYLOAD
@@ -27,7 +28,6 @@ from sim.effects.firmware import calibrated_voltage, controller_of
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, VehicleParams
 from tests.sitl import test_betaflight as bench
-from tests.sitl.direct import FlightClock, set_up
 from visthrow import config
 from visthrow.logs.flightlog import FlightRecorder
 from visthrow.logs.readers.blackbox.decoder import read_blackbox

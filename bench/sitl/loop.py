@@ -1,10 +1,10 @@
 """The loop closed on Betaflight's firmware: throws before, what the diagnosis found, throws after.
 
-    python -m tests.sitl.loop
+    python -m bench.sitl.loop
         # the committed record
-    python tests/sitl/alone.py python -m tests.sitl.loop --name after
+    python bench/sitl/alone.py python -m bench.sitl.loop --name after
         # and again
-    python tests/sitl/alone.py python -m tests.sitl.loop --name gains --policy vision
+    python bench/sitl/alone.py python -m bench.sitl.loop --name gains --policy vision
 
 Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1
 mm and 0.2 deg of noise at 100 Hz, and the same throws on our own block with the policy's own
@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from bench.direct import Direct
+from bench.sitl.direct import throw
 from hil.params import HilParams
 from hil.rehearsal.fake_mocap import FakeMocapParams
-from tests.sitl.direct import throw
 from tests.sitl.test_betaflight import program
 from visthrow import config
 from visthrow.common import provenance

@@ -1,7 +1,7 @@
 """MSP OVERRIDE on Betaflight in software: a pilot hovers, hands over, and what the sticks do when
 the runner is gone; a line of JSON a case.
 
-    python tests/sitl/alone.py python -m tests.sitl.override --firmware PROGRAM
+    python bench/sitl/alone.py python -m bench.sitl.override --firmware PROGRAM
 """
 
 import argparse
@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.sitl.direct import opened
+from bench.sitl.piloted import Piloted
 from hil.control.loop import Loop
 from hil.control.states import State
 from hil.links.backends.betaflight import STICKS
@@ -18,8 +20,6 @@ from hil.params import HilParams
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.hil_flight import AutoOperator
 from tests.loopback import test_endings as endings
-from tests.sitl.direct import opened
-from tests.sitl.piloted import Piloted
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors

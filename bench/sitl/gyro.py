@@ -1,7 +1,7 @@
 """What the blackbox's gyro shows beside the controller block, and why: one throw, without one after
 the other of what makes it differ.
 
-    python tests/sitl/alone.py python -m tests.sitl.gyro --seeds 100 101
+    python bench/sitl/alone.py python -m bench.sitl.gyro --seeds 100 101
 
 The blackbox records each loop of the firmware; the vehicle is the training's with the firmware's
 settings, as `diagnose apply` makes it. What windows leave of the gyro beside their initial states
@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.sitl.direct import SETTINGS, throw
+from bench.sitl.landings import BASE, DELAY
 from hil.params import HilParams
 from hil.rehearsal.bridges.betaflight_bridge import SAMPLE
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake_mocap import FakeMocapParams
-from tests.sitl.direct import SETTINGS, throw
-from tests.sitl.landings import BASE, DELAY
 from tests.sitl.test_betaflight import program
 from visthrow import config
 from visthrow.diagnose.extend import patch

@@ -1,7 +1,7 @@
 """From the newest pose on the wire to the command on the wire, through the firmware's own link,
 beside the runner's own share.
 
-    python tests/sitl/alone.py python -m tests.sitl.latency --seconds 25
+    python bench/sitl/alone.py python -m bench.sitl.latency --seconds 25
 
 Bridge and runner are processes of their own, in real time. The kernel stamps each packet on the
 loopback interface (a packet socket, which a network namespace of one's own grants): poses of the

@@ -1,7 +1,7 @@
 """Throws through the firmware in lock step: runner, link, firmware and vehicle take turns in one
 process, on no clock but theirs.
 
-    python tests/sitl/alone.py python -m tests.sitl.direct --firmware PROGRAM --seeds 0 1 2    # a
+    python bench/sitl/alone.py python -m bench.sitl.direct --firmware PROGRAM --seeds 0 1 2    # a
     line of JSON a throw
 
 The runner is the one that flies, with its state machine, guard, back-end and recorder; poses come

@@ -1,0 +1,1 @@
+"""Programs that measure throws through Betaflight in software, and their records."""
