@@ -51,7 +51,7 @@ def check_device(text: str, *, remote: bool = False) -> Device:
     match = _NETWORK.fullmatch(text)
     if not match:
         raise LinkError(
-            f"device {text[:80]!r} is refused; expected udp:127.0.0.1:14550 (listen),"
+            f"device {text!r:.80} is refused; expected udp:127.0.0.1:14550 (listen),"
             " udpout:127.0.0.1:14550 (send first), tcp:127.0.0.1:5760 or"
             " serial:/dev/ttyACM0:921600"
         )

@@ -25,7 +25,11 @@ NAN_QUATERNION = (math.nan,) * 4
 
 # type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently
 # not followed
-IGNORE_ATTITUDE = 128
+IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+OUR_SYSTEM, OUR_COMPONENT = 245, mav.MAV_COMP_ID_ONBOARD_COMPUTER
+# where system and component stand in a message's bytes
+IDS = {mav.PROTOCOL_MARKER_V1: slice(3, 5), mav.PROTOCOL_MARKER_V2: slice(5, 7)}
+MOST_PENDING = 50  # questions for a time whose answer may still come
 
 
 class Link:
@@ -42,8 +46,8 @@ class Link:
     def __init__(
         self,
         port: Port,
-        system: int = 245,
-        component: int = 191,
+        system: int = OUR_SYSTEM,
+        component: int = OUR_COMPONENT,
         tlog: TlogWriter | None = None,
         roster: Roster | None = None,
         key: bytes | None = None,
@@ -114,7 +118,7 @@ class Link:
                 listener(message, arrival)
             count += 1
         for forged in self.parser.forged:
-            ids = forged[5:7] if forged[0] == mav.PROTOCOL_MARKER_V2 else forged[3:5]
+            ids = forged[IDS[forged[0]]]
             self.roster.refuse(Seen(self.sender, *ids, "message", "no valid signature"))
         return count
 
@@ -251,7 +255,7 @@ class LinkSync:
         if self._link.received and now - self._asked >= self._pause:
             self._asked, self._pause = now, self._random.uniform(*ASK_EVERY)
             stamp = TimeSync.stamp(now)
-            self._pending = [*self._pending[-50:], stamp]
+            self._pending = [*self._pending[-MOST_PENDING:], stamp]
             self._link.send(mav.MAVLink_timesync_message(0, stamp))
 
     def _hear(self, message: Any, arrival: float) -> None:

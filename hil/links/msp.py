@@ -35,9 +35,9 @@ SET_RC_TUNING = FACTS["MSP_SET_RC_TUNING"]
 EEPROM_WRITE = FACTS["MSP_EEPROM_WRITE"]
 
 TO_CONTROLLER, ANSWER, REFUSAL = b"<", b">", b"!"
-MOST_PAYLOAD = (
-    254  # a length of 255 marks a jumbo frame; answers that are used here have some forty bytes
-)
+MOST_PAYLOAD = FACTS["jumbo"] - 1  # answers that are used here have some forty bytes
+START = FACTS["frame_start"]  # of what the checksum goes over
+HEAD = START + 2  # bytes before the payload
 
 
 @dataclass(frozen=True)
@@ -94,14 +94,12 @@ class Parser:
         while (start := buffer.find(b"$")) >= 0:
             del buffer[:start]
             if buffer[1:2] in (b"", b"M") and (len(buffer) < 3 or buffer[2] in b"<>!"):
-                if len(buffer) < 4 or len(buffer) < 6 + buffer[3]:
+                if len(buffer) <= START or len(buffer) <= (end := HEAD + buffer[START]):
                     return frames  # more is to come
-                length = 6 + buffer[3]
-                if xor(buffer[3 : length - 1]) == buffer[length - 1]:
-                    frames.append(
-                        Frame(buffer[4], bytes(buffer[5 : length - 1]), bytes(buffer[2:3]))
-                    )
-                    del buffer[:length]
+                if xor(buffer[START:end]) == buffer[end]:
+                    payload = bytes(buffer[HEAD:end])
+                    frames.append(Frame(buffer[START + 1], payload, bytes(buffer[2:3])))
+                    del buffer[: end + 1]
                     continue
             self.errors += 1
             del buffer[:1]  # look for the next beginning right behind this one

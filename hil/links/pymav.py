@@ -11,6 +11,7 @@ import hashlib
 import hmac
 import os
 import stat
+import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -75,6 +76,9 @@ class Parser:
         return messages
 
 
+SIGNATURE = struct.Struct("<B6s6s")  # at a message's end: link id, time [10 us], signature
+KEY_BYTES = 32
+TICKS = 100_000  # of a signature's time a second
 EPOCH = 1_420_070_400.0  # 2015-01-01, where time stamps of signatures begin [s since 1970]
 # that the first message of a stream may be behind our clock: a minute, in units of 10 us
 BEHIND = 6_000_000
@@ -96,14 +100,14 @@ def read_key(path: str | Path) -> bytes:
         ) from error
     if mode & (stat.S_IRGRP | stat.S_IROTH):
         raise LinkError(f"key {path} can be read by others; expected: chmod 600 {path}")
-    if len(data) == 32:
+    if len(data) == KEY_BYTES:
         return data
     word = data.strip()
     try:
         raw = bytes.fromhex(word.decode("ascii"))
     except (ValueError, UnicodeDecodeError):
         raw = b""
-    if len(raw) == 32:
+    if len(raw) == KEY_BYTES:
         return raw
     if len(word) < LEAST_WORD:
         raise LinkError(
@@ -115,7 +119,7 @@ def read_key(path: str | Path) -> bytes:
 
 def stamp_now() -> int:
     """Return the time as signatures have it [10 us]."""
-    return int((time.time() - EPOCH) * 1e5)
+    return int((time.time() - EPOCH) * TICKS)
 
 
 class Signed(mav.MAVLink):
@@ -141,11 +145,13 @@ class Signed(mav.MAVLink):
 
         The library's own notes the time of a message before it has looked at the signature: one
         forged message with a late time would shut the true sender out."""
-        good = hashlib.sha256(self.signing.secret_key + bytes(msgbuf[:-6])).digest()[:6]
-        if not hmac.compare_digest(good, bytes(msgbuf[-6:])):
+        link, units, signature = SIGNATURE.unpack(msgbuf[-SIGNATURE.size :])
+        signed = bytes(msgbuf[: -len(signature)])
+        good = hashlib.sha256(self.signing.secret_key + signed).digest()[: len(signature)]
+        if not hmac.compare_digest(good, signature):
             return False
-        stream, last = (msgbuf[-13], srcSystem, srcComponent), self.signing.stream_timestamps
-        stamp = int.from_bytes(msgbuf[-12:-6], "little")
+        stream, last = (link, srcSystem, srcComponent), self.signing.stream_timestamps
+        stamp = int.from_bytes(units, "little")
         if stamp <= last.get(stream, stamp_now() - BEHIND) or (
             stream not in last and len(last) >= MOST_STREAMS
         ):

@@ -43,7 +43,7 @@ class Writer:
         """Open the file; raises `StorageError` where it cannot be written."""
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(path, "wb", buffering=1 << 16)  # noqa: SIM115 - closed in close()
+            self._file = open(path, "wb", buffering=65536)  # noqa: SIM115 - closed in close()
         except OSError as error:
             raise StorageError(
                 f"cannot write {path}: {error.strerror}; expected a folder that can be written"

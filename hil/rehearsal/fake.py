@@ -23,23 +23,20 @@ from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams, Mocap
 from visthrow.config.bounds import Bounded, NotNegative
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 
-VEHICLE_ID, PAYLOAD_ID = (
-    (1, 1),
-    (
-        1,
-        25,
-    ),
-)  # MAVLink system and component that poses of vehicle and payload come from
+# MAVLink system and component that poses of vehicle and payload come from
+VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, mav.MAV_COMP_ID_USER1)
 MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were trained with [rad/s]
 
 MOST_EVENTS = 200
 ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
 MOST_KEPT = 100  # breaches
 ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm` asks for [s]
-DESCENT, TOUCH = (
-    0.4,
-    0.12,
-)  # set-point of a landing below the vehicle [m]; height that counts as down [m]
+# set-point of a landing below the vehicle, and at least; height that counts as down [m]
+DESCENT, LOWEST, TOUCH = 0.4, 0.05, 0.12
+# of the policy's vehicle: weight [N], its share of 14 N, straight, tolerance, no voltage
+THRUST = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+GOES_ON = 1.5  # periods after which an event that comes again is a new one
+COVARIANCES = 21  # numbers of a covariance in ODOMETRY
 
 
 class WirePlant(Protocol):
@@ -272,7 +269,7 @@ class Fake(ABC):
         """Note something that the autopilot did by itself, or was told; what goes on from one
         period to the next is one event.
         """
-        goes_on = self.plant.time - self._going_on.get(text, -1e9) < 1.5 * self.plant.period
+        goes_on = self.plant.time - self._going_on.get(text, -1e9) < GOES_ON * self.plant.period
         self._going_on[text] = self.plant.time
         if len(self.events) < MOST_EVENTS and not goes_on:
             self.events.append((round(self.plant.time, 3), text))
@@ -364,7 +361,7 @@ class Fake(ABC):
         if pos[2] < TOUCH:
             self.armed = False
             self.happened("landed, disarmed")
-        return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, 0.05)]))
+        return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, LOWEST)]))
 
     @abstractmethod
     def take(self) -> None:
@@ -434,16 +431,17 @@ class Fake(ABC):
         """Put a pose, as the source writes it, on its way."""
         stamp = int((pose.stamp + self.options.clock_offset) * 1e6)
         if self.options.pose_message == "ODOMETRY":
-            unknown = [float("nan")] * 6
+            unknown = [float("nan")] * 3
             message = mav.MAVLink_odometry_message(
                 stamp,
                 mav.MAV_FRAME_LOCAL_FRD,
                 mav.MAV_FRAME_BODY_FRD,
                 *pose.pos,
                 list(pose.quat),
-                *unknown,
-                [float("nan")] * 21,
-                [float("nan")] * 21,
+                *unknown,  # velocity
+                *unknown,  # rates
+                [float("nan")] * COVARIANCES,
+                [float("nan")] * COVARIANCES,
                 pose.reset % 256,
             )
         else:
@@ -486,7 +484,7 @@ class PortFake(Fake):
     motion capture.
     """
 
-    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+    thrust_map = THRUST
 
     @abstractmethod
     def came(self, data: bytes) -> None:

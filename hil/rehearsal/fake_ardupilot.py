@@ -20,16 +20,12 @@ from hil.links.backends.ardupilot import (
     SERVO_GRIPPER,
     THRUST_AS_THRUST,
 )
-from hil.links.backends.thrust import ThrustParams
 from hil.links.pymav import mav
+from hil.rehearsal.fake import THRUST
 from hil.rehearsal.fake_mavlink import SERVO, FakeMavlink
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
-FULL_CLIMB = (
-    2.5  # climb rate at full thrust where thrust is read as one: PILOT_SPEED_UP's default [m/s]
-)
-CLIMB_GAIN = 5.0  # gain of the climb rate's loop, PSC_VELZ_P's default [1/s]
 ANSWERS = {
     "denied": mav.MAV_RESULT_DENIED,
     "in-progress": mav.MAV_RESULT_IN_PROGRESS,
@@ -42,9 +38,9 @@ class FakeArduPilot(FakeMavlink):
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     modes = (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE)
     usual_mode, pilots_mode = GUIDED, LOITER
-    thrust_map = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+    thrust_map = THRUST
     defaults = {  # noqa: RUF012 - copied by each instance
-        "GUID_OPTIONS": 8.0,
+        "GUID_OPTIONS": float(THRUST_AS_THRUST),
         "ATC_ANGLE_BOOST": 0.0,
         "GUID_TIMEOUT": 0.5,
         "EK3_SRC1_POSXY": float(FACTS["position_source"]),
@@ -90,8 +86,10 @@ class FakeArduPilot(FakeMavlink):
         """Return the set-point as the parameters make it mean."""
         out, now = target.copy(), self.plant.state
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
-            climb = FULL_CLIMB * (2.0 * target[0] / self.plant.max_thrust - 1.0)
-            out[0] = self.weight() * (1.0 + CLIMB_GAIN * (climb - now["vel_w"][2]) / GRAVITY)
+            climb = FACTS["climb_rate"] * (2.0 * target[0] / self.plant.max_thrust - 1.0)
+            out[0] = self.weight() * (
+                1.0 + FACTS["climb_gain"] * (climb - now["vel_w"][2]) / GRAVITY
+            )
         elif self.parameters["ATC_ANGLE_BOOST"]:
             out[0] /= max(matrix_of_quat(now["quat_wb"][None].astype(float))[0, 2, 2], 0.5)
         out[0] = min(max(out[0], 0.0), self.plant.max_thrust)

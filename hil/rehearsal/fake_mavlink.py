@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 
 from hil.links.backends.autopilot import ARMED, CUSTOM
-from hil.links.mavlink_link import IGNORE_ATTITUDE
+from hil.links.facts import values
+from hil.links.mavlink_link import IGNORE_ATTITUDE, OUR_COMPONENT, OUR_SYSTEM
 from hil.links.pymav import mav
 from hil.rehearsal.fake import VEHICLE_ID, Fake
 
-FORCE = 21196  # second parameter of COMPONENT_ARM_DISARM that disarms in flight
+FORCE = values("ardupilot")[
+    "force"
+]  # second parameter of COMPONENT_ARM_DISARM that disarms in flight
+OUTPUTS = 16  # of SERVO_OUTPUT_RAW
+FLIES = 0.3  # height above which it counts as flying [m]
 SERVO = 9  # output of the mechanism, from 1
 
 
@@ -149,7 +154,7 @@ class FakeMavlink(Fake):
 
     def _arm(self, message: Any) -> None:
         wanted = message.param1 == 1.0
-        flying = self.plant.state["pos_w"][2] > 0.3
+        flying = self.plant.state["pos_w"][2] > FLIES
         if wanted and not self.options.arming:
             self.link.send(
                 mav.MAVLink_statustext_message(
@@ -182,7 +187,7 @@ class FakeMavlink(Fake):
             )
         elif self.tells_unknown:
             error = mav.MAVLink_param_error_message(
-                245, 191, name.encode(), -1, mav.MAV_PARAM_ERROR_DOES_NOT_EXIST
+                *(OUR_SYSTEM, OUR_COMPONENT, name.encode(), -1), mav.MAV_PARAM_ERROR_DOES_NOT_EXIST
             )
             self.say(error, self.options.answer_delay)
 
@@ -207,7 +212,7 @@ class FakeMavlink(Fake):
                 )
             )
         elif number == mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW:
-            outputs = [0] * 16
+            outputs = [0] * OUTPUTS
             outputs[SERVO - 1] = self.ends[self.moved]
             self.link.send(
                 mav.MAVLink_servo_output_raw_message(

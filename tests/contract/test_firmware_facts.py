@@ -1,8 +1,8 @@
 """A constant that stands for a firmware's behaviour comes from the table of facts.
 
 In modules that speak for a firmware no number stands outside of module constants and defaults, but
-those of arithmetic; parameter names are rows of the table. What a module constant may hold is ours:
-:data:`CHOICES` names each.
+those of arithmetic; parameter names stand in rows of the table. What a module constant may hold is
+ours: :data:`CHOICES` names each. Numbers that a page gives for a parameter are the table's or ours.
 """
 
 import ast
@@ -11,33 +11,60 @@ from pathlib import Path
 
 import pytest
 
-from hil.links.facts import values
+from hil.links.backends.ardupilot import MOST_SILENCE
+from hil.links.backends.px4 import MOST_LOSS
+from hil.links.facts import FOLDER, facts
 
 ROOT = Path(__file__).resolve().parents[2]
+FIRMWARES = [path.stem for path in FOLDER.glob("*.toml")]
+FACTS = {name: fact for firmware in FIRMWARES for name, fact in facts(firmware).items()}
 
-PLAIN = {0, 1, 2, 3, 4, 0.5, 10, 100, 1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9, 0.01, 255, 65535}
+PLAIN = {0, 1, 2, 3, 4, 0.5, 10, 100, 1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9, 0.01}
+PLAIN |= {255, 256, 65535, 65536, 0xFFFFFFFF}
 """Numbers of arithmetic: ends of ranges, units, axes, numbers of a command, bytes."""
 
 CHOICES = {
-    "hil/links/backends/crazyflie.py": {"ASK", "ARM_PERIOD", "HOLDS", "DESCENT", "SHORTEST"},
-    "hil/links/backends/betaflight.py": {
-        "EXPIRES",
-        "FEWEST_AUX",
-        "LONGEST_DELAY",
-        "NEAR",
-        "KEEP_ALIVE",
-        "OPEN_TIME",
-        "ARM_LOW",
-        "POLLS",
-        "READ_BACK",
-    },
-    "hil/links/crtp.py": set(),
-    "tests/fakes/fake_crazyflie.py": set(),
+    "hil/links/backends/__init__.py": "THRUST_SHORT",
+    "hil/links/backends/audit.py": "ASK_AGAIN GIVE_UP GIVE_UP_OPTIONAL",
+    "hil/links/backends/autopilot.py": "ASK_AGAIN STREAM COMMAND_VALUES SERVO_NEAR",
+    "hil/links/backends/base.py": "REPEAT",
+    "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX LONGEST_DELAY NEAR KEEP_ALIVE OPEN_TIME"
+    " ARM_LOW POLLS READ_BACK",
+    "hil/links/backends/crazyflie.py": "ASK ARM_PERIOD HOLDS DESCENT SHORTEST",
+    "hil/links/backends/px4.py": "MARGIN GAP",
+    "hil/links/backends/thrust.py": "LEAST_SHARES VOLTAGE_RANGE",
+    "hil/links/device.py": "MOST_CHUNKS MOST_SHUT_OUT",
+    "hil/links/mavlink_link.py": "OUR_SYSTEM OUR_COMPONENT IDS MOST_PENDING ASK_EVERY EARLY LATE",
+    "hil/links/pymav.py": "KEY_BYTES TICKS EPOCH BEHIND LEAST_WORD",
+    "hil/links/roster.py": "SILENT MOST_SAID",
+    "hil/links/writer.py": "MOST_WAITING WRITE_EVERY",
+    "hil/rehearsal/bridges/ardupilot_bridge.py": "LOW HIGH NEAR",
+    "hil/rehearsal/bridges/betaflight_bridge.py": "ASK SAMPLE",
+    "hil/rehearsal/bridges/betaflight_firmware.py": "LAST_WORDS LOOK_AGAIN START ANSWER END FREED"
+    " GAINS",
+    "hil/rehearsal/bridges/packets.py": "TIME MOTORS LARGEST_ANSWER SEA_LEVEL STILL CALIBRATION",
+    "hil/rehearsal/bridges/px4_bridge.py": "STREAMS NEAR HALVING MOST_DAMPING SETTLING",
+    "hil/rehearsal/fake.py": "MOST_EVENTS ROOM DESCENT LOWEST TOUCH GOES_ON COVARIANCES THRUST",
+    "hil/rehearsal/fake_command.py": "BRIDGE_ID BALL_LAG",
+    "hil/rehearsal/fake_mavlink.py": "OUTPUTS FLIES SERVO",
 }
-"""Module -> constants that are a choice of ours, not a firmware's behaviour."""
+"""Module -> constants that are a choice of ours or of a protocol, not a firmware's behaviour."""
 
-PARAMETER = re.compile(r"^(flightmode|stabilizer|motorPowerSet|MSP)[._]\w+$")
+PATHS = sorted(
+    str(path.relative_to(ROOT))
+    for folder in ("hil/links", "hil/rehearsal")
+    for path in (ROOT / folder).rglob("*.py")
+) + ["tests/fakes/fake_crazyflie.py"]
+
+PARAMETER = re.compile(
+    r"(flightmode|stabilizer|motorPowerSet)\.\w+|MSP_\w+|[A-Z][A-Z0-9]+_[A-Z0-9_]+"
+)
 """Names that a firmware gave."""
+MESSAGES = re.compile(
+    r"(ATT_POS|VISION_POSITION|SERVO_OUTPUT|COMMAND|PARAM|VFR|SYS|SET_ATTITUDE|ATTITUDE|HIL_STATE"
+    r"|NAMED_VALUE|MAV|LD|VISTHROW)_\w+"
+)
+"""Messages of MAVLink, by the library; variables of processes."""
 
 
 def names(target: ast.expr) -> set[str]:
@@ -45,30 +72,41 @@ def names(target: ast.expr) -> set[str]:
     return {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
 
 
+def has_row(parameter: str) -> bool:
+    """Return whether a row of the table names a parameter."""
+    word = re.compile(rf"\b{re.escape(parameter)}\b")
+    return any(
+        word.search(text)
+        for name, fact in FACTS.items()
+        for text in (name, str(fact.value), fact.text, fact.means)
+    )
+
+
 def offences(text: str, choices: set[str]) -> list[str]:
     """Return numbers and parameter names of a module that have no source, with their line."""
     tree = ast.parse(text)
-    free: set[int] = set()  # literals of ours, and of annotations' bounds
+    free: set[int] = set()  # literals of ours, of annotations' bounds, and defaults of options
     for node in ast.walk(tree):
         ours = isinstance(node, ast.Assign) and set().union(*map(names, node.targets)) & choices
-        bounds = isinstance(node, ast.AnnAssign)
-        if ours or bounds:
+        option = isinstance(node, ast.keyword) and node.arg == "default"
+        if ours or option or isinstance(node, ast.AnnAssign):
             free |= {id(part) for part in ast.walk(node)}
-    rows = set(values("crazyflie")) | set(values("betaflight"))
     found = []
     for node in ast.walk(tree):
-        if not isinstance(node, ast.Constant) or id(node) in free or isinstance(node.value, bool):
+        if not isinstance(node, ast.Constant) or isinstance(node.value, bool):
             continue
-        number = isinstance(node.value, int | float) and abs(node.value) not in PLAIN
-        named = isinstance(node.value, str) and PARAMETER.match(node.value)
-        if number or (named and node.value not in rows):
-            found.append(f"{node.lineno}: {node.value!r}")
+        value = node.value
+        number = isinstance(value, int | float) and abs(value) not in PLAIN and id(node) not in free
+        named = isinstance(value, str) and PARAMETER.fullmatch(value)
+        if number or (named and not MESSAGES.fullmatch(value) and not has_row(value)):
+            found.append(f"{node.lineno}: {value!r}")
     return found
 
 
-@pytest.mark.parametrize("path", CHOICES)
+@pytest.mark.parametrize("path", PATHS)
 def test_no_constant_of_a_firmware_without_a_source(path):
-    assert offences((ROOT / path).read_text(encoding="utf-8"), CHOICES[path]) == []
+    choices = set(CHOICES.get(path, "").split())
+    assert offences((ROOT / path).read_text(encoding="utf-8"), choices) == []
 
 
 @pytest.mark.parametrize("path", CHOICES)
@@ -76,12 +114,12 @@ def test_each_choice_is_still_there(path):
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     bound = {
         name
-        for node in tree.body
+        for node in ast.walk(tree)
         if isinstance(node, ast.Assign)
         for target in node.targets
         for name in names(target)
     }
-    assert CHOICES[path] - bound == set()
+    assert set(CHOICES[path].split()) - bound == set()
 
 
 def test_a_constant_without_a_source_is_found():
@@ -91,3 +129,60 @@ def test_a_constant_without_a_source_is_found():
         "2: 'flightmode.other'",
         "2: 42",
     ]
+    assert offences("rule = equal('GRIP_COLOUR', 1.0)\n", set()) == ["1: 'GRIP_COLOUR'"]
+    assert offences("rule = equal('GRIP_RELEASE', 1.0)\n", set()) == []
+
+
+SAYINGS = [
+    ("betaflight", r"UDP (\d+)", "sensor_port"),
+    ("betaflight", r"UDP \d+ and (\d+)", "radio_port"),
+    ("betaflight", r"sticks count again\s+after ([\d.]+) s", "override_window"),
+    ("crazyflie", r"\(type (\d+) of the generic", "manual"),
+    ("crazyflie", r"CRTP protocol (\d+)", "protocol_state"),
+    ("crazyflie", r"levels after ([\d.]+) s", "levels_after"),
+    ("crazyflie", r"locked after ([\d.]+) s", "stops_after"),
+    ("crazyflie", r"own controller over (\d+)", "manual_thrust"),
+    ("faults", r"2026\.6 and newer \| the pilot's after ([\d.]+) s", "override_window"),
+]
+"""Page, words with a number, and the row that has the number."""
+
+
+@pytest.mark.parametrize(("page", "words", "name"), SAYINGS)
+def test_a_page_gives_the_number_of_the_table(page, words, name):
+    text = (ROOT / f"docs/pilots/{page}.md").read_text(encoding="utf-8")
+    assert float(re.search(words, text)[1]) == FACTS[name].value
+
+
+def unfounded(line: str, firmware: str) -> list[str]:
+    """Return the numbers that a page's line gives for a parameter and no row of it has."""
+    parameters = re.findall(r"\b[A-Z][A-Z0-9]+_[A-Z0-9_]+", line)
+    given = line
+    if not line.startswith("| "):
+        given = " ".join(re.findall(r"\b[A-Z][A-Z0-9]+_[A-Z0-9_]+ (?:is )?(\d[\d.]*)", line))
+    elif not parameters or not line.startswith(f"| {parameters[0]} |"):
+        return []
+    words = [re.sub(r"^SERVO\d+_", "SERVOn_", parameter) for parameter in parameters]
+    rows = [
+        f"{fact.value} {fact.text} {fact.means}"
+        for fact in facts(firmware).values()
+        if any(word in fact.text + fact.means for word in words)
+    ]
+    known = {float(number) for number in NUMBER.findall(" ".join(rows))} | OURS
+    return [number for number in NUMBER.findall(given) if float(number) not in known]
+
+
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
+OURS = {MOST_SILENCE, MOST_LOSS}  # limits that the audit sets
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_numbers_of_parameters_on_a_page_stand_in_the_table(firmware):
+    text = (ROOT / f"docs/pilots/{firmware}.md").read_text(encoding="utf-8")
+    assert [line for line in text.splitlines() if unfounded(line, firmware)] == []
+
+
+def test_a_wrong_number_on_a_page_is_found():
+    assert unfounded("| GRIP_RELEASE | 1900 | opens |", "ardupilot") == ["1900"]
+    assert unfounded("| EK3_SRC1_POSXY | 3 | GPS |", "ardupilot") == ["3"]
+    assert unfounded("It writes SERVO9_FUNCTION 7.", "ardupilot") == ["7"]
+    assert unfounded("| GUID_TIMEOUT | 3 s by default |", "ardupilot") == []

@@ -28,7 +28,12 @@ STREAM = (
 in hover, and the mode, which a heartbeat of 1 Hz tells up to a second late.
 """
 
+COMMAND_VALUES = 7  # of COMMAND_LONG
 SERVO_NEAR = 50  # an output this near to where the mechanism is open counts as open [us]
+
+HEARTBEAT = mav.MAVLink_heartbeat_message(  # ours
+    mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID, 0, 0, mav.MAV_STATE_ACTIVE, 3
+)
 
 ARMED = mav.MAV_MODE_FLAG_SAFETY_ARMED
 CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -159,7 +164,7 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._acknowledged(message)
         elif kind == "STATUSTEXT" and len(self.texts) < 1000:
             self.texts.append(str(message.text))
-        elif kind == "SERVO_OUTPUT_RAW" and 1 <= p.servo_output <= 16:
+        elif kind == "SERVO_OUTPUT_RAW" and p.servo_output:
             value = getattr(message, self._servo, 0)
             if value:
                 self.release_record.output(abs(value - p.servo_open_us) <= SERVO_NEAR)
@@ -284,9 +289,7 @@ class MavlinkAutopilot(Autopilot, ABC):
     def service(self, now: float) -> None:
         if now - self._beat_at >= 1.0:
             self._beat_at = now
-            self._link.send(
-                mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4, 3)
-            )
+            self._link.send(HEARTBEAT)
         if self._heartbeat is not None:
             self.audit.service(now)
             if now - self._streamed > 10.0 and self._wanted is None:
@@ -302,7 +305,7 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     def _command(self, number: int, confirmation: int, *values: float) -> None:
         p = self.params
-        seven = [*map(float, values), *([0.0] * (7 - len(values)))]
+        seven = [*map(float, values), *([0.0] * (COMMAND_VALUES - len(values)))]
         self._link.send(
             mav.MAVLink_command_long_message(
                 p.system, p.component, number, min(confirmation, 255), *seven

@@ -27,7 +27,8 @@ FACTS = values("px4")
 MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = FACTS["posctl"], FACTS["auto"], FACTS["offboard"]
 AUTO_LOITER, AUTO_LAND = FACTS["auto_loiter"], FACTS["auto_land"]
 # set-points are streamed for this long before OFFBOARD is asked for; a longer pause begins anew [s]
-STREAM_FIRST, STREAM_GAP = FACTS["stream_first"] + 0.2, 0.6 / FACTS["stream_hz"]
+MARGIN, GAP = 0.2, 0.6  # more than PX4 asks for [s]; of its longest pause
+STREAM_FIRST, STREAM_GAP = FACTS["stream_first"] + MARGIN, GAP / FACTS["stream_hz"]
 LAND_OR_HOLD = (FACTS["loss_land"], FACTS["loss_hold"])  # values of COM_OBL_RC_ACT
 POSITION_BITS = FACTS["vision_horizontal"] | FACTS["vision_vertical"]  # of EKF2_EV_CTRL
 MOST_LOSS = 0.5  # of COM_OF_LOSS_T [s]: at a throw's rates a vehicle turns over in a second
@@ -57,7 +58,7 @@ class Px4(MavlinkAutopilot):
     _stream_since = _sent_at = -1e9
 
     def _role(self, mode: int) -> str | None:
-        main, sub = mode >> 16 & 255, mode >> 24 & 255
+        main, sub = modes_of(mode)
         if main == MAIN_OFFBOARD:
             return FOLLOW
         if main == MAIN_POSCTL and (self.params.hold == "position" or not self._ours):
@@ -65,7 +66,7 @@ class Px4(MavlinkAutopilot):
         return {AUTO_LOITER: HOLD, AUTO_LAND: LAND}.get(sub) if main == MAIN_AUTO else None
 
     def _mode_text(self, mode: int) -> str:
-        return f"{mode >> 16 & 255}.{mode >> 24 & 255}"
+        return "{}.{}".format(*modes_of(mode))
 
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
         hold = (MAIN_AUTO, AUTO_LOITER) if self.params.hold == "hold" else (MAIN_POSCTL, 0)
@@ -93,7 +94,7 @@ class Px4(MavlinkAutopilot):
         if p.release == "gripper":
             return mav.MAV_CMD_DO_GRIPPER, (p.gripper, mav.GRIPPER_ACTION_RELEASE)
         nan = float("nan")  # leaves the other actuators of the set alone
-        values = [nan] * 6
+        values = [nan] * FACTS["actuators"]
         values[p.gripper - 1] = p.actuator_open
         return mav.MAV_CMD_DO_SET_ACTUATOR, (*values, 0.0)
 
@@ -156,6 +157,12 @@ class Px4(MavlinkAutopilot):
         if p.servo_output and end is not None and "FUNC" in p.output_parameter:
             rules.append(self._open_end(p.output_parameter.replace("FUNC", end), optional=True))
         return rules
+
+
+def modes_of(custom: int) -> tuple[int, int]:
+    """Return main mode and sub-mode of a heartbeat's custom mode."""
+    _, main, sub = struct.unpack(FACTS["mode_layout"], struct.pack("<I", custom))
+    return main, sub
 
 
 def parameter_value(field: float, kind: int) -> float:

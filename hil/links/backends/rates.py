@@ -52,11 +52,12 @@ class RatesParams(Bounded):
         bent = size**4 * expo + size * (1.0 - expo)
         if gain > 2.0:
             gain += FACTS["rate_steep"] * (gain - 2.0)
-        return 200.0 * gain * bent / min(max(1.0 - size * self.rates[axis] / 100.0, 0.01), 1.0)
+        super_rate = min(max(1.0 - size * self.rates[axis] / 100.0, 0.01), 1.0)
+        return FACTS["rate_unit"] * gain * bent / super_rate
 
     def _actual(self, axis: int, size: float) -> float:
         expo, middle = self.expo[axis] / 100.0, 10.0 * self.rc_rates[axis]
-        bent = size * (size**5 * expo + size * (1.0 - expo))
+        bent = size * (size ** FACTS["rate_power"] * expo + size * (1.0 - expo))
         return size * middle + max(0.0, 10.0 * self.rates[axis] - middle) * bent
 
 

@@ -35,12 +35,9 @@ SERVOS = FACTS["json_port"]  # UDP port on which ArduPilot finds the simulation
 HEAD = struct.Struct(
     "<HHI"
 )  # magic, frames a second that it would like, number of the frame; outputs [us] follow
-MAGIC = {FACTS["json_magic_16"]: 16, FACTS["json_magic_32"]: 32}  # outputs of a packet by its magic
-
-OURS = (2, 0, 1, 3)
-"""Where front left, front right, rear left, rear right stand among the outputs of a quadrotor X
-(FRAME_CLASS 1, FRAME_TYPE 1).
-"""
+# outputs of a packet by its magic
+MAGIC = {FACTS[f"json_magic_{size}"]: FACTS[f"json_outputs_{size}"] for size in ("16", "32")}
+OURS = FACTS["motor_order"]
 
 LOW, HIGH, NEAR = (
     1000.0,
@@ -132,7 +129,7 @@ class ArduPilotSitl(Bridge):
         else:
             self.restarts += number < self._number
             self._number, self.frames = number, self.frames + 1
-            self.motors = np.clip((servos[list(OURS)] - LOW) / (HIGH - LOW), 0.0, 1.0)
+            self.motors = np.clip((servos[OURS] - LOW) / (HIGH - LOW), 0.0, 1.0)
             at, opens = self.params.servo_output - 1, self.params.servo_open_us
             self.output(0 <= at < len(servos) and abs(servos[at] - opens) <= NEAR, self.plant.time)
             super().fly()

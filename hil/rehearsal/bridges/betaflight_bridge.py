@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hil.links import msp
-from hil.links.backends.betaflight import BOX_ARM, HIGH, NEAR, STICKS, BetaflightParams
+from hil.links.backends.betaflight import BOX_ARM, FACTS, HIGH, NEAR, STICKS, BetaflightParams
 from hil.links.device import Device, TcpPort, chunks
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_firmware import PORTS
@@ -111,7 +111,7 @@ class BetaflightSitl(Bridge):
             self.output(at < len(channels) and abs(channels[at] - HIGH) <= NEAR, self.heard)
 
     def _hear_status(self, frame: msp.Frame) -> None:
-        flags, cycle = frame.number("<I", 6) or 0, frame.number("<H", 0)
+        flags, cycle = frame.number("<I", FACTS["status_flags"]) or 0, frame.number("<H", 0)
         armed = BOX_ARM in self._boxes and bool(flags >> self._boxes.index(BOX_ARM) & 1)
         if armed != self.armed:
             self.happened("armed" if armed else "disarmed")

@@ -20,13 +20,13 @@ import time
 from pathlib import Path
 
 from hil.errors import RunError
-from hil.links.backends.betaflight import STICKS, BetaflightParams
+from hil.links.backends.betaflight import FACTS, STICKS, BetaflightParams
 from hil.rehearsal.bridges.packets import at_rest, stood
 
-PORTS = (
-    5761,
-    5762,
-)  # TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
+# TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
+PORTS = (FACTS["serial_port"] + 1, FACTS["serial_port"] + 2)
+LAST_WORDS = 200  # of its output, in an error
+LOOK_AGAIN = 0.02  # for a port that opens [s]
 START, ANSWER, END = (
     20.0,
     20.0,
@@ -207,9 +207,10 @@ class Firmware:
             if not self.runs or time.monotonic() > end:
                 self.stop()
                 raise RunError(
-                    f"the firmware does not listen on port {PORTS[0]}; its words: {words[-200:]!r}"
+                    f"the firmware does not listen on port {PORTS[0]};"
+                    f" its words: {words[-LAST_WORDS:]!r}"
                 )
-            time.sleep(0.02)
+            time.sleep(LOOK_AGAIN)
         return words
 
     @property
@@ -319,7 +320,8 @@ class CommandLine:
                 chunk = b""
             if not chunk:
                 raise RunError(
-                    f"the firmware's command line does not answer; last words {data[-80:]!r}"
+                    "the firmware's command line does not answer;"
+                    f" last words {data[-LAST_WORDS:]!r}"
                 )
             data += chunk
         return data.decode("ascii", "replace")

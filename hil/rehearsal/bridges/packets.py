@@ -22,9 +22,11 @@ from contextlib import contextmanager, suppress
 import numpy as np
 
 from hil.errors import RunError
+from hil.links.facts import values
 
-GRAVITY = 9.80665  # of the firmware's accelerometer [m/s^2]
-SENSORS = 9003  # UDP port that samples go to
+FACTS = values("betaflight")
+GRAVITY = FACTS["gravity"]  # of the firmware's accelerometer [m/s^2]
+SENSORS = FACTS["sensor_port"]  # UDP port that samples go to
 FDM = struct.Struct(
     "<18d"
 )  # stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure
@@ -33,7 +35,7 @@ TIME, MOTORS, LARGEST_ANSWER = (
     4,
     4096,
 )  # bytes of the firmware's time before its answers; motors in one; bytes of all
-OURS = (2, 0, 1, 3)  # where front left, front right, rear left, rear right stand in an answer
+OURS = FACTS["motor_order"]
 SEA_LEVEL = 101325.0  # [Pa]
 
 STILL, CALIBRATION = 0.002, 3.0

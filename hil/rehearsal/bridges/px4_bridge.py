@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hil.links.backends.px4 import Px4Params, parameter_value
+from hil.links.facts import values
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.rehearsal.fake import Bridge, FakeOptions
@@ -43,7 +44,9 @@ FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down and forward, right, down
 HALVING = 1.4  # a slow swing halves in this time, as below the simulator's hovering vehicle [s]
 MOST_DAMPING = 0.15  # of the ball [m/s^2], so that it takes 2 % off a throw
 
-EQUATOR, FLATTENING = 6378137.0, 1.0 / 298.257223563  # WGS 84 [m]
+FACTS = values("px4")
+EQUATOR, ECCENTRICITY = FACTS["earth_radius"], FACTS["earth_eccentricity"]
+DEGREE = FACTS["degree_unit"]  # of a latitude on the wire [deg]
 SETTLING = 0.3  # in which the place, integrated from velocities, follows the latitude's steps [s]
 
 
@@ -198,9 +201,9 @@ class Place:
 
     def __init__(self, latitude: float, longitude: float, altitude: float) -> None:
         """Measure from an origin [deg, deg, m]."""
-        flat = FLATTENING * (2.0 - FLATTENING)
+        flat = ECCENTRICITY**2
         curve = 1.0 - flat * math.sin(math.radians(latitude)) ** 2
-        north = EQUATOR * (1.0 - flat) / curve**1.5
+        north = EQUATOR * (1.0 - flat) / (curve * math.sqrt(curve))
         east = EQUATOR / math.sqrt(curve) * math.cos(math.radians(latitude))
         self._origin = np.array([latitude, longitude, altitude])
         self._scale = np.array([math.radians(north), -math.radians(east), 1.0])
@@ -209,7 +212,11 @@ class Place:
     def update(self, time: float, message: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return place [m] and velocity [m/s] at a time [s], z up, by a HIL_STATE_QUATERNION."""
         vel = FLIP * [rounded(v, 1e-2) for v in (message.vx, message.vy, message.vz)]
-        where = [rounded(message.lat, 1e-7), rounded(message.lon, 1e-7), rounded(message.alt, 1e-3)]
+        where = [
+            rounded(message.lat, DEGREE),
+            rounded(message.lon, DEGREE),
+            rounded(message.alt, 1e-3),
+        ]
         pos = self._scale * (where - self._origin)
         step = time - self._time
         if 0.0 < step < SETTLING:
@@ -266,7 +273,7 @@ class Px4Sih(Bridge):
         elif kind == "PARAM_VALUE" and message.param_id in ORIGIN:
             value, kind = message.param_value, message.param_type
             # up to 1.14 latitude and longitude are integers
-            unit = 1e-7 if kind == mav.MAV_PARAM_TYPE_INT32 else 1.0
+            unit = DEGREE if kind == mav.MAV_PARAM_TYPE_INT32 else 1.0
             self._origin[message.param_id] = unit * parameter_value(value, kind)
             if len(self._origin) == len(ORIGIN) and self._place is None:
                 self._place = Place(*(self._origin[name] for name in ORIGIN))
