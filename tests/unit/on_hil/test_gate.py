@@ -51,6 +51,35 @@ def test_each_reason(second, reason):
     assert gate.refused == ({} if reason is None else {reason: 1})
 
 
+def turned(angle: float, norm: float = 1.0):
+    return (0.0, norm * math.sin(angle / 2.0), 0.0, norm * math.cos(angle / 2.0))
+
+
+@pytest.mark.parametrize(
+    ("at", "limit", "reason"),
+    [
+        (lambda x: pose(0.01, x), 0.12 + 20.0 * 0.01**2, "jump"),  # 0.5 * 40 m/s^2
+        (lambda x: pose(0.02, -x), 0.12 + 20.0 * 0.02**2, "jump"),
+        (lambda a: pose(0.01, 0.01, turned(a)), 0.3 + 15.0 * 0.01, "turn"),
+        (lambda a: pose(0.02, 0.01, turned(-a)), 0.3 + 15.0 * 0.02, "turn"),
+        (lambda n: pose(0.01, 0.01, turned(0.0, n)), 1.02, "quaternion"),
+        (lambda v: pose(0.01, 0.01, vel=(0.0, -v, 0.0)), 8.0, "speed"),
+    ],
+)
+def test_limits_just_inside_and_just_outside(at, limit, reason):
+    for share, expected in ((0.999, None), (1.001, reason)):
+        gate = Gate(PARAMS)
+        gate.check(pose())
+        assert gate.check(at(share * limit), (0.0, 0.0, 0.0)) == expected
+
+
+def test_without_a_velocity_the_largest_speed_bounds_the_way():
+    for x, expected in ((0.199, None), (0.201, "speed")):
+        gate = Gate(PARAMS)
+        gate.check(pose())
+        assert gate.check(pose(0.01, x)) == expected
+
+
 def test_a_swapped_body_is_never_taken_back_by_waiting():
     gate = Gate(PARAMS)
     gate.check(pose())
@@ -150,8 +179,9 @@ def test_a_stamp_that_is_no_time_spoils_no_velocity():
 
 
 def test_wrong_limits():
-    with pytest.raises(ConfigError, match="ascending"):
-        GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.1, 0.04, 0.25)
+    for ages in ((0.1, 0.04, 0.25), (0.04, 0.1, 0.1), (0.04, 0.3, 0.25), (0.1, 0.1, 0.25)):
+        with pytest.raises(ConfigError, match="ascending"):
+            GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, *ages)
     with pytest.raises(ConfigError, match=r"quat_tolerance is 0.0; expected above 0"):
         GateParams(0.0, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
 

@@ -285,6 +285,18 @@ def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware,
     assert log["motor_output"].values[0].tolist() == [1000 + 10 * n for n in order]
 
 
+@pytest.mark.parametrize(
+    ("ignored", "quality", "good"), [(0, 0, True), (1, 0, False), (0, -1, False)]
+)
+def test_external_poses_that_ardupilot_ignored_are_invalid(ignored, quality, good, tmp_path):
+    rows = [
+        ("VISP", (1000 * i, 0, i, swing(i), 0.0, -1.0, 0, 0, 0, 0, 0, 0, ignored, quality))
+        for i in range(10)
+    ]
+    logfiles.write_bin(tmp_path / "a.BIN", {"VISP": logfiles.VISP}, rows)
+    assert np.all(read(tmp_path / "a.BIN")[0]["mocap_pos_w"].valid == good)
+
+
 def test_external_odometry_and_ground_truth_are_channels_of_their_own(tmp_path):
     odometry = ["uint64_t timestamp", "float[3] position", "float[4] q", "int8_t quality"]
     truth = ["uint64_t timestamp", "float x", "float y", "float z"]
