@@ -161,4 +161,4 @@ def test_a_throw_that_ends_without_a_release_is_counted():
     walk = Walk("throw")
     walk.after(TICK, payload=HOLD)
     assert walk.machine.cancelled == 1
-    assert State.RECOVER == walk.machine.state
+    assert walk.machine.state == State.RECOVER
