@@ -4,76 +4,26 @@ is judged.
 
 import importlib
 import json
-import os
 import shlex
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from bench import camera as bench_camera
-from bench import commands, fleet, mpc, report, sim_gpu, start, time_to_error, train
 from bench import mujoco_warp as bench_mujoco_warp
+from bench import report, start, train
 from bench import sim as sim_cpu
 from visthrow import cli, config
-from visthrow.common.errors import StorageError, VisthrowError
+from visthrow.common.errors import StorageError
 from visthrow.onboard.policy import find_policy
 from visthrow.paper import measurements
-from visthrow.task import Experiment, plant_of
-
-
-@pytest.fixture(scope="module")
-def experiment() -> Experiment:
-    return config.load(Experiment, config.find("train", "state"))
+from visthrow.task import Experiment
 
 
 @pytest.fixture
 def kept(tmp_path, monkeypatch) -> Path:
     monkeypatch.setattr(measurements, "FOLDER", tmp_path)
     return tmp_path
-
-
-def test_longest_accurate_step_finds_the_last_good_one():
-    def error(step: float) -> float:
-        return 0.0 if step <= 0.0007 else float("nan")
-
-    found = sim_cpu.longest_accurate_step(error, 0.5, 1e-3)
-    count = round(0.5 / found)
-    assert error(found) == 0.0
-    assert np.isnan(error(0.5 / (count - 1)))
-    with pytest.raises(VisthrowError, match="too long already"):
-        sim_cpu.longest_accurate_step(lambda _: 1.0, 0.5, 1e-3)
-
-
-def test_pinning_restores_the_cores():
-    before = os.sched_getaffinity(0)
-    with sim_cpu.on_one_core() as core:
-        assert os.sched_getaffinity(0) == {core}
-    assert os.sched_getaffinity(0) == before
-    with pytest.raises(VisthrowError, match="expected one of"), sim_cpu.on_one_core(10**6):
-        pass
-
-
-def test_commands_stay_within_limits(experiment):
-    limits, plant = experiment.task.action, plant_of(experiment)
-    full = commands.draw("full", plant, limits, 5, 200)
-    assert full[..., 0].min() >= 0.0
-    assert full[..., 0].max() <= limits.max_thrust
-    assert (np.abs(full[..., 1:]) <= np.float32(limits.max_rate)).all()
-    assert not np.array_equal(full[0], full[1])
-
-
-def test_graph_replays_every_command(experiment):
-    """Two replays from a start equal the same steps one by one."""
-    graph = sim_gpu.Graph(experiment, 3, "full", "cpu", steps=2)
-    graph.rate(replays=2)
-    replayed = graph.sim.get("pos_w").copy()
-    by_hand = sim_gpu.Graph(experiment, 3, "full", "cpu", steps=2)
-    by_hand.sim.randomize(by_hand.spreads)
-    for _ in range(2):
-        by_hand._advance()
-    assert np.array_equal(by_hand.sim.get("pos_w"), replayed)
 
 
 def test_bench_sim_against_mujoco_writes_a_record(kept, tmp_path, capsys):
@@ -99,15 +49,6 @@ def test_bench_sim_against_mujoco_writes_a_record(kept, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "## tiny" in printed
     assert "hard throw" in printed
-
-
-def test_missing_mujoco_warp_is_told_with_its_cure(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
-    with pytest.raises(ModuleNotFoundError):
-        import mujoco_warp  # noqa: F401
-    found = bench_mujoco_warp.measure("cpu", 1, 0.02)
-    assert set(found) == {"why_not"}
-    assert "pip install mujoco-warp" in found["why_not"]
 
 
 @pytest.mark.slow  # MuJoCo Warp's kernels compile for half a minute
@@ -234,49 +175,3 @@ def test_mistakes_are_told(capsys):
 def test_mistakes_of_developers_are_told(of, words, message, capsys):
     assert of.main(words.split()) == 2
     assert message in capsys.readouterr().err
-
-
-def test_mpc_steps_are_timed_and_recorded(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("piqp")
-    from visthrow.paper.baseline import spline
-
-    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr(mpc, "TARGETS", (1.5,))
-    monkeypatch.setattr(measurements, "FOLDER", tmp_path)
-    assert mpc.main(["--throws", "1", "--record", "mpc-test"]) == 0
-    rows = measurements.load(tmp_path / "mpc-test.json")["figures"]["rows"]
-    assert [row["plant"] for row in rows] == ["pendulum", "hybrid"]
-    for row in rows:
-        assert 0.0 < row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
-        assert row["steps"] > 40
-    assert "| 1.5 m" in capsys.readouterr().out
-    assert mpc.main(["--throws", "0"]) == 2
-
-
-def test_a_training_to_an_error_is_told_as_it_ends(capsys):
-    """What the first seeds took is not lost with the last one."""
-    small = ["ppo.environments=16", "ppo.iterations=2", "ppo.hidden=[8]", "ppo.steps=4"]
-    experiment = config.load(Experiment, config.find("train", "laptop"), small)
-    found = time_to_error.measure({"laptop": experiment}, "cpu", [100.0, 1e-6], [3, 4], 1.0, 1)
-    told = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in told] == ["seed 3", "seed 4"]
-    assert all("1e-06 m never" in line for line in told)
-    assert len(found.figures["runs"]["laptop"]) == 2
-
-
-def test_of_a_fleet_is_kept_how_its_vehicles_spread_and_no_row_of_each():
-    vehicles = [*map(str, range(41)), "x500"]
-    rows = [
-        fleet.Row("any", v, t, 6, 6, 0.001 * i + 0.01 * t, 1.0)
-        for i, v in enumerate(vehicles)
-        for t in fleet.TARGETS
-    ]
-    found = fleet._report(rows, {})
-    assert [row[:3] for row in found.tables[0].rows] == [
-        ("drawn", "any", "41"),
-        ("x500", "any", "1"),
-    ]
-    (spread,) = found.figures["spread"]
-    assert (spread["vehicles"], spread["n"]) == ("drawn", 41)
-    assert spread["error"]["2"] == pytest.approx(0.02 + 0.04 * np.array(fleet.QUANTILES), abs=5e-5)
-    assert spread["error"]["all"] == spread["error"]["2"], "the mean target is the middle one"

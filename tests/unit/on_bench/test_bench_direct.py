@@ -67,20 +67,6 @@ def test_the_same_seed_gives_the_same_commands():
     assert first == second
 
 
-def test_poses_are_as_old_as_over_the_wire():
-    """10 ms and up to a period of the motion capture, lost ones left lateral."""
-    kinds = {}
-    for seed in range(20):
-        direct = made(seed)
-        kinds.setdefault((direct._phase, direct._in_time), seed)
-    expected = {(0, True): 0.010, (0, False): 0.020, (1, True): 0.015, (1, False): 0.015}
-    assert set(kinds) == set(expected), "all that can happen over the wire happens"
-    for kind in ((0, True), (0, False), (1, True)):
-        ages = flown(kinds[kind])[3]
-        assert ages.min() >= 0.01 - 1e-9
-        assert np.median(ages) == pytest.approx(expected[kind], abs=1e-6)
-
-
 def test_a_policy_that_never_releases_ends():
     report, params, _, _ = flown(0, (HOVER, 0.0, 0.0, 0.0, -1.0))
     assert (report["latch"], scored(report, params, 0.0)["error"]) == (None, None)
