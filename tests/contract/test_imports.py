@@ -36,7 +36,9 @@ EXTRAS = (  # packages that an installation without extras lacks
     *("mujoco", "piqp", "pyulog", "rosbags", "h5py", "mcap", "skimage", "submitit", "serial"),
     *("cflib", "cyclonedds", "natnet", "motioncapture", "mujoco_warp", "aeroid"),
 )
-ON_THE_GROUND = ("warp", "rsl_rl", "tensordict", "kornia", "rerun", "pyarrow")  # extras train, view
+ON_THE_GROUND = (  # extras train, view, pictures
+    *("warp", "rsl_rl", "tensordict", "kornia", "rerun", "pyarrow", "cv2", "matplotlib"),
+)
 BLOCKED_ON_BOARD = ("sim", "warp", "rsl_rl", "tensordict", "mujoco")
 
 
@@ -144,14 +146,14 @@ for words in {commands!r}:
 
 
 def test_what_flies_needs_neither_train_nor_view(tmp_path):
-    """A run on recorded poses, its replay and a camera's picture; the rest names its extra."""
+    """A run on recorded poses and its replay; the rest names its extra."""
     poses = ROOT / "tests" / "data" / "payload_cf_single" / "log201.csv.gz"
     source = f"source.file={poses}"
     flying = [
         ["hil", "run", "--config", "crazyflie_log", "--set", source, "--out", "run"],
         ["hil", "replay", "run"],
     ]
-    refused = {"fly": "train", "train laptop": "train", "hil view run": "view"}
+    refused = {"fly": "train", "train laptop": "train", "hil view run": "pictures"}
     code = f"""
 import contextlib, io, sys
 sys.modules.update(dict.fromkeys({(*ON_THE_GROUND, *EXTRAS)!r}))

@@ -1,8 +1,9 @@
 """Code blocks of the pages, and what runs them.
 
 A fence is run by its language: ``sh`` a line at a time, ``python`` as one program, and any language
-with a ``title="NAME"`` becomes the file of that name beside the commands. ``text`` is what a
-command printed. Comments in front of a fence, unseen by a reader, say more:
+with a ``title="NAME"`` becomes the file of that name beside the commands. ``text`` is what the
+commands above it printed, which is compared. Comments in front of a fence, unseen by a reader, say
+more:
 
     <!-- run with: --throws 2 -->
         these arguments are added to each visthrow command of the block, to make it cheaper
@@ -18,6 +19,7 @@ wrote is copied. A training is evaluated with 20 throws for 200."""
 import contextlib
 import dataclasses
 import hashlib
+import io
 import os
 import re
 import runpy
@@ -51,6 +53,9 @@ FENCE = re.compile(
     r'((?:<!--[^\n]*-->\n+)*)^```(\w*)(?: title="([^"\n]+)")?[^\n]*\n(.*?)^```[ \t]*$',
     re.MULTILINE | re.DOTALL,
 )
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+TOLERANCE = 0.1
+"""Of a number that a page shows, relative; two units of its last place come on top."""
 PATIENCE = 300.0
 """For the processes of one block [s]."""
 
@@ -160,6 +165,8 @@ class Runner:
         self.done: dict[
             str, Path
         ] = {}  # digest of a command and its files -> copy of what it wrote
+        self.printed: dict[str, str] = {}  # by the same digest
+        self.last: list[str] = []  # digests of the block that ran last
         self.seconds: dict[str, float] = {}  # place and command -> processor time [s]
 
     def run(self, blocks: list[Block]) -> None:
@@ -194,8 +201,12 @@ class Runner:
                     assert block.language == "text", (
                         f"{block.place}: nothing is done with {block.language!r}; give it a title"
                     )
+                    printed = [self.printed.get(digest, "") for digest in self.last]
+                    written = [path.read_text(encoding="utf-8") for path in Path().glob("*.toml")]
+                    check_shown(block, "\n".join([*printed, *written]))
 
     def _run_commands(self, block: Block) -> None:
+        self.last = []
         for jobs in (
             [block.commands()] if block.terminals else [[words] for words in block.commands()]
         ):
@@ -204,6 +215,7 @@ class Runner:
                 for words in jobs
             ]
             digest = _digest(jobs)
+            self.last += [digest]
             if digest in self.done:
                 shutil.copytree(self.done[digest], ".", dirs_exist_ok=True)
                 continue
@@ -211,13 +223,37 @@ class Runner:
             if len(jobs) > 1:
                 _side_by_side(jobs, block.place)
             else:
-                _one(jobs[0], block.place)
+                self.printed[digest] = _one(jobs[0], block.place)
             self.seconds[f"{block.place} {' '.join(jobs[0])}"] = _processor() - start
             self.done[digest] = kept = self.work / f"kept-{len(self.done)}"
             kept.mkdir()
             for path in sorted(_files() - before):
                 (kept / path[0]).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(path[0], kept / path[0])
+
+
+def check_shown(block: Block, printed: str) -> None:
+    """Compare the lines of a text fence with what was printed, or stands in a file that was
+    written: the same words, and numbers within :data:`TOLERANCE`.
+    """
+    lines = [line.strip() for line in printed.splitlines()]
+    for shown in filter(None, map(str.strip, block.text.splitlines())):
+        near = [line for line in lines if NUMBER.sub("#", line) == NUMBER.sub("#", shown)]
+        assert any(_close(shown, line) for line in near), (
+            f"{block.place}: the page shows {shown!r}; the command prints {near or lines[-20:]}"
+        )
+
+
+def _close(shown: str, printed: str) -> bool:
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True)
+    return all(
+        abs(float(one) - float(other)) <= TOLERANCE * abs(float(one)) + 2 * 10 ** -_places(one)
+        for one, other in pairs
+    )
+
+
+def _places(number: str) -> int:
+    return len(number.partition(".")[2])
 
 
 def parse(block: Block) -> None:
@@ -227,14 +263,21 @@ def parse(block: Block) -> None:
             assert cli.build_parser().parse_args(words[1:]).command == words[1], block.place
 
 
-def _one(words: list[str], place: str) -> None:
+def _one(words: list[str], place: str) -> str:
+    """Run one command and return what a visthrow command printed."""
+    output = io.StringIO()
     if words[0] == "visthrow":  # in this process: most of a command's time is what it imports
-        status = cli.main(words[1:])
+        try:
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+                status = cli.main(words[1:])
+        finally:
+            print(output.getvalue())
     elif words[0].startswith("python "):  # as above
         status = _program(shlex.split(words[0])[1:])
     else:
         status = subprocess.run(["bash", "-ec", words[0]], env=_environment()).returncode
     assert status == 0, f"{place}: status {status}: {' '.join(words)}"
+    return output.getvalue()
 
 
 def _program(argv: list[str]) -> int:

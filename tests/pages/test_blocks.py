@@ -26,7 +26,7 @@ visthrow config vehicle mine.toml  # a remark
 echo x > made.txt
 ```
 ```text
-what it printed
+mass = 0.211
 ```
 <!-- not run: a GPU -->
 ```sh
@@ -73,6 +73,10 @@ def test_a_module_that_a_test_has_imported_runs_anew(tmp_path, monkeypatch):
         ("```sh\nvisthrow fly --no-such-option\n```\n", "2"),
         ("```python\nassert 1 == 2, 'wrong'\n```\n", "wrong"),
         ("<!-- not run: a GPU -->\n```sh\nvisthrow train --no-such-option\n```\n", "2"),
+        (
+            "```sh\nvisthrow config vehicle paper\n```\n```text\nmass = 0.40\n```\n",
+            "the page shows",
+        ),
         ("```toml\nbase = 'x'\n```\n", "give it a title"),
         ('```toml title="lonely.toml"\nbase = "x"\n```\n', "nothing on the page uses lonely.toml"),
         (

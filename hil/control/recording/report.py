@@ -2,6 +2,7 @@
 times.
 """
 
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from visthrow.common.errors import VisthrowError
 from visthrow.onboard.calibration import Calibration
 
 LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
+PICTURE_PACKAGES = ("matplotlib", "cv2")  # of the extra pictures
 
 
 def summary_text(summary: dict[str, Any], folder: Path) -> str:
@@ -74,8 +76,13 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
     from visthrow.view import strip
 
     folder, lines = Path(folder), []
+    missing = [name for name in PICTURE_PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        lines.append(
+            f"no pictures without {' and '.join(missing)}: pip install 'visthrow[pictures]'"
+        )
     try:
-        if stages is not None:
+        if stages is not None and not missing:
             draw(
                 folder / LATENCY_PICTURE,
                 stages,
@@ -94,7 +101,7 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
             if result["success"]:
                 how = f"{result['error']:.3f} m from the goal after {result['duration']:.2f} s"
             lines.append(f"{path}  throw {number}: {how}")
-            if "landing" in log:
+            if "landing" in log and not missing:
                 strip.draw(throw_path(folder, number, ".png"), log, played.playback.params.camera)
     except VisthrowError as error:
         lines.append(f"not all could be written: {error}")

@@ -44,7 +44,9 @@ class Status:
 
 
 class Backend:
-    """A receiver of commands; no call waits or raises. What a child leaves out does nothing."""
+    """A receiver of commands whose calls never wait or raise.
+
+    Methods that a subclass does not define do nothing."""
 
     name = ""
     holds = False  # whether the autopilot has modes of its own that hold a place and land

@@ -1,6 +1,6 @@
 """Recorded data of others: what is said of each, and what is not.
 
-The reasons stand in docs/explanation/real_data.md.
+The reasons stand in docs/explanation/diagnosis_trust.md and the record recorded-data-page.
 
 With the environment variable VISTHROW_REAL_DATA naming a folder of the full data sets, all of their
 files are looked at."""
