@@ -53,7 +53,7 @@ FENCE = re.compile(
     r'((?:<!--[^\n]*-->\n+)*)^```(\w*)(?: title="([^"\n]+)")?[^\n]*\n(.*?)^```[ \t]*$',
     re.MULTILINE | re.DOTALL,
 )
-NUMBER = re.compile(r"\d+(?:\.\d+)?")
+NUMBER, TIMED = re.compile(r"\d+(?:\.\d+)?"), re.compile(r" [\d.]+ s$")
 TOLERANCE = 0.1
 """Of a number that a page shows, relative; two units of its last place come on top."""
 PATIENCE = 300.0
@@ -203,7 +203,7 @@ class Runner:
                     )
                     printed = [self.printed.get(digest, "") for digest in self.last]
                     written = [path.read_text(encoding="utf-8") for path in Path().glob("*.toml")]
-                    check_shown(block, "\n".join([*printed, *written]))
+                    check_shown(block.text, "\n".join([*printed, *written]), block.place)
 
     def _run_commands(self, block: Block) -> None:
         self.last = []
@@ -232,15 +232,15 @@ class Runner:
                 shutil.copy2(path[0], kept / path[0])
 
 
-def check_shown(block: Block, printed: str) -> None:
-    """Compare the lines of a text fence with what was printed, or stands in a file that was
-    written: the same words, and numbers within :data:`TOLERANCE`.
+def check_shown(text: str, printed: str, place: str) -> None:
+    """Compare each line that a page shows with what was printed: the same words, and numbers within
+    :data:`TOLERANCE`. A line that ends with a time says how long the machine took.
     """
     lines = [line.strip() for line in printed.splitlines()]
-    for shown in filter(None, map(str.strip, block.text.splitlines())):
+    for shown in filter(None, map(str.strip, text.splitlines())):
         near = [line for line in lines if NUMBER.sub("#", line) == NUMBER.sub("#", shown)]
-        assert any(_close(shown, line) for line in near), (
-            f"{block.place}: the page shows {shown!r}; the command prints {near or lines[-20:]}"
+        assert any(TIMED.search(line) or _close(shown, line) for line in near), (
+            f"{place}: the page shows {shown!r}; the command prints {near or lines[-20:]}"
         )
 
 

@@ -5,12 +5,16 @@ import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
+import torch
 
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
+from hil.poses.sources import images
 from tests.unit.on_view import test_camera_command as drawn
 from visthrow import config
+from visthrow.training import rewards, trainer
 
 ROOT = Path(__file__).resolve().parents[2]
 BALLS = ROOT / "tests" / "data" / "real" / "jugglebot_throws" / "session7.csv.gz"
@@ -25,6 +29,7 @@ RUNS = {
     "diagnose_csv": (f"{BALLS} --tracks 1", "tracks, 1 used"),
     "add_effect": ("--size 0.02", "the ball moves by"),
     "add_source": ("--seconds 0.5", "the policy's command is"),
+    "fly_keypoints": ("", "thrust [N]"),
     "step_simulator": ("--count 2 --seconds 0.1", "the first ball at"),
 }
 """Program -> its arguments, and what it prints."""
@@ -73,8 +78,41 @@ def test_a_flight_is_exported(tmp_path, monkeypatch, capsys):
     assert "payload_pos_w" in (tmp_path / "flight.csv").read_text().splitlines()[0]
 
 
+def test_a_reward_term_is_trained_with(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rewards, "kinetic", rewards.kinetic)
+    monkeypatch.setattr(trainer, "EVALUATED", 4)
+    with pytest.raises(SystemExit, match="0"):
+        run(
+            "add_reward",
+            "train laptop --iterations 1 --set ppo.environments=8 --out calmer --device cpu",
+            monkeypatch,
+        )
+    assert rewards.kinetic.__name__ == "calmer"
+    assert (tmp_path / "calmer" / "policy.npz").exists()
+
+
+def test_a_detector_finds_what_its_network_says(monkeypatch):
+    monkeypatch.setattr(images, "DETECTORS", dict(images.DETECTORS))
+    program = runpy.run_path(str(ROOT / "examples" / "add_detector.py"))
+    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    picture = np.zeros((camera.fisheye.height, camera.fisheye.width, 3), np.uint8)
+    lens = Fisheye(camera.fisheye)
+    seen = images.DETECTORS["mine"](lens, camera.payload_radius, camera.goal_side).detect(picture)
+    left, right = program["network"](picture)[1][::2]
+    (u, _), _ = lens.project(torch.tensor(seen.ball.ray_c))
+    assert float(u) == pytest.approx((left + right) / 2, abs=0.5)
+    assert seen.goal.rays_c.shape == (4, 3)
+
+
 def test_every_example_is_short_and_run():
     programs = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
-    assert set(programs) == {*RUNS, "calibrate_camera", "export_flight"}
+    assert set(programs) == {
+        *RUNS,
+        "calibrate_camera",
+        "export_flight",
+        "add_detector",
+        "add_reward",
+    }
     for path in programs.values():
         assert len(path.read_text().splitlines()) <= LONGEST, path.name
