@@ -113,11 +113,11 @@ class Kind:
         )
 
 
-def kinds(rng: np.random.Generator) -> list[Kind]:
-    """Seven single effects, a pair, a law, lost commands and two with nothing hidden, drawn anew in
-    every run.
+def kinds(rng: np.random.Generator, count: int = 7) -> list[Kind]:
+    """Draw a ``count`` of single effects, a pair, a law, lost commands and two with nothing hidden,
+    anew in every run.
     """
-    singles = [Kind((str(name),), "rod") for name in rng.permutation(SINGLE)[:7]]
+    singles = [Kind((str(name),), "rod") for name in rng.permutation(SINGLE)[:count]]
     singles[-1] = replace(singles[-1], plant="string")
     pair = Kind(tuple(map(str, rng.choice(PAIRED, 2, replace=False))), "rod")
     law = Kind((str(rng.choice(UNKNOWN_LAWS)),), "rod")

@@ -297,18 +297,6 @@ class TestFlyer:
         )
         assert diagnosis.overall == "NO EFFECT"
 
-    @pytest.mark.slow
-    def test_gain_drag_and_battery_are_found(self):
-        names = ["thrust_gain", "rotor_drag_xy", "battery_sag", "cmd_delay", "frame_tilt_x"]
-        estimates = found(
-            FlyerModel([fly(8.0, gain=1.05, drag=0.02, volts_slope=0.08)], FLYER), names
-        )
-        assert near(estimates, "thrust_gain", 0.05), estimates
-        assert near(estimates, "rotor_drag_xy", 0.02), estimates
-        assert near(estimates, "battery_sag", 0.08), estimates
-        assert near(estimates, "frame_tilt_x", 0.0), estimates
-        assert near(estimates, "cmd_delay", LATE), estimates
-
     def test_wind_a_late_attitude_and_thrust_that_fades_are_found(self):
         log = fly(6.0, drag=0.03, wind=1.5, late=0.02, fade=-0.004)
         params = FlyerParams(**{**vars(FLYER), "drag_xy": 0.03})
@@ -371,42 +359,6 @@ class TestFlyer:
         assert estimates["rotor_drag_xy"][0] == pytest.approx(0.03, rel=0.1), estimates
         alone = found(model, names[1:])
         assert alone["rotor_drag_xy"][0] < 0.025, alone  # without it the drag is taken for less
-
-    @pytest.mark.slow
-    def test_cable_length_and_payload(self):
-        params = FlyerParams(**{**vars(FLYER), "cable": CableParams(0.5, 0.008)})
-        names = ["rope_length", "payload_drag", "thrust_gain", "cmd_delay"]
-        estimates = found(FlyerModel([fly(6.0, cable=0.47, payload_drag=5e-4)], params), names)
-        assert estimates["rope_length"][0] == pytest.approx(-0.03, abs=1e-3)
-        assert near(estimates, "rope_length", -0.03)
-        assert near(estimates, "payload_drag", 5e-4), estimates
-
-    @pytest.mark.slow
-    def test_a_vehicle_fitted_alone_holds_with_a_payload_below(self):
-        """Fit of flights without payload; with the payload nothing of the vehicle needs
-        to change.
-        """
-        result = fitting.fit(
-            FlyerModel([fly(8.0, gain=1.05, drag=0.02)], FLYER),
-            ["thrust_gain", "rotor_drag_xy", "cmd_delay"],
-        )
-        gain, drag, delay = result.theta
-        scaled = tuple(float(c * (1.0 + gain)) for c in FLYER.thrust_map)
-        cable = CableParams(0.5, 0.008)
-        changes = {
-            "thrust_map": scaled,
-            "drag_xy": float(drag),
-            "command_delay": float(delay),
-            "cable": cable,
-        }
-        params = FlyerParams(**{**vars(FLYER), **changes})
-        estimates = found(
-            FlyerModel([fly(6.0, gain=1.05, drag=0.02, cable=0.5, seed=4)], params),
-            ["thrust_gain", "rotor_drag_xy"],
-        )
-        assert near(estimates, "thrust_gain", 0.0), estimates
-        assert near(estimates, "rotor_drag_xy", 0.0), estimates
-        assert estimates["thrust_gain"][1] < 0.01
 
     def test_derivatives_are_those_of_the_residuals(self):
         torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))

@@ -15,10 +15,9 @@ from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
 from visthrow.diagnose.likelihood.correlation import Correlation, with_correlations
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
-from visthrow.diagnose.reporting import blackbox, blind, gain, pictures, report
+from visthrow.diagnose.reporting import blackbox, blind, gain, report
 from visthrow.diagnose.select import held_out, point, result, search
 from visthrow.diagnose.throw.landing import Landings
-from visthrow.logs.flightlog import FlightLog
 from visthrow.view import page
 
 SWING = str(
@@ -249,15 +248,6 @@ def test_nothing_has_no_sign(share, text):
     assert report.percent(share) == text
 
 
-@pytest.mark.slow
-def test_two_flights_are_halved_instead():
-    model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 15.0}, throws=0, free=2, seed=2)
-    measured = gain.measure(search.explain(model, laws=False))
-    assert measured.left_out == "parts of flights"
-    assert measured.folds == 6
-    assert measured["pos_w"].gain > 0.0
-
-
 @pytest.mark.parametrize("flights", [3, 10])
 def test_intervals_of_the_gain_hold_what_they_promise_and_stay_finite(flights):
     """Ratios of sums over flights with lognormal sizes, as flights have; 95 % intervals cover 90 to
@@ -287,27 +277,6 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
         assert curve.exact[0] < 0.1
         assert max(curve.wrong) < 0.05
         assert 2.0 < curve.limit / curve.sizes[0] < 20.0
-
-
-@pytest.mark.slow
-def test_limits_hold_for_effects_hidden_in_the_measurements(hidden):
-    """Twice the limit is found by the whole search, half of it is not: the statistics' promise,
-    kept by the simulation.
-    """
-    model = SyntheticModel(effects=EFFECTS, seed=7)
-    limit = blind.hide(search.explain(model, laws=False), draws=60)["effect_09"].limit
-    assert search.explain(blind.Hidden(model, {"effect_09": 2.0 * limit}), laws=False).named == (
-        "effect_09",
-    )
-    assert not search.explain(blind.Hidden(model, {"effect_09": 0.4 * limit}), laws=False).theta
-
-
-@pytest.mark.slow
-def test_what_is_hidden_besides_what_was_found_is_told(found):
-    trial = blind.verify(found[1], 1, floors=12.0, only=("effect_00",))[0]
-    assert trial.name == "effect_00"
-    assert set(trial.named) == {*TRUTH, "effect_00"}
-    assert trial.estimate == pytest.approx(trial.expected, abs=2 * EFFECTS[0].floor)
 
 
 @pytest.fixture(scope="module")
@@ -522,33 +491,6 @@ def test_errors_are_told_in_millimetres(found, measured):
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "most", "ticks"),
-    [
-        (0.9, 60.0, 9, [1, 2, 5, 10, 20, 50]),
-        (0.9, 6e3, 9, [1, 3, 10, 30, 100, 300, 1000, 3000]),
-        (0.0, 140.0, 9, None),
-        (-11.0, 12.0, 16, [-10, -5, -2, -1, 0, 1, 2, 5, 10]),
-        (2.1, 4.9, 9, []),
-    ],
-)
-def test_ticks_are_plain_numbers_that_fit(low, high, most, ticks):
-    found = pictures.plain_ticks(low, high, most)
-    assert found == ([0, 1, 2, 5, 10, 20, 50, 100] if ticks is None else ticks)
-
-
-def test_many_steps_stand_in_rows_that_can_be_read(found):
-    def size(count: int) -> tuple[int, int]:
-        picture = pictures.ladder(replace(found[1], steps=found[1].steps[:1] * count))
-        return int.from_bytes(picture[16:20], "big"), int.from_bytes(
-            picture[20:24], "big"
-        )  # of a PNG's head
-
-    assert size(6)[0] == size(1)[0]
-    assert size(3)[1] == size(1)[1]
-    assert size(6)[1] > 1.9 * size(3)[1]
-
-
-@pytest.mark.parametrize(
     ("channel", "unit"),
     [
         ("pos_w", "m"),
@@ -615,18 +557,3 @@ def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, ar
     printed = capsys.readouterr()
     assert said in printed.err
     assert printed.out == "", "before the search"
-
-
-def test_flights_are_numbers():
-    from visthrow.common.errors import DiagnoseError
-    from visthrow.diagnose.inputs.opening import numbers
-
-    logs = [FlightLog({}, {"source": f"runs/{name}.npz"}) for name in "abcd"]
-    assert numbers("0, 3", logs) == (0, 3)
-    assert numbers("", logs) == ()
-    with pytest.raises(DiagnoseError, match="such as 0,3"):
-        numbers("first", logs)
-    with pytest.raises(DiagnoseError, match=r"no flight 7; there are 0 \(a\.npz\), 1 \(b\.npz\)"):
-        numbers("1,7", logs)
-    with pytest.raises(DiagnoseError, match="leaves no flight"):
-        numbers("0,1,2,3", logs)

@@ -149,17 +149,6 @@ def test_a_law_is_not_shared_out_among_two_effects_that_hide_each_other():
     assert not {"effect_03", "effect_07"} & set(diagnosis.named)
 
 
-@pytest.mark.slow
-def test_mirror_config_is_wrong_instead_of_the_world():
-    """A model that has what the world lacks gets the opposite correction."""
-    right = search.explain(world(truth={"effect_04": 10.0}, seed=6), laws=False)
-    mirrored = search.explain(world(truth={"effect_04": -10.0}, seed=6), laws=False)
-    assert right.named == mirrored.named == ("effect_04",)
-    assert right.theta["effect_04"] == pytest.approx(
-        -mirrored.theta["effect_04"], abs=2 * EFFECTS[4].floor
-    )
-
-
 def test_idempotence_what_was_found_is_not_found_again():
     model = world(truth={"effect_04": 10.0}, seed=6)
     first = search.explain(model, laws=False)
@@ -238,17 +227,6 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     assert diagnosis["effect_05"].verdict == result.UNOBSERVABLE
     assert diagnosis["effect_05"].missing == ("battery_voltage",)
     assert diagnosis.named == ("effect_03",)
-
-
-@pytest.mark.slow
-def test_an_effect_that_was_not_excited_is_not_identifiable():
-    quiet = altered(
-        lambda m, w: replace(w, effects=w.effects * np.where(np.arange(12) == 6, 1e-5, 1.0))
-    )
-    diagnosis = search.explain(quiet, laws=False)
-    assert diagnosis["effect_06"].verdict == result.NOT_IDENTIFIABLE
-    assert diagnosis["effect_06"].manoeuvres == ("swing",)
-    assert diagnosis["effect_03"].verdict == result.BOUNDED
 
 
 def test_what_happened_in_one_flight_is_an_event_and_no_cause():
@@ -342,15 +320,6 @@ def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
         found.sentence
         == "effect_03: on its bound of 0 N; these flights ask for less than is possible."
     )
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_answer():
-    one, two = (
-        search.explain(world(truth={"effect_03": 8.0}), seed=5, laws=False) for _ in range(2)
-    )
-    assert one.theta == two.theta
-    assert one.threshold == two.threshold
 
 
 def test_no_window_is_an_error_that_says_so():
@@ -538,17 +507,3 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
     diagnosis = search.explain(model, laws=False)
     assert diagnosis.named == ("effect_01",)
     assert diagnosis["effect_01"].estimate == pytest.approx(0.02, abs=1e-3)
-
-
-def test_windows_side_by_side_give_the_same_diagnosis():
-    """As a GPU has them, candidates side by side too: names to the last, sizes but for rounding."""
-    truth = {"effect_03": 12.0, "effect_07": -9.0}
-    alone, together = SyntheticModel(truth=truth, seed=4), SyntheticModel(truth=truth, seed=4)
-    together.device = "cpu:0"
-    first, second = search.explain(alone), search.explain(together)
-    assert set(first.named) == set(truth)
-    assert [s.named for s in second.steps] == [s.named for s in first.steps]
-    assert second.theta == pytest.approx(first.theta, rel=1e-6)
-    assert [f.nats for f in second.findings] == pytest.approx(
-        [f.nats for f in first.findings], rel=1e-6, abs=1e-6
-    )

@@ -424,43 +424,6 @@ def test_mistakes_are_told(planted):
         )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("part", "kind", "name"),
-    [
-        ("aero", "none", "aerodynamics"),
-        ("controller", "geometric", "controller_kind"),
-        ("motor", "instant", "motor_lag"),
-        ("rope", None, "rope_flexible"),
-    ],
-)
-def test_what_a_simplified_simulator_lacks_stands_out(part, kind, name):
-    """The paper's ablations: flights of the whole plant, a model without one block; that block
-    explains them best.
-    """
-    logs, plant = fly(setting_with({}), noise=1.0, free=1, throws=2, seconds=3.0), paper_plant()
-    if kind is None:
-        simple = dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=1))
-    else:
-        block = dataclasses.replace(getattr(plant.vehicle, part), kind=kind)
-        simple = dataclasses.replace(
-            plant, vehicle=dataclasses.replace(plant.vehicle, **{part: block})
-        )
-    model = ThrowModel(logs, simple)
-    plain, whole = model.windows({}), model.windows({name: 1.0})
-    wrong, right = (
-        sum(np.sum((w.residual / w.sigma) ** 2) for w in windows) for windows in (plain, whole)
-    )
-    assert right < 0.7 * wrong, (wrong, right)
-    states = {
-        "aerodynamics": 0,
-        "controller_kind": 3,
-        "motor_lag": 4,
-        "rope_flexible": 8,
-    }  # integrals, rotors, bends of the rope
-    assert whole[0].nuisance.shape[1] - plain[0].nuisance.shape[1] == states[name]
-
-
 def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(planted):
     """Where a controller makes up for no voltage: it carries the weight at the share of throttle,
     whatever a log begins with.

@@ -195,26 +195,6 @@ def test_terms_that_lack_their_knots_are_not_made():
         assert set(term.factors) <= {"speed"}
 
 
-@pytest.mark.parametrize(
-    ("law", "size", "formula"),
-    [
-        ("speed", -0.01, "F = c |v| v"),
-        pytest.param("swirl", 0.01, "F_p = c (z x v_p)", marks=pytest.mark.slow),
-        pytest.param("thrust", 0.012, "F = c T v_xy² e_z", marks=pytest.mark.slow),
-    ],
-)
-def test_hidden_laws_are_written_down(law, size, formula):
-    model = SyntheticModel(effects=EFFECTS, law=law, law_size=abs(size), seed=3)
-    diagnosis = search.explain(model)
-    assert diagnosis.overall == result.UNKNOWN
-    assert not diagnosis.theta
-    first = diagnosis.laws[0]
-    assert diagnosis.block == first.block
-    assert formula in [term.formula for term in diagnosis.laws[:3]]
-    own = next(term for term in diagnosis.laws if term.formula == formula)
-    assert own.coefficient == pytest.approx(size, rel=0.1)
-
-
 def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     model = SyntheticModel(
         effects=EFFECTS, law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3

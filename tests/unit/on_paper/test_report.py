@@ -3,9 +3,6 @@ missing, and the page.
 """
 
 import re
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -290,68 +287,3 @@ def test_the_quick_list_can_do_without_the_reference_plant():
         units = load_list(command.QUICK_LIST, changes).throws.values()
         plants[changes] = {unit.params.plant for row in units for unit in row}
     assert plants == {(): {"hybrid", "reference-realistic"}, command.NO_REFERENCE: {"hybrid"}}
-
-
-QUICK = """
-[runs.shipped]
-policies = ["state"]
-throws = ["a", "b", "c"]
-[throws.a]
-plant = "hybrid"
-targets = [1.5]
-count = 4
-[throws.b]
-plant = "hybrid"
-targets = [2.0]
-count = 4
-[throws.c]
-plant = "hybrid"
-targets = [2.5]
-count = 4
-"""
-
-DRIVER = """
-import sys
-from visthrow import cli
-from visthrow.paper.baseline import spline, thrower
-from visthrow.paper.commands import report_command as report
-spline.LONGEST = (1.4,)
-report.QUICK_LIST = sys.argv[1]
-targets = (1.5, 2.0, 2.5)
-report.quick_units = lambda: [thrower.unit("pendulum", "none", r, 1) for r in targets]
-sys.exit(cli.main(["report", "--quick", "--jobs", "1", "--out", sys.argv[2]]))
-"""
-
-
-@pytest.mark.slow
-def test_quick_report_killed_and_started_again_repeats_nothing(tmp_path):
-    """SIGKILL in the policies' throws, then in the baseline's: what was there stays as it is, the
-    rest is added.
-    """
-    pytest.importorskip("piqp")
-    (tmp_path / "tiny.toml").write_text(QUICK)
-    command = [sys.executable, "-c", DRIVER, str(tmp_path / "tiny.toml"), str(tmp_path / "out")]
-    units = tmp_path / "out" / "quick" / "throws"
-    kept: dict[str, int] = {}
-    for least in (1, 4):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        deadline = time.monotonic() + 300.0
-        while (
-            time.monotonic() < deadline
-            and process.poll() is None
-            and len(list(units.glob("*.json"))) < least
-        ):
-            time.sleep(0.01)
-        process.kill()
-        process.wait()
-        time.sleep(2.0)  # a worker without its parent ends by itself
-        now = {path.name: path.stat().st_mtime_ns for path in units.glob("*.json")}
-        assert len(now) >= least
-        assert kept.items() <= now.items()
-        kept = now
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    now = {path.name: path.stat().st_mtime_ns for path in units.glob("*.json")}
-    assert kept.items() <= now.items()
-    assert len(now) == 6
-    assert "6 sets of throws" in done.stdout

@@ -3,18 +3,15 @@ see each other.
 """
 
 import dataclasses
-import os
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.cores import _pool
 from sim.effects.setting import Setting, generalised
 from sim.hybrid import HybridSim
 from sim.kernels.replay import kernel as rk
-from sim.kernels.replay.lanes import _BUILDS, Recording, Replay, _shared_out
+from sim.kernels.replay.lanes import _BUILDS, Recording, Replay
 from sim.params import SensingParams
 from tests.plants import EVERYTHING, paper_plant
 
@@ -335,30 +332,7 @@ def test_rope_that_leaves_falls_with_the_payload(flight):
     assert np.linalg.norm(late["payload_vel_w"][0] - early["payload_vel_w"][0] - fallen) > 1e-4
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system starts processes anew")
-def test_a_child_process_has_threads_of_its_own():
-    """Those of its parent do not run in it: a replay would wait for them for ever."""
-    assert _pool(2) is _pool(2)
-    child = os.fork()
-    if not child:
-        os._exit(_pool.cache_info().currsize)
-    _, status = os.waitpid(child, 0)
-    assert os.waitstatus_to_exitcode(status) == 0
-
-
 def test_mixed_segments_are_refused():
     rigid = dataclasses.replace(plant(), rope=dataclasses.replace(plant().rope, segments=1))
     with pytest.raises(ValueError, match="one number of segments"):
         Replay([plant(), rigid], [SensingParams()] * 2)
-
-
-@pytest.mark.parametrize("costs", [[1.0] * 100, [50.0, *[1.0] * 50], [3.0, 2.0], [7.0]])
-def test_pieces_of_a_run_cost_alike_and_hold_every_lane_once(costs):
-    """No piece takes more than its share and one lane."""
-    bounds = _shared_out(np.array(costs), 8)
-    assert bounds[0] == 0
-    assert bounds[-1] == len(costs)
-    pieces = [costs[a:b] for a, b in pairwise(bounds)]
-    assert all(pieces)
-    assert len(pieces) <= 8
-    assert all(sum(piece[:-1]) <= sum(costs) / 8 for piece in pieces)

@@ -312,18 +312,6 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
     assert len(listed) == 6
 
 
-def test_plan_covers_every_throw_once():
-    jobs = reference_protocol.plan(2, (1.5, 2.0), 120, seed=3)
-    for policy in range(2):
-        for target in (1.5, 2.0):
-            assert (
-                sum(job.count for job in jobs if job.policies == (policy,) and job.target == target)
-                == 120
-            )
-    together = reference_protocol.plan(2, (2.0,), 6, seed=3, together=True)
-    assert [job.policies for job in together] == [(0, 1)]
-
-
 def test_failures_name_their_cause():
     experiment = config.load(Experiment, config.find("train", "state"))
     plant = HybridPlant(experiment, 5)
