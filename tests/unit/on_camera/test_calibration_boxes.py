@@ -285,6 +285,11 @@ LENSES = {
         f"cam_cx: {CX}\ncam_cy: {CY}\n" + "".join(f"cam_d{i}: {k}\n" for i, k in enumerate(RT)),
         pinhole(*RT, f=NARROW[:2]),
     ),
+    "vikit shares": (
+        f"cam_model: ATAN\ncam_width: {W}\ncam_height: {H}\ncam_fx: {FX / W}\n"
+        f"cam_fy: {FY / H}\ncam_cx: {(CX + 0.5) / W}\ncam_cy: {(CY + 0.5) / H}\ncam_d0: 0.93\n",
+        fov(0.93),
+    ),
 }
 
 
@@ -323,6 +328,17 @@ def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
     assert np.max(error[inside & holds], initial=0.0) < HOLDS_PX + GRID_PX
     assert np.max(error[inside]) < report.max_px + GRID_PX
     assert report.max_px < WORST_PX.get(published.__qualname__, HOLDS_PX)
+
+
+def test_boxes_of_one_lens_give_one_fit(tmp_path):
+    """Skew and shear are too small to be told apart by pixels."""
+    fits = []
+    for name in ("ocam", "svo ocam", "py-ocamcalib"):
+        path = tmp_path / "calibration"
+        path.write_text(LENSES[name][0])
+        lens = read(path)[1]
+        fits.append([lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients])
+    np.testing.assert_allclose(fits[1:], [fits[0]] * 2, rtol=1e-9)
 
 
 def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
