@@ -231,6 +231,7 @@ class HybridSim:
             "ropes": ropes,
             "packed": (self._vehicles, self._ropes),
             "gravity": self.gravity,
+            "state": self.state,
         }
         return solvers.Exchange(kernels, world)
 

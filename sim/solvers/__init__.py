@@ -44,8 +44,8 @@ class Solver(Protocol):
         installed.
         """
 
-    def place(self, state: Any, mask: "wp.array[Any]") -> None:
-        """Put the bodies to a struct of state arrays where ``mask``, shape (E,), int, is not 0.
+    def place(self, mask: "wp.array[Any]") -> None:
+        """Put the bodies to ``world.state`` where ``mask``, shape (E,), int, is not 0.
 
         ``world.bodies`` shows them already, with the payload in line with the rope."""
 
@@ -65,6 +65,7 @@ class World:
     ropes: Sequence[RopeParams]  # likewise; mounts are stated from the centre of mass
     packed: tuple[Any, Any]  # the same on the device: arrays of types.Vehicle and types.Rope
     gravity: float  # [m/s^2]
+    state: Any  # arrays of sim.kernels.state.STATE_FIELDS
     kernels: ExchangeKernels  # whose structs the arrays are in
     wrench: Any  # of sim.kernels.exchange.WRENCH_FIELDS
     bodies: Any  # of sim.kernels.exchange.BODY_FIELDS
@@ -144,7 +145,7 @@ class Exchange:
         """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
         shared = [self.world.bodies, self.world.wrench]
         launch(self.kernels.show, [self.world.packed[1], sim.state, mask, *shared])
-        self.solver.place(sim.state, mask)
+        self.solver.place(mask)
         launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
 
 

@@ -17,24 +17,20 @@ class ChainSolver:
     capturable = True
 
     def __init__(self, world: World) -> None:
-        self.world, self._kernels = world, _kernels(world)
-        real, segments = world.types.real, world.params.rope.segments
-        self._stiffness = wp.zeros((segments, world.count), dtype=real, device=world.device)
-        self._scale = wp.zeros(world.count, dtype=real, device=world.device)
+        self.world, self._kernel = world, _kernel(world)
 
-    def place(self, state, mask) -> None:
-        inputs = [state, mask, self._stiffness, self._scale]
-        wp.launch(self._kernels[0], self.world.count, inputs, device=self.world.device)
+    def place(self, mask) -> None:
+        """Nothing is to be done: all that it keeps are the arrays of the state."""
 
     def advance(self, duration: float) -> None:
         w, s = self.world, self.world.params.sim
         numbers = [s.gamma, s.max_turn, w.gravity, duration]
-        inputs = [*w.packed, *numbers, self._stiffness, w.bodies, self._scale, w.wrench]
-        wp.launch(self._kernels[1], w.count, inputs, device=w.device, block_dim=64)
+        inputs = [*w.packed, *numbers, w.state, w.bodies, w.wrench]
+        wp.launch(self._kernel, w.count, inputs, device=w.device, block_dim=64)
 
 
-def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels that place and advance the bodies of a world."""
+def _kernel(world: World) -> wp.Kernel:
+    """Kernel that advances the bodies of a world."""
     t, L = world.types, world.params.rope.segments
     real, vec3, vec4 = t.real, t.vec3, t.vec4
     Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow
@@ -60,21 +56,6 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def place(
-        # In:
-        state: State,
-        mask: wp.array(dtype=wp.int32),
-        # Out:
-        stiffness: wp.array2d(dtype=real),
-        scale: wp.array(dtype=real),
-    ):
-        env = wp.tid()
-        if mask[env] != 0:
-            scale[env] = state.mass_scale[env]
-            for i in range(L):
-                stiffness[i, env] = state.stiffness[i, env]
-
-    @wp.kernel(module="unique", enable_backward=False)
     def advance(
         # Params:
         vehicle: wp.array(dtype=Vehicle),
@@ -84,15 +65,14 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
         gravity: real,
         h: real,
         # State in:
-        stiffness: wp.array2d(dtype=real),
+        state: State,
         bodies: Bodies,
         # In:
-        scale: wp.array(dtype=real),
         wrench: Wrench,
     ):
         env = wp.tid()
         p = vehicle[env % vehicle.shape[0]]
-        p.body.mass = p.body.mass * scale[env]
+        p.body.mass = p.body.mass * state.mass_scale[env]
         rope = ropes[env % ropes.shape[0]]
         air = Air()
         air.push_w = wrench.force_b[env]
@@ -109,7 +89,7 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
         for i in range(L):
             n[i] = bodies.cable_dir_w[i, env]
             u[i] = bodies.cable_vel_w[i, env]
-            k[i] = stiffness[i, env]
+            k[i] = state.stiffness[i, env]
         g = vec3(real(0.0), real(0.0), -gravity)
         s, _total, _fell_back = coupled.step(
             p,
@@ -129,7 +109,8 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
         for i in range(L):
             bodies.cable_dir_w[i, env] = n[i]
             bodies.cable_vel_w[i, env] = u[i]
-            stiffness[i, env] = k[i]
+            if wp.isfinite(k[i]):
+                state.stiffness[i, env] = k[i]
         bodies.pos_w[env] = s.pos_w
         bodies.quat_wb[env] = s.quat_wb
         bodies.vel_w[env] = s.vel_w
@@ -138,4 +119,4 @@ def _kernels(world: World) -> tuple[wp.Kernel, wp.Kernel]:
         bodies.payload_pos_w[env] = pos
         bodies.payload_vel_w[env] = vel
 
-    return place, advance
+    return advance

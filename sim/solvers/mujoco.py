@@ -12,7 +12,7 @@ import warp as wp
 
 from sim.solvers import World
 from sim.solvers.payloads import compile_model
-from sim.solvers.rods import build_place, quat, vec3
+from sim.solvers.rods import Ints, Table, build_place, quat, vec3
 
 RK4_STEP = 5e-4
 """Largest substep of RK4 [s]: half of it moves a hard throw's end by less than a micrometre."""
@@ -63,19 +63,19 @@ class MujocoSolver:
         )
         self._vehicle = mujoco.mj_name2id(models[0], mujoco.mjtObj.mjOBJ_BODY, "vehicle")
         self._nominal = wp.array(own["body_mass"][:, self._vehicle], dtype=float, device=device)
-        segments = world.params.rope.segments
-        shapes = ((count, 7), (count, 6), (count, 2 * segments), (count, 2 * segments))
-        self._arrays = [wp.zeros(shape, dtype=wp.float32, device=device) for shape in shapes]
         self._rows = wp.array(np.arange(count), dtype=wp.int32, device=device)
         self._payload_quat = wp.zeros(count, dtype=quat, device=device)
         self._kernels = _kernels(world)
 
-    def place(self, state, mask) -> None:
+    def place(self, mask) -> None:
         w, device = self.world, self.world.device
-        place = [state, mask, self._rows, *self._arrays]
+        end = 2 * w.params.rope.segments
+        root = [self.qpos[:, :7], self.qvel[:, :6]]
+        rope = [self.qpos[:, 7 : 7 + end], self.qvel[:, 6 : 6 + end]]
+        place = [w.state, mask, self._rows, *root, *rope]
         wp.launch(self._kernels["place"], w.count, place, device=device)
         masses = [self._nominal, self._vehicle, self._masses]
-        pack = [w.packed[1], state, mask, *self._arrays, *masses, self.qpos, self.qvel]
+        pack = [w.packed[1], w.state, mask, *masses, self.qpos, self.qvel]
         wp.launch(self._kernels["pack"], w.count, pack, device=device)
         self._placed(mask)
         self._show()
@@ -147,9 +147,9 @@ def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
 @wp.kernel(enable_backward=False)
 def _clear(
     # In:
-    mask: wp.array(dtype=wp.int32),
+    mask: Ints,
     # Out:
-    values: wp.array2d(dtype=float),
+    values: Table,
 ):
     env, i = wp.tid()
     if mask[env] != 0:
@@ -170,28 +170,19 @@ def _kernels(world: World) -> dict[str, Callable]:
         ropes: wp.array(dtype=Rope),
         # In:
         state: State,
-        mask: wp.array(dtype=wp.int32),
-        pose: wp.array2d(dtype=float),
-        velocity: wp.array2d(dtype=float),
-        angles: wp.array2d(dtype=float),
-        rates: wp.array2d(dtype=float),
+        mask: Ints,
         nominal: wp.array(dtype=float),
         vehicle: int,
         # Out:
-        masses: wp.array2d(dtype=float),
-        qpos: wp.array2d(dtype=float),
-        qvel: wp.array2d(dtype=float),
+        masses: Table,
+        qpos: Table,
+        qvel: Table,
     ):
+        """Write what the rods' angles do not say: masses, and the box."""
         env = wp.tid()
         if mask[env] == 0:
             return
         masses[env, vehicle] = nominal[env] * state.mass_scale[env]
-        qpos[env, 3] = pose[env, 6]
-        for k in range(3):
-            qpos[env, k] = pose[env, k]
-            qpos[env, 4 + k] = pose[env, 3 + k]
-            qvel[env, k] = velocity[env, k]
-            qvel[env, 3 + k] = state.rate_b[env][k]
         if wp.static(cables):  # both taut: the box hangs level with the vehicle
             rope = ropes[env % ropes.shape[0]]
             q = state.quat_wb[env]
@@ -200,19 +191,16 @@ def _kernels(world: World) -> dict[str, Callable]:
             pos = state.pos_w[env] + arm + rope.segment_length * state.cable_dir_w[0, env]
             vel = state.vel_w[env] + wp.cross(w, arm)
             vel += rope.segment_length * state.cable_vel_w[0, env]
-            qpos[env, 10] = pose[env, 6]
             for k in range(3):
                 qpos[env, 7 + k] = pos[k]
-                qpos[env, 11 + k] = pose[env, 3 + k]
                 qvel[env, 6 + k] = vel[k]
                 qvel[env, 9 + k] = state.rate_b[env][k]
-        else:
-            for i in range(2 * N):
+            for k in range(4):
+                qpos[env, 10 + k] = qpos[env, 3 + k]
+        elif wp.static(box):
+            for i in range(2 * L, 2 * N):
                 qpos[env, 7 + i] = 0.0
                 qvel[env, 6 + i] = 0.0
-                if i < 2 * L:
-                    qpos[env, 7 + i] = angles[env, i]
-                    qvel[env, 6 + i] = rates[env, i]
 
     @wp.kernel(module="unique", enable_backward=False)
     def push(
@@ -220,7 +208,7 @@ def _kernels(world: World) -> dict[str, Callable]:
         wrench: Wrench,
         payload_quat: wp.array(dtype=quat),
         # Out:
-        ctrl: wp.array2d(dtype=float),
+        ctrl: Table,
     ):
         env = wp.tid()
         load = wp.quat_rotate_inv(payload_quat[env], wrench.load_w[env])
@@ -234,8 +222,8 @@ def _kernels(world: World) -> dict[str, Callable]:
         # Params:
         ropes: wp.array(dtype=Rope),
         # In:
-        qpos: wp.array2d(dtype=float),
-        qvel: wp.array2d(dtype=float),
+        qpos: Table,
+        qvel: Table,
         # Out:
         bodies: Bodies,
         payload_quat: wp.array(dtype=quat),

@@ -16,7 +16,7 @@ from sim.kernels.rope.payload import LOADS
 from sim.kernels.structs import extensions_of
 from sim.params import RopeParams, VehicleParams
 from sim.solvers import World
-from sim.solvers.rods import AXIAL_INERTIA, build_place, quat, rod_inertial, vec3
+from sim.solvers.rods import AXIAL_INERTIA, Ints, build_place, rod_inertial, vec3
 
 LOCKED, FREE = ("transX", "transY", "transZ", "rotZ"), ("rotX", "rotY")
 SCENE = """#usda 1.0
@@ -146,15 +146,16 @@ class PhysxSolver:
         paths = self._tensors["pose"].prim_paths
         self._order = np.array([int(path.split("/")[1].removeprefix("env")) for path in paths])
         self._rows = wp.array(self._order, dtype=wp.int32, device=self.world.device)
-        self._arrays = {
-            name: wp.zeros(tensor.shape, dtype=wp.float32, device=self.world.device)
-            for name, tensor in self._tensors.items()
-            if name != "mass"
-        }
+        of_links = {"links": wp.transformf, "link_velocities": wp.spatial_vectorf}
+        self._arrays = {}
+        for name, tensor in self._tensors.items():
+            dtype = of_links.get(name, wp.float32)
+            shape = tensor.shape[:2] if name in of_links else tensor.shape
+            self._arrays[name] = wp.zeros(shape, dtype=dtype, device=self.world.device)
         self._masses = np.zeros(self._tensors["mass"].shape, np.float32)  # PhysX has them on host
         self._tensors["mass"].read(self._masses)
 
-    def place(self, state, mask) -> None:
+    def place(self, mask) -> None:
         w, moved = self.world, mask.numpy()[self._order] != 0
         if not moved.any():
             return
@@ -162,9 +163,9 @@ class PhysxSolver:
         arrays = [self._arrays[name] for name in names]
         rows = wp.array(moved, dtype=wp.uint8, device=w.device)
         wp.launch(
-            self._kernels["place"], w.count, [state, mask, self._rows, *arrays], device=w.device
+            self._kernels["place"], w.count, [w.state, mask, self._rows, *arrays], device=w.device
         )
-        scale = state.mass_scale.numpy()[self._order]
+        scale = w.state.mass_scale.numpy()[self._order]
         masses = np.where(moved, self._unscaled * scale, self._masses[:, 0])
         changed = masses != self._masses[:, 0]
         if changed.any():
@@ -228,7 +229,7 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
         # In:
         wrench: Wrench,
         bodies: Bodies,
-        rows: wp.array(dtype=wp.int32),
+        rows: Ints,
         # Out:
         out: wp.array3d(dtype=float),
     ):
@@ -257,19 +258,19 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
         # Params:
         ropes: wp.array(dtype=Rope),
         # In:
-        rows: wp.array(dtype=wp.int32),
-        links: wp.array3d(dtype=float),
-        velocities: wp.array3d(dtype=float),
+        rows: Ints,
+        links: wp.array2d(dtype=wp.transformf),
+        velocities: wp.array2d(dtype=wp.spatial_vectorf),
         # Out:
         bodies: Bodies,
     ):
         row = wp.tid()
         env = rows[row]
         rope = ropes[env % ropes.shape[0]]
-        q = quat(links[row, 0, 3], links[row, 0, 4], links[row, 0, 5], links[row, 0, 6])
-        rate_w = vec3(velocities[row, 0, 3], velocities[row, 0, 4], velocities[row, 0, 5])
-        pos = vec3(links[row, 0, 0], links[row, 0, 1], links[row, 0, 2])
-        vel = vec3(velocities[row, 0, 0], velocities[row, 0, 1], velocities[row, 0, 2])
+        q = wp.transform_get_rotation(links[row, 0])
+        pos = wp.transform_get_translation(links[row, 0])
+        vel = wp.spatial_top(velocities[row, 0])
+        rate_w = wp.spatial_bottom(velocities[row, 0])
         bodies.pos_w[env] = pos
         bodies.quat_wb[env] = q
         bodies.vel_w[env] = vel
@@ -280,10 +281,8 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
         n = vec3()
         u = vec3()
         for i in range(1, L + 1):
-            turn = quat(links[row, i, 3], links[row, i, 4], links[row, i, 5], links[row, i, 6])
-            spin = vec3(velocities[row, i, 3], velocities[row, i, 4], velocities[row, i, 5])
-            n = wp.quat_rotate(turn, vec3(0.0, 0.0, -1.0))
-            u = wp.cross(spin, n)
+            n = wp.quat_rotate(wp.transform_get_rotation(links[row, i]), vec3(0.0, 0.0, -1.0))
+            u = wp.cross(wp.spatial_bottom(velocities[row, i]), n)
             bodies.cable_dir_w[i - 1, env] = n
             bodies.cable_vel_w[i - 1, env] = u
             pos += rope.segment_length * n

@@ -6,6 +6,7 @@ from sim.params import RopeParams
 from sim.solvers import World
 
 vec3, quat = wp.vec3f, wp.quatf
+Ints, Table = wp.array(dtype=wp.int32), wp.array2d(dtype=float)
 
 AXIAL_INERTIA = 1e-8
 """Of a rod about its axis [kg m^2]. Its joints pass the vehicle's yaw on, a cord does not: it must
@@ -30,12 +31,14 @@ def rod_inertial(rope: RopeParams, last: bool) -> tuple[float, float, float]:
 def build_place(world: World, hinges: bool) -> wp.Kernel:
     """Build the kernel that turns state arrays into an engine's coordinates where a mask is not 0.
 
-    It fills in poses (E, 7) and velocities (E, 6) of the roots, in the world frame, and angles and
-    their rates (E, 2 L). A joint's two angles are a rotation vector in its x-y plane, and their
-    rates lie in that plane of the lower rod; with ``hinges`` the rod turns by them about y, then
-    about x. Environment ``rows[r]`` stands in row r.
+    It fills in poses (E, 7) and velocities (E, 6) of the roots, and angles and their rates
+    (E, 2 L). A joint's two angles are a rotation vector in its x-y plane, and their rates lie in
+    that plane of the lower rod; quaternions are xyzw, angular velocities in the world frame. With
+    ``hinges``, as MuJoCo has them, a rod turns by the angles about y, then about x, quaternions are
+    wxyz and the roots' angular velocities in the body frame. Environment ``rows[r]`` has row r.
     """
     L, State = world.params.rope.segments, world.kernels.State
+    first = 1 if hinges else 0
 
     @wp.func
     def turned(d: vec3):
@@ -56,26 +59,30 @@ def build_place(world: World, hinges: bool) -> wp.Kernel:
     def place(
         # In:
         state: State,
-        mask: wp.array(dtype=wp.int32),
-        rows: wp.array(dtype=wp.int32),
+        mask: Ints,
+        rows: Ints,
         # Out:
-        pose: wp.array2d(dtype=float),
-        velocity: wp.array2d(dtype=float),
-        angles: wp.array2d(dtype=float),
-        rates: wp.array2d(dtype=float),
+        pose: Table,
+        velocity: Table,
+        angles: Table,
+        rates: Table,
     ):
         row = wp.tid()
         env = rows[row]
         if mask[env] == 0:
             return
         q = state.quat_wb[env]
-        w = wp.quat_rotate(q, state.rate_b[env])
+        rate_b = state.rate_b[env]
+        w = wp.quat_rotate(q, rate_b)
+        spin_root = w
+        if wp.static(hinges):
+            spin_root = rate_b
         for k in range(3):
             pose[row, k] = state.pos_w[env][k]
             velocity[row, k] = state.vel_w[env][k]
-            velocity[row, 3 + k] = w[k]
+            velocity[row, 3 + k] = spin_root[k]
         for k in range(4):
-            pose[row, 3 + k] = q[k]
+            pose[row, 3 + (k + first) % 4] = q[k]
         for i in range(L):
             n = state.cable_dir_w[i, env]
             u = state.cable_vel_w[i, env]
