@@ -62,14 +62,17 @@ def build_exchange(
 ) -> ExchangeKernels:
     """Build the kernels from the parts of a fused step of the same plant and ``extensions``."""
     real, vec3, vec4 = t.real, t.vec3, t.vec4
-    Vehicle, Rope, Release, Air = t.Vehicle, t.Rope, t.Release, t.Air
     L, loaded = params.rope.segments, bool(extensions & LOADS)
     parts, State, Output = step.parts, step.State, step.Output
     load, store, load_rope = parts.load, parts.store, parts.load_rope
     flow, rate, motor_advance, laws = parts.flow, parts.rate, parts.motor_advance, parts.laws
     coupled, depart, hanging = parts.coupled, parts.depart, parts.payload.hanging
-    rope_size, rope_in_rotor, limit = parts.rope_size, parts.rope_in_rotor, real(st.SPEED_LIMIT)
-    nonfinite, collision, in_rotor = st.NONFINITE, st.COLLISION, st.ROPE_IN_ROTOR
+    rope_size, scaled, hazards = parts.rope_size, parts.scaled, parts.hazards
+    nonfinite, limit = st.NONFINITE, real(st.SPEED_LIMIT)
+    Ints = wp.array(dtype=wp.int32)
+    Vehicles, Ropes, Releases, Airs = (
+        wp.array(dtype=kind) for kind in (t.Vehicle, t.Rope, t.Release, t.Air)
+    )
     Wrench = st.array_struct(t, "Wrench", {k: (v, False) for k, v in WRENCH_FIELDS.items()})
     Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
     tiny = real(1.0e-6)
@@ -78,16 +81,16 @@ def build_exchange(
     def begin_kernel(
         # Params:
         first: int,
-        releases: wp.array(dtype=Release),
+        releases: Releases,
         # State in:
         state: State,
         # In:
         command: wp.array(dtype=vec4),
-        release: wp.array(dtype=wp.int32),
-        mask: wp.array(dtype=wp.int32),
+        release: Ints,
+        mask: Ints,
         # Out:
-        moves: wp.array(dtype=wp.int32),
-        again: wp.array(dtype=wp.int32),
+        moves: Ints,
+        again: Ints,
         out: Output,
     ):
         """Take the command, trip the latch; ``again``: the solver's bodies are to be put back."""
@@ -108,16 +111,16 @@ def build_exchange(
     def wrench_kernel(
         # Params:
         first: int,
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        airs: wp.array(dtype=Air),
+        vehicle: Vehicles,
+        ropes: Ropes,
+        airs: Airs,
         period: real,
         time: real,
         h: real,
         gravity: real,
         # State in:
         state: State,
-        moves: wp.array(dtype=wp.int32),
+        moves: Ints,
         # In:
         out: Output,
         # Out:
@@ -130,10 +133,8 @@ def build_exchange(
         wrench.load_w[env] = vec3()
         if moves[env] == 0:
             return
-        p = vehicle[env % vehicle.shape[0]]
+        p = scaled(vehicle, state, env)
         rope = ropes[env % ropes.shape[0]]
-        air = airs[env % airs.shape[0]]
-        p.body.mass = p.body.mass * state.mass_scale[env]
         half = real(0.5) * h
         g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
@@ -143,7 +144,7 @@ def build_exchange(
         whole, switch = split_delay(p, period)
         active, _until = held(state.queue, env, whole, switch, time + half, period)
         s = load(state, env)
-        now = laws.on(p, rope, air, s, n, u, stiffness, active, state.attached[env])
+        now = laws.on(p, rope, airs[env % airs.shape[0]], s, n, u, stiffness, active, state.attached[env])
         if state.attached[env] == 0:
             s = coupled.step_alone(p, now, s, active, g, h)
             if st.size(s) < limit:
@@ -175,17 +176,17 @@ def build_exchange(
     def take_kernel(
         # Params:
         first: int,
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        releases: wp.array(dtype=Release),
-        airs: wp.array(dtype=Air),
+        vehicle: Vehicles,
+        ropes: Ropes,
+        releases: Releases,
+        airs: Airs,
         time: real,
         h: real,
         gravity: real,
         # State in:
         state: State,
-        moves: wp.array(dtype=wp.int32),
-        again: wp.array(dtype=wp.int32),
+        moves: Ints,
+        again: Ints,
         wrench: Wrench,
         # In:
         bodies: Bodies,
@@ -214,14 +215,13 @@ def build_exchange(
             moves[env] = 0
             again[env] = 1
             return
-        mass = vehicle[env % vehicle.shape[0]].body.mass * state.mass_scale[env]
-        inertia = vehicle[env % vehicle.shape[0]].body.inertia
+        body = scaled(vehicle, state, env).body
         mean_b = real(0.5) * (s.rate_b + state.rate_b[env])
         own = wp.quat_rotate(state.quat_wb[env], wrench.force_b[env])
         fall = vec3(real(0.0), real(0.0), gravity)
-        wrench.pull_w[env] = mass * ((s.vel_w - state.vel_w[env]) / h + fall) - own
-        momentum = wp.cw_mul(inertia, (s.rate_b - state.rate_b[env]) / h)
-        gyroscopic = wp.cross(mean_b, wp.cw_mul(inertia, mean_b))
+        wrench.pull_w[env] = body.mass * ((s.vel_w - state.vel_w[env]) / h + fall) - own
+        momentum = wp.cw_mul(body.inertia, (s.rate_b - state.rate_b[env]) / h)
+        gyroscopic = wp.cross(mean_b, wp.cw_mul(body.inertia, mean_b))
         wrench.twist_b[env] = momentum + gyroscopic - wrench.torque_b[env]
         store(state, env, s)
         for i in range(L):
@@ -257,20 +257,18 @@ def build_exchange(
     def end_kernel(
         # Params:
         first: int,
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
+        vehicle: Vehicles,
+        ropes: Ropes,
         period: real,
         # State in:
         state: State,
         # In:
-        mask: wp.array(dtype=wp.int32),
+        mask: Ints,
         out: Output,
     ):
         env = wp.tid() + first
         if mask[env] == 0:
             return
-        p = vehicle[env % vehicle.shape[0]]
-        rope = ropes[env % ropes.shape[0]]
         if state.release_timer[env] >= real(0.0):
             state.release_timer[env] = wp.max(state.release_timer[env] - period, real(0.0))
         if state.attached[env] != 0:
@@ -278,20 +276,18 @@ def build_exchange(
             n = wp.zeros(shape=(L,), dtype=vec3)
             for i in range(L):
                 n[i] = state.cable_dir_w[i, env]
-            reach = rope.payload_radius + p.collision_radius
-            if wp.length(out.payload_pos_w[env] - s.pos_w) < reach:
-                state.status[env] = state.status[env] | collision
-            if rope_in_rotor(p, rope, s, n):
-                state.status[env] = state.status[env] | in_rotor
+            p = scaled(vehicle, state, env)
+            found = hazards(p, ropes[env % ropes.shape[0]], s, n, out.payload_pos_w[env])
+            state.status[env] = state.status[env] | found
 
     @wp.kernel(module="unique", enable_backward=False)
     def show_kernel(
         # Params:
         first: int,
-        ropes: wp.array(dtype=Rope),
+        ropes: Ropes,
         # In:
         state: State,
-        mask: wp.array(dtype=wp.int32),
+        mask: Ints,
         # Out:
         bodies: Bodies,
         wrench: Wrench,

@@ -45,7 +45,7 @@ def build_parts(
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
     ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
-    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``rope_in_rotor``;
+    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``scaled``, ``hazards``;
     ``depart``, which writes what follows when the payload separates with a stated velocity."""
     real, vec3 = t.real, t.vec3
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
@@ -88,9 +88,19 @@ def build_parts(
             stiffness[i] = state.stiffness[i, env]
 
     @wp.func
-    def rope_in_rotor(p: Vehicle, rope: Rope, s: QuadState, n: wp.array(dtype=vec3)):
-        """Whether a joint of the rope stands within a propeller disc, one centimetre thick."""
-        hit = bool(False)
+    def scaled(vehicle: wp.array(dtype=Vehicle), state: State, env: int):
+        """Parameters of an environment's vehicle, with its mass."""
+        p = vehicle[env % vehicle.shape[0]]
+        p.body.mass = p.body.mass * state.mass_scale[env]
+        return p
+
+    @wp.func
+    def hazards(p: Vehicle, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), payload_pos: vec3):
+        """Bits of the status: the payload strikes the vehicle; a joint of the rope stands within a
+        propeller disc, one centimetre thick."""
+        status = int(0)
+        if wp.length(payload_pos - s.pos_w) < rope.payload_radius + p.collision_radius:
+            status = st.COLLISION
         point = rope.mount
         for i in range(L):
             point += rope.segment_length * wp.quat_rotate_inv(s.quat_wb, n[i])
@@ -99,8 +109,8 @@ def build_parts(
                     dx = point[0] - p.rotors.x[j]
                     dy = point[1] - p.rotors.y[j]
                     if dx * dx + dy * dy < p.rotors.radius * p.rotors.radius:
-                        hit = bool(True)
-        return hit
+                        status = status | st.ROPE_IN_ROTOR
+        return status
 
     @wp.func
     def depart(
@@ -145,7 +155,8 @@ def build_parts(
         store=store,
         load_rope=load_rope,
         rope_size=rope_size,
-        rope_in_rotor=rope_in_rotor,
+        scaled=scaled,
+        hazards=hazards,
         depart=depart,
     )
 
@@ -171,16 +182,13 @@ def build_step(
     real, vec3, vec4 = t.real, t.vec3, t.vec4
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = params.rope.segments
-    nonfinite, fallback, collision, in_rotor = (
-        st.NONFINITE,
-        st.FALLBACK,
-        st.COLLISION,
-        st.ROPE_IN_ROTOR,
-    )
+    nonfinite, fallback = st.NONFINITE, st.FALLBACK
     parts = build_parts(t, params, direct, extensions, motors)
     State, Output, chain, coupled = parts.State, parts.Output, parts.chain, parts.coupled
     laws, leaving, load, store = parts.laws, parts.leaving, parts.load, parts.store
-    load_rope, rope_size, rope_in_rotor = parts.load_rope, parts.rope_size, parts.rope_in_rotor
+    load_rope, rope_size, scaled, hazards = (
+        getattr(parts, name) for name in ("load_rope", "rope_size", "scaled", "hazards")
+    )
     depart, limit = parts.depart, real(st.SPEED_LIMIT)
 
     @wp.func
@@ -234,11 +242,10 @@ def build_step(
         env = wp.tid() + first
         if mask[env] == 0:
             return
-        p = vehicle[env % vehicle.shape[0]]
+        p = scaled(vehicle, state, env)
         natural = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]
         air = airs[env % airs.shape[0]]
-        p.body.mass = p.body.mass * state.mass_scale[env]
         g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
@@ -305,10 +312,7 @@ def build_step(
             pos, vel = coupled.payload(rope, s, n, u)
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
-            if wp.length(pos - s.pos_w) < rope.payload_radius + p.collision_radius:
-                status = status | collision
-            if rope_in_rotor(p, rope, s, n):
-                status = status | in_rotor
+            status = status | hazards(p, rope, s, n, pos)
         state.status[env] = status
 
     @wp.kernel(module="unique", enable_backward=False)
