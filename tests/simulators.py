@@ -53,12 +53,17 @@ def scene_plant(
 
 
 def scene_sim(
-    scene: Scene, substep: float, precision: str, control_period: float = 0.01, **options
+    scene: Scene,
+    substep: float,
+    precision: str,
+    control_period: float = 0.01,
+    solver: str = "chain",
+    **options,
 ) -> HybridSim:
     """Simulator of one vehicle at the start of a scene."""
-    sim = HybridSim(
-        scene_plant(scene, substep, precision, control_period), 1, direct=True, **options
-    )
+    plant = scene_plant(scene, substep, precision, control_period)
+    plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, solver=solver))
+    sim = HybridSim(plant, 1, direct=True, **options)
     sim.place(
         np.array([scene.pos_w]),
         np.array([scene.quat_wb]),
@@ -80,9 +85,15 @@ class Flight:
     status: int
 
 
-def fly(scene: Scene, substep: float, precision: str, control_period: float = 0.01) -> Flight:
+def fly(
+    scene: Scene,
+    substep: float,
+    precision: str,
+    control_period: float = 0.01,
+    solver: str = "chain",
+) -> Flight:
     """Fly a scene to its end."""
-    sim = scene_sim(scene, substep, precision, control_period)
+    sim = scene_sim(scene, substep, precision, control_period, solver)
     status = 0
     for k in range(round(scene.duration / control_period)):
         wrench = wrench_at(scene, k * control_period)

@@ -4,19 +4,18 @@ The hard throw and the whip of ``tests/data/scenes``, a pendulum, and a vehicle 
 up on a rope that hangs askew."""
 
 import dataclasses
-import itertools
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 
 from bench import start
 from bench.report import Report, Table, finish
-from sim.hybrid import HybridSim
 from sim.params import GRAVITY
-from tests.oracle.converged import converged
+from tests.oracle.converged import OracleRun, converged
 from tests.plants import SCENES
 from tests.scenes import Scene, Wrench, load_scene, wrench_at
-from tests.simulators import scene_plant
+from tests.simulators import scene_sim
 
 STEPS = {
     "chain": (0.002, 0.0005),
@@ -30,31 +29,22 @@ PERIOD = 0.01
 PULLS = (1, 2, 3, 4, 5, 6)  # weights of vehicle, rope and ball
 CALM = 20.0  # [rad/s]: a rope that is pulled straight turns slower than that after PULLED
 PULLED = 0.3  # [s]
-
-
-def simulator(scene: Scene, solver: str, substep: float) -> HybridSim:
-    """The scene's vehicle, without blocks, at its start."""
-    plant = scene_plant(scene, substep, "float32", PERIOD)
-    plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, solver=solver))
-    sim = HybridSim(plant, 1, direct=True)
-    states = (scene.pos_w, scene.quat_wb, scene.vel_w, scene.rate_b)
-    rope = scene.cable_dir_w()[None], scene.cable_vel_w()[None]
-    sim.place(*(np.array([value]) for value in states), *rope)
-    return sim
+COLUMNS = ("hard_throw_ball", "hard_throw_vehicle", "pendulum_ball_most", "whip_ball")
 
 
 def fly(scene: Scene, solver: str, substep: float) -> dict[str, np.ndarray]:
-    """Ball and vehicle [m] after each control period, shape (T, 3); the rope's rates at the end."""
-    sim, rows = simulator(scene, solver, substep), []
+    """Ball and vehicle [m] after each control period, shape (T, 3), NaN where the solver failed;
+    the rope's rates at the end."""
+    sim, rows = scene_sim(scene, substep, "float32", PERIOD, solver), []
     for k in range(round(scene.duration / PERIOD)):
         wrench = wrench_at(scene, PERIOD * k)
         sim.set_command(np.array([[wrench.force_b[2], *wrench.torque_b]]))
         sim.step()
         rows.append([sim.get(name)[0].astype(float) for name in ("payload_pos_w", "pos_w")])
-    ball, vehicle = (np.array(column) for column in zip(*rows))
-    failed = bool(sim.get("status")[0] & 1)
-    rates = np.linalg.norm(sim.get("cable_vel_w")[0], axis=1)
-    return {"ball": ball, "vehicle": vehicle, "rates": rates, "failed": failed}
+    scale = np.nan if sim.get("status")[0] & 1 else 1.0
+    ball, vehicle = np.moveaxis(scale * np.array(rows), 1, 0)
+    rates = scale * np.linalg.norm(sim.get("cable_vel_w")[0], axis=1)
+    return {"ball": ball, "vehicle": vehicle, "rates": rates}
 
 
 def pendulum() -> Scene:
@@ -79,36 +69,37 @@ def pulled(weights: float) -> Scene:
     return dataclasses.replace(scene, **still, direction=direction, schedule=schedule)
 
 
-def reference(scene: Scene) -> dict[str, np.ndarray]:
-    """MuJoCo's converged run at the same times."""
-    times = PERIOD * np.arange(1, round(scene.duration / PERIOD) + 1)
-    run = converged(scene, times=times)
-    return {"ball": run.ball_pos_w, "vehicle": run.pos_w}
+@functools.cache
+def reference(scene: Scene) -> OracleRun:
+    """MuJoCo's converged run."""
+    return converged(scene, times=PERIOD * np.arange(1, round(scene.duration / PERIOD) + 1))
+
+
+def distances(scene: Scene, name: str, solver: str, substep: float) -> dict[str, float]:
+    """How far ball and vehicle end from MuJoCo's converged run, and the most on the way [m]."""
+    truth, flown, row = reference(scene), fly(scene, solver, substep), {}
+    for part, true in (("ball", truth.ball_pos_w), ("vehicle", truth.pos_w)):
+        off = np.linalg.norm(flown[part] - true, axis=1)
+        row |= {f"{name}_{part}": float(off[-1]), f"{name}_{part}_most": float(off.max())}
+    return row
 
 
 def run(args) -> int:
-    names = {name: load_scene(SCENES / f"{name}.toml") for name in ("hard_throw", "whip")}
-    scenes = names | {"pendulum": pendulum()}
-    truths = {name: reference(scene) for name, scene in scenes.items()}
-    rows = []
-    for solver, substep in itertools.chain(*([(s, h) for h in STEPS[s]] for s in args.solvers)):
-        row: dict = {"solver": solver, "substep": substep}
-        for name, scene in scenes.items():
-            found = fly(scene, solver, substep)
-            for part in ("ball", "vehicle"):
-                off = np.linalg.norm(found[part] - truths[name][part], axis=1)
-                row[f"{name}_{part}"] = None if found["failed"] else float(off[-1])
-                row[f"{name}_{part}_most"] = None if found["failed"] else float(off.max())
-        calm = [k for k in PULLS if not_wild(fly(pulled(k), solver, substep))]
-        row["pull"] = max(calm, default=0)
-        rows.append(row)
-        print(row, flush=True)
-    columns = ("hard_throw_ball", "hard_throw_vehicle", "pendulum_ball_most", "whip_ball")
-    header = ("solver, step", *(name.replace("_", " ") + " [mm]" for name in columns), "pull")
-    cells = []
-    for row in rows:
-        parts = ["NaN" if row[name] is None else f"{1e3 * row[name]:.2f}" for name in columns]
-        cells.append((f"{row['solver']}, {1e3 * row['substep']:g} ms", *parts, f"{row['pull']}"))
+    scenes = {name: load_scene(SCENES / f"{name}.toml") for name in ("hard_throw", "whip")}
+    scenes["pendulum"] = pendulum()
+    rows, cells = [], []
+    for solver in args.solvers:
+        for substep in STEPS[solver]:
+            row = {"solver": solver, "substep": substep}
+            for name, scene in scenes.items():
+                row |= distances(scene, name, solver, substep)
+            calm = [k for k in PULLS if fly(pulled(k), solver, substep)["rates"].max() < CALM]
+            row["pull"] = max(calm, default=0)
+            rows.append(row)
+            print(row, flush=True)
+            parts = [f"{1e3 * row[name]:.2f}" for name in COLUMNS]
+            cells.append((f"{solver}, {1e3 * substep:g} ms", *parts, f"{row['pull']}"))
+    header = ("solver, step", *(name.replace("_", " ") + " [mm]" for name in COLUMNS), "pull")
     title = "Solvers on bare scenes, off MuJoCo at 20 us"
     notes = (
         f"pull: the most weights of {PULLS} under which no segment turns faster than {CALM:g} rad/s"
@@ -116,11 +107,6 @@ def run(args) -> int:
     )
     report = Report("engine", title, (Table(title, header, tuple(cells)),), notes, {"rows": rows})
     return finish(report, args)
-
-
-def not_wild(found: dict) -> bool:
-    """Whether a pulled rope has come to rest along its pull, or nearly."""
-    return not found["failed"] and float(found["rates"].max()) < CALM
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,6 +1,7 @@
 """Landings of policies on each solver, from the same starts and with the same noise."""
 
 import json
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,66 +13,45 @@ from bench.report import Report, Table, device_name, finish
 from visthrow.throws.loading import load_policy
 from visthrow.training.protocol import throw
 
+MOVED = (
+    "Moved: distance of each landing from that on the first solver in the same throw, median and"
+    " largest. A release one control step later moves a landing by some 25 mm."
+)
 
-def thrown(policy: str, solver: str | None, args) -> list[dict]:
-    """Throws of one policy on one solver, a row a target; without a solver on the policy's own."""
+
+def thrown(policy: str, solver: str | None, target: float, args: Namespace) -> tuple[dict, list]:
+    """Throw a policy on one solver, or on its own one; returns what is kept, and landings [m]."""
     changes = overrides(solver, args.substep) if solver else []
     item = load_policy(policy, args.config, [*changes, *args.overrides], args.allow)
-    flown, rows = item.policy.to(args.device), []
-    for target in args.targets:
-        actor = flown.actor(args.throws)  # with a memory of its own
-        found = throw(item.experiment, actor, target, args.throws, args.device, args.seed)
-        row = {
-            "policy": Path(policy).stem,
-            "solver": solver,
-            "substep": item.experiment.sim.substep,
-        }
-        landed = np.where(np.isfinite(found.landing_w), found.landing_w, 0.0).round(5)
-        rows.append({**row, **found.summary(), "landing_w": landed.tolist()})
-    return rows
+    actor = item.policy.to(args.device).actor(args.throws)
+    found = throw(item.experiment, actor, target, args.throws, args.device, args.seed)
+    name = Path(policy).stem if Path(policy).stem != "policy" else Path(policy).parent.name
+    row = {"policy": name, "solver": solver or "its own", "substep": item.experiment.sim.substep}
+    return {**row, **found.summary()}, np.nan_to_num(found.landing_w).round(5).tolist()
 
 
-def moved(rows: list[dict], first: dict) -> tuple[float, float]:
-    """Median and largest distance of landings from those of the first solver [m]."""
-    other = next(
-        row
-        for row in rows
-        if all(row[k] == first[k] for k in ("policy", "target")) and row["landing_w"]
-    )
-    off = np.linalg.norm(np.array(first["landing_w"]) - np.array(other["landing_w"]), axis=1)
-    return float(np.median(off)), float(off.max())
-
-
-def run(args) -> int:
-    rows: list[dict] = []
+def run(args: Namespace) -> int:
+    rows, landings, firsts, cells = [], [], {}, []
     for policy in args.policies:
         for solver in args.solvers or [None]:
-            rows += thrown(policy, solver, args)
-            for row in rows[-len(args.targets) :]:
-                told = {k: v for k, v in row.items() if k != "landing_w"}
-                print(json.dumps(told), flush=True)
-    if args.raw:
-        Path(args.raw).write_text(json.dumps(rows))
-    cells = []
-    for row in rows:
-        middle, most = moved(rows, row)
-        error = f"{row['error_mean']:.4f}" if row["success"] > 0 else "-"
-        landed = f"{row['success'] * row['throws']:.0f} of {row['throws']}"
-        name = f"{row['solver'] or 'its own'}, {1e3 * row['substep']:g} ms"
-        off = f"{1e3 * middle:.2f} / {1e3 * most:.1f}"
-        row["moved_median"], row["moved_most"] = middle, most
-        cells.append((row["policy"], f"{row['target']:g} m", name, landed, error, off))
+            for target in args.targets:
+                row, landing_w = thrown(policy, solver, target, args)
+                first = np.array(firsts.setdefault((policy, target), landing_w))
+                off = np.linalg.norm(np.array(landing_w) - first, axis=1)
+                row |= {"moved_median": float(np.median(off)), "moved_most": float(off.max())}
+                print(json.dumps(row), flush=True)
+                rows.append(row)
+                landings.append(landing_w)
+                landed = f"{row['success'] * args.throws:.0f} of {args.throws}"
+                error = f"{row.get('error_mean', np.nan):.4f}"
+                moved = f"{1e3 * row['moved_median']:.2f} / {1e3 * row['moved_most']:.1f}"
+                on = f"{row['solver']}, {1e3 * row['substep']:g} ms"
+                cells.append((row["policy"], f"{target:g} m", on, landed, error, moved))
     header = ("policy", "target", "solver", "landed", "mean error [m]", "moved [mm]")
     title = f"Landings by solver, {device_name(args.device)}"
-    notes = (
-        (
-            "Moved: distance of each landing from that on the first solver in the same throw,"
-            " median and largest. A release one control step later moves a landing by some 25 mm."
-        ),
-    )
-    kept = [{k: v for k, v in row.items() if k != "landing_w"} for row in rows]
-    report = Report("engine", title, (Table(title, header, tuple(cells)),), notes, {"rows": kept})
-    return finish(report, args)
+    figures = {"rows": rows} | ({"landing_w": landings} if args.landings else {})
+    table = Table(title, header, tuple(cells))
+    return finish(Report("engine", title, (table,), (MOVED,), figures), args)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--allow", action="append", default=[])
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--raw", metavar="FILE", help="rows as JSON")
+    parser.add_argument("--landings", action="store_true", help="keep each landing point")
     return start.main(parser, run, argv)
 
 

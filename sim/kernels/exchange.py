@@ -144,7 +144,9 @@ def build_exchange(
         whole, switch = split_delay(p, period)
         active, _until = held(state.queue, env, whole, switch, time + half, period)
         s = load(state, env)
-        now = laws.on(p, rope, airs[env % airs.shape[0]], s, n, u, stiffness, active, state.attached[env])
+        now = laws.on(
+            p, rope, airs[env % airs.shape[0]], s, n, u, stiffness, active, state.attached[env]
+        )
         if state.attached[env] == 0:
             s = coupled.step_alone(p, now, s, active, g, h)
             if st.size(s) < limit:

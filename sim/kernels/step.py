@@ -45,8 +45,9 @@ def build_parts(
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
     ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
-    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``scaled``, ``hazards``;
-    ``depart``, which writes what follows when the payload separates with a stated velocity."""
+    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``scaled``,
+    ``hazards``; ``depart``, which writes what follows when the payload separates with a stated
+    velocity."""
     real, vec3 = t.real, t.vec3
     Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
     L = params.rope.segments

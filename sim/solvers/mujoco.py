@@ -135,7 +135,7 @@ def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
             mujoco_warp.step(there, data)
         wp.synchronize_device(device)
 
-    def step() -> None:
+    def step(_read=(there, data)) -> None:  # the graph reads these, and must not outlive them
         wp.capture_launch(captured.graph, stream=wp.get_stream(device))
 
     def placed(mask) -> None:

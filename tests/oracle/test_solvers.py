@@ -13,8 +13,8 @@ from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, PlantParams
 from tests.plants import SCENES, paper_plant
-from tests.scenes import load_scene, wrench_at
-from tests.simulators import scene_plant
+from tests.scenes import load_scene
+from tests.simulators import fly
 from visthrow import config
 from visthrow.cli import build_parser
 from visthrow.common.errors import ConfigError
@@ -38,24 +38,14 @@ def on(plant: PlantParams, solver: str, substep: float) -> PlantParams:
     return dataclasses.replace(plant, sim=numerics)
 
 
-def hard_throw(solver: str, substep: float) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of ball and vehicle [m], shape (3,)."""
-    plant = scene_plant(SCENE, 2e-3, "float32", 0.02)
-    sim = HybridSim(on(plant, solver, substep), 1, direct=True)
-    start = (SCENE.pos_w, SCENE.quat_wb, SCENE.vel_w, SCENE.rate_b)
-    rope = SCENE.cable_dir_w()[None], SCENE.cable_vel_w()[None]
-    sim.place(*(np.array([value]) for value in start), *rope)
-    for k in range(round(SCENE.duration / 0.02)):
-        wrench = wrench_at(SCENE, 0.02 * k)
-        sim.set_command(np.array([[wrench.force_b[2], *wrench.torque_b]]))
-        sim.step()
-    return sim.get("payload_pos_w")[0].astype(float), sim.get("pos_w")[0].astype(float)
-
-
 def off_converged(solver: str, substep: float) -> float:
     """How far a solver ends the hard throw from the fused chain's converged run [m]."""
-    ends = zip(hard_throw(solver, substep), hard_throw("chain", 2e-4), strict=True)
-    return max(float(np.linalg.norm(a - b)) for a, b in ends)
+    found, truth = (
+        fly(SCENE, step, "float32", 0.02, name)
+        for name, step in ((solver, substep), ("chain", 2e-4))
+    )
+    pairs = ((found.ball_pos_w, truth.ball_pos_w), (found.pos_w, truth.pos_w))
+    return max(float(np.linalg.norm(a - b)) for a, b in pairs)
 
 
 def test_the_exchange_costs_the_chain_no_accuracy():
