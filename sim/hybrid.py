@@ -3,6 +3,7 @@ time.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -216,8 +217,8 @@ class HybridSim:
 
     def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
         """The solver of the plant's bodies with what it exchanges; None for the fused kernel."""
-        params = self.params
-        if params.sim.solver == "chain":
+        params, build = self.params, self._solver()
+        if build is None:
             params.rope.require_chain("sim.solver 'chain'")
             return None
         solvers.refuse(self.extensions, params)
@@ -233,7 +234,12 @@ class HybridSim:
             "gravity": self.gravity,
             "state": self.state,
         }
-        return solvers.Exchange(kernels, world)
+        return solvers.Exchange(kernels, world, build)
+
+    def _solver(self) -> Callable[[solvers.World], solvers.Solver] | None:
+        """What builds the solver of the plant's bodies; None for the fused kernel."""
+        name = self.params.sim.solver
+        return None if name == "chain" else solvers.solver_class(name)
 
     @property
     def capturable(self) -> bool:

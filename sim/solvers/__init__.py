@@ -102,10 +102,10 @@ class Exchange:
     Raises ValueError: a plant that has something which cannot be exchanged.
     """
 
-    def __init__(self, kernels: ExchangeKernels, world: dict[str, Any]) -> None:
-        """Build the solver of the plant; ``world``: what :class:`World` is made of, without the
-        shared arrays.
-        """
+    def __init__(
+        self, kernels: ExchangeKernels, world: dict[str, Any], build: Callable[[World], Solver]
+    ) -> None:
+        """Build the solver; ``world``: what :class:`World` is made of, without the shared arrays."""
         t, params, count, device = (world[k] for k in ("types", "params", "count", "device"))
         rows = dict.fromkeys(("cable_dir_w", "cable_vel_w"), params.rope.segments)
         wrench = {k: (v, False) for k, v in WRENCH_FIELDS.items()}
@@ -115,8 +115,7 @@ class Exchange:
             wrench=st.allocate(t, kernels.Wrench, wrench, count, {}, device),
             bodies=st.allocate(t, kernels.Bodies, BODY_FIELDS, count, rows, device),
         )
-        module, _, name = SOLVERS[params.sim.solver].partition(":")
-        self.solver: Solver = getattr(importlib.import_module(module), name)(self.world)
+        self.solver = build(self.world)
         self.kernels = kernels
         self._moves, self._again = (wp.zeros(count, dtype=wp.int32, device=device) for _ in "ma")
 
@@ -147,6 +146,13 @@ class Exchange:
         launch(self.kernels.show, [self.world.packed[1], sim.state, mask, *shared])
         self.solver.place(mask)
         launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
+
+
+def solver_class(name: str) -> type[Solver]:
+    """Class of a solver by its name in :data:`SOLVERS`."""
+    module, _, attribute = SOLVERS[name].partition(":")
+    found: type[Solver] = getattr(importlib.import_module(module), attribute)
+    return found
 
 
 def refuse(extensions: frozenset[str], params: PlantParams) -> None:

@@ -1,0 +1,426 @@
+"""TeamEnv: the cooperative task as rsl_rl's vectorised environment, a row a vehicle.
+
+All rows are flown by one policy, each from its own view; a world's rows end together. As in
+:class:`visthrow.training.env.ThrowEnv`, nothing branches on data: a rollout can be captured."""
+
+import math
+
+import torch
+import warp as wp
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from camera import history as hist
+from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
+from camera.noise import StepDraw, apply_noise
+from sim.params import GRAVITY
+from sim.torch_bridge import TorchViews, on_torch_stream
+from visthrow.cooperative.plant import TeamSim
+from visthrow.cooperative.task import TeamExperiment, layout_of, members
+from visthrow.onboard import actions as act
+from visthrow.onboard import observations as ob
+from visthrow.task import plant_of
+from visthrow.training import rewards, terminations
+from visthrow.training.device import rounded_products
+
+RESULTS = ("episodes", "released", "landing_error", "duration", "contact")
+"""Sums over finished worlds; landing error [m] and duration [s] over the released ones."""
+
+
+class TeamEnv(VecEnv):
+    """Worlds of a team. Observation groups: ``actor`` and ``critic``.
+
+    The critic sees all vehicles, its own first, without noise, the load with its velocity, the
+    time, every latch, mass and voltage, and how old the others' poses are.
+
+    Attributes:
+        last: what the last step ended, each over the worlds: ``released``, ``negative``,
+            ``contact`` (bool), ``landing_error`` [m], ``duration`` [s], ``landing_w`` [m],
+            ``clearance`` [m], ``gap`` [m] and ``apart`` [s], between first and last separation.
+    """
+
+    def __init__(
+        self,
+        experiment: TeamExperiment,
+        device: str = "cpu",
+        seed: int = 0,
+        count: int | None = None,
+        build=None,
+    ):
+        """Build simulator and buffers and start all episodes.
+
+        Args:
+            experiment, device: plant, camera, task; "cpu" or "cuda:0".
+            seed: of the simulator's resets; torch's own generator draws the rest.
+            count: number of rows; default the experiment's.
+            build: another solver of the bodies, as of :class:`TeamSim`.
+        """
+        self.cfg, self.device, task, team = experiment, device, experiment.task, experiment.team
+        self.num_envs, self.num_actions = count or experiment.ppo.environments, act.ACTIONS
+        self.team, self.worlds = team.vehicles, self.num_envs // team.vehicles
+        if self.num_envs % self.team:
+            raise ValueError(f"{self.num_envs} rows; expected a multiple of {self.team}")
+        self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
+        options = members(experiment) | ({} if build is None else {"build": build})
+        plant = plant_of(experiment)
+        self.sim = TeamSim(plant, self.worlds, self.team, device, seed, **options)
+        self.views = TorchViews(self.sim)
+        self.load_w, self.load_vel_w = (
+            wp.to_torch(array, requires_grad=False) for array in self.sim.load
+        )
+        self.layout = layout_of(experiment)
+        self.camera = KeypointCamera(experiment.camera, device)
+        make = {"device": device, "dtype": torch.float32}
+        ropes = torch.tensor([r.segment_length for r in options["ropes"]], **make)
+        rows = torch.arange(self.num_envs, device=device)
+        self._segment = ropes[rows % len(ropes)]
+        self._mount = torch.tensor(plant.rope.mount, **make)
+        hover = act.hover_action(GRAVITY * plant.total_mass, task.action.max_thrust)
+        self._start_action = torch.tensor(hover, **make)
+        self._max_rate = torch.tensor(task.action.max_rate, **make)
+        self._half_gravity = torch.tensor([0.0, 0.0, -0.5 * GRAVITY], **make)
+        samples = experiment.release.clearance_samples
+        self._fractions = torch.linspace(0.0, 1.0, samples, **make)
+        self._rate_weights = torch.tensor(task.reward.rate_command, **make)
+        self._change_weights = torch.tensor(task.reward.command_change, **make)
+        self.episode_length_buf = torch.zeros(self.num_envs, device=device, dtype=torch.long)
+        self._memory = self._remembered()
+        self.last: dict[str, Tensor] = {}
+        self._goal: Tensor | None = None
+        self.reset()
+
+    def _remembered(self) -> dict[str, Tensor]:
+        """The buffers that an episode carries beside the simulator's state."""
+        rows, worlds, make = self.num_envs, self.worlds, {"device": self.device}
+        steps = 2 + math.ceil(self.cfg.team.age[1] / self.cfg.sim.control_period)
+        history, payload = 1 + self.layout.history, self.layout.payload
+        shapes = {
+            "previous": (rows, act.ACTIONS),
+            "history": (rows, history, payload),
+            "true_history": (rows, history, 3),
+            "frame_bias": (rows, ob.VEHICLE + 5),
+            "command_bias": (rows, act.COMMANDS),
+            "keypoint_bias": (rows, KEYPOINTS, 2),
+            "pose_age": (rows,),
+            "age": (worlds,),
+            "poses": (rows, steps, ob.VEHICLE + 3),
+            "asked": (worlds, steps),
+            "first": (worlds,),
+        }
+        memory = {name: torch.zeros(shape, **make) for name, shape in shapes.items()}
+        memory["totals"] = torch.zeros(len(RESULTS), dtype=torch.float64, **make)
+        return memory
+
+    def _rows(self, of_worlds: Tensor) -> Tensor:
+        """Values of worlds, shape (W, ...), for their rows."""
+        return of_worlds.repeat_interleave(self.team, dim=0)
+
+    def _worlds(self, of_rows: Tensor) -> Tensor:
+        """Values of rows as (W, V, ...)."""
+        return of_rows.unflatten(0, (self.worlds, self.team))
+
+    def _other(self, of_rows: Tensor, k: int) -> Tensor:
+        """Values of the k-th vehicle after each row's own in its world."""
+        return self._worlds(of_rows).roll(-k, 1).flatten(0, 1)
+
+    def fix_goal(self, goal_w: Tensor | None) -> None:
+        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones."""
+        self._goal = goal_w
+
+    def clear_totals(self) -> None:
+        """Start the sums again."""
+        self._memory["totals"].zero_()
+
+    def episode_means(self) -> dict[str, float]:
+        """Means over the worlds that finished since :meth:`clear_totals`, and their number."""
+        totals = dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
+        released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
+        means = {name: totals[name] / released for name in ("landing_error", "duration")}
+        shares = {name: totals[name] / episodes for name in ("released", "contact")}
+        return {**shares, **means, "episodes": totals["episodes"]}
+
+    def reset(self) -> TensorDict:
+        """Start a new episode everywhere."""
+        fresh = torch.ones(self.worlds, device=self.device, dtype=torch.bool)
+        self._start(fresh)
+        self._observations = self._observe(self._rows(fresh))
+        return self._observations
+
+    def get_observations(self) -> TensorDict:
+        """Observations of the current step."""
+        return self._observations.clone()
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Apply unclipped actions, shape (E, 5), for one control period; worlds that end start
+        anew.
+        """
+        action = self._apply(actions)
+        reward, done = self._judge(action)
+        hit = self.last["released"].float()
+        parts = [done.float(), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
+        parts.append((self.last["contact"] & done).float())
+        self._memory["totals"] += torch.stack(parts).sum(-1, dtype=torch.float64)
+        self._memory["previous"].copy_(action)
+        self._start(done)
+        rows = self._rows(done)
+        self._observations = self._observe(rows)
+        return self._observations, reward, rows.float(), {}
+
+    def _apply(self, actions: Tensor) -> Tensor:
+        """Fly one control period; returns the clipped actions.
+
+        Latches trip together, where all asked as long ago as the members know of one another.
+        """
+        task, memory = self.cfg.task, self._memory
+        action = act.clip_action(actions)
+        noise = torch.randn_like(memory["command_bias"]) * task.noise.command_step
+        noisy = action[:, : act.COMMANDS] + noise + memory["command_bias"]
+        command = act.command_from_action(noisy, task.action.max_thrust, self._max_rate)
+        self.views.command.copy_(command)
+        asked = self._worlds(act.release_asked(actions, self.cfg.release.threshold)).all(1)
+        fresh = torch.zeros_like(asked)
+        memory["asked"].copy_(hist.push(memory["asked"], asked.float(), fresh))
+        steps = (memory["age"] / self.cfg.sim.control_period - 1e-3).ceil().long()
+        agreed = memory["asked"].gather(1, steps[:, None])[:, 0] > 0.5
+        self.views.release.copy_(self._rows(agreed))
+        with on_torch_stream(self.device):
+            self.sim.step()
+        self.episode_length_buf += 1
+        return action
+
+    def gap(self) -> Tensor:
+        """Least gap between vehicles, cables and load that must not touch [m], shape (W,).
+
+        Vehicles are spheres of the propellers' reach; a vehicle's own cable is the simulator's to
+        judge (``ROPE_IN_ROTOR``), cables meet at the load.
+        """
+        state, reach = self.views.state, self.cfg.team.rotor_reach
+        pos, held = state["pos_w"], state["attached"] != 0
+        steps = state["cable_dir_w"].cumsum(0) * self._segment[:, None]
+        arm = ob.rotation_from_quat(state["quat_wb"]) @ self._mount
+        joints = (pos + arm + steps).transpose(0, 1)
+        load = self._rows(self.load_w) - pos
+        radius = self.cfg.rope.payload_radius + self.cfg.vehicle.collision_radius
+        gaps = [load.square().sum(-1).sqrt() - radius]
+        for k in range(1, self.team):
+            gaps.append((self._other(pos, k) - pos).square().sum(-1).sqrt() - 2.0 * reach)
+            cable = (self._other(joints, k) - pos[:, None]).square().sum(-1).amin(-1).sqrt()
+            gaps.append(torch.where(self._other(held, k), cable - reach, 10.0))
+        return self._worlds(torch.stack(gaps).amin(0)).amin(1)
+
+    def _landed(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Worlds whose last vehicle has let go in this step, and what follows from it."""
+        out, memory = self.views.out, self._memory
+        separated = self._worlds(out["separated"]) != 0
+        held = self._worlds(self.views.state["attached"] != 0).any(1)
+        when = torch.where(separated, self._worlds(out["separation_time"]), -1.0)
+        last = when.argmax(1)
+        begin = time - self.cfg.sim.control_period
+        earliest = torch.where(separated, when, 1e6).amin(1) + begin
+        memory["first"].copy_(torch.minimum(memory["first"], earliest))
+        chosen = {}
+        for name in ("landing_w", "time_to_impact"):
+            values = self._worlds(out[name])
+            index = last.view(-1, 1, *(1,) * (values.dim() - 2))
+            chosen[name] = values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]
+        at = begin + when.amax(1)
+        chosen["duration"] = at + chosen["time_to_impact"]
+        chosen["apart"] = at - memory["first"]
+        chosen["clearance"] = self._clearance(chosen["time_to_impact"])
+        return separated.any(1) & ~held, chosen
+
+    def _clearance(self, flight: Tensor) -> Tensor:
+        """Least distance of the load's flight to any vehicle [m], shape (W,); vehicles stand."""
+        time = (flight[:, None] * self._fractions)[:, :, None]
+        path = self.load_w[:, None] + self.load_vel_w[:, None] * time
+        path = path + self._half_gravity * time.square()
+        away = path[:, :, None] - self._worlds(self.views.state["pos_w"])[:, None]
+        return away.square().sum(-1).sqrt().flatten(1).amin(1)
+
+    def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Rewards of the rows and ends of the worlds of the step just made."""
+        task, state, team = self.cfg.task, self.views.state, self.cfg.team
+        p, period, release = task.reward, self.cfg.sim.control_period, self.cfg.release
+        time, load = self.episode_length_buf * period, self._rows(self.load_w)
+        released, landing = self._landed(time[:: self.team])
+        gap = self.gap()
+        contact = (gap < 0.0) & ~released
+        ended = terminations.negative(
+            task.bounds,
+            state["pos_w"],
+            ob.rotation_from_quat(state["quat_wb"]),
+            load,
+            state["status"],
+            state["release_timer"] >= 0.0,
+            time,
+            release.landing_height,
+        )
+        negative = ~released & (self._worlds(ended).any(1) | contact)
+        error = (landing["landing_w"] - self.views.goal_w[:: self.team])[:, :2].norm(dim=-1)
+        attached = (
+            rewards.kinetic(p, state["vel_w"], state["rate_b"], self._rows(self.load_vel_w))
+            + rewards.command(p, action, self._rate_weights)
+            + rewards.change(p, action, self._memory["previous"], self._change_weights)
+        )
+        at_release = (
+            rewards.landing(p, error)
+            + rewards.time_of_flight(p, landing["time_to_impact"])
+            + rewards.proximity(p, landing["clearance"], release.clearance_margin)
+        )
+        shared = rewards.carry_time(p, period) - p.termination * negative.float()
+        shared = shared - team.contact_cost * contact.float()
+        shared = shared - team.margin_cost * (team.margin - gap).clamp(0.0, team.margin)
+        reward = torch.where(self._rows(released), self._rows(at_release), attached)
+        self.last = {"released": released, "negative": negative, "contact": contact}
+        self.last |= landing | {"landing_error": error, "gap": gap}
+        return p.scale * (reward + self._rows(shared)), released | negative
+
+    def _start(self, fresh: Tensor) -> None:
+        """Start worlds where ``fresh``, bool, shape (W,)."""
+        task, memory, noise = self.cfg.task, self._memory, self.cfg.task.noise
+        rows = self._rows(fresh)
+        mask = rows.to(torch.int32)
+        with on_torch_stream(self.device):
+            self.sim.randomize(task.start, wp.from_torch(mask))
+            self._form(fresh)
+            self.sim.adopt(wp.from_torch(mask))
+        self._kept = mask  # until the launches have read it
+        self.episode_length_buf.masked_fill_(rows, 0)
+        previous = memory["previous"]
+        torch.where(rows[:, None], self._start_action, previous, out=previous)
+        memory["asked"].masked_fill_(fresh[:, None], 0.0)
+        memory["first"].masked_fill_(fresh, 1e6)
+        spreads = {
+            "frame_bias": noise.observation_bias,
+            "command_bias": noise.command_bias,
+            "keypoint_bias": self.cfg.camera.noise.bias_std,
+        }
+        for name, std in spreads.items():
+            old = memory[name]
+            where = rows.view(-1, *(1,) * (old.dim() - 1))
+            torch.where(where, torch.randn_like(old) * std, old, out=old)
+        low, high = task.observation.latency
+        age = memory["pose_age"]
+        torch.where(rows, low + (high - low) * torch.rand_like(age), age, out=age)
+        low, high = self.cfg.team.age
+        age = memory["age"]
+        more = (2.0 * torch.rand_like(age) - 1.0).clamp(min=0.0)
+        torch.where(fresh, low + (high - low) * more, age, out=age)
+
+    def _form(self, fresh: Tensor) -> None:
+        """Move the vehicles that were drawn into a formation around the load, and draw a goal."""
+        team, state, goal = self.cfg.team, self.views.state, self.views.goal_w
+        draw = torch.rand(self.worlds, 4, device=self.device)
+        heading = 2.0 * math.pi * draw[:, 0]
+        low, high = team.goal
+        distance = low + (high - low) * draw[:, 1]
+        drawn = torch.stack([distance * heading.cos(), distance * heading.sin()], -1)
+        if self._goal is not None:
+            drawn = self._goal[:2].expand_as(drawn)
+            heading = torch.atan2(drawn[:, 1], drawn[:, 0])
+        drawn = torch.cat([drawn, torch.zeros_like(drawn[:, :1])], -1)
+        spread = math.radians(team.across_deg) * (2.0 * draw[:, 2] - 1.0)
+        low, high = (math.radians(degree) for degree in team.tilt_deg)
+        tilt = self._rows(low + (high - low) * draw[:, 3])
+        rows = torch.arange(self.num_envs, device=self.device)
+        turn = 2.0 * math.pi / self.team * (rows % self.team)
+        azimuth = self._rows(heading + spread) + 0.5 * math.pi + turn
+        side = -tilt.sin()
+        down = torch.stack([side * azimuth.cos(), side * azimuth.sin(), -tilt.cos()], -1)
+        lead, lead_vel = (self._worlds(state[name])[:, :1] for name in ("pos_w", "vel_w"))
+        length = self._segment * self.cfg.rope.segments
+        drop = self.cfg.rope.length * tilt.cos()
+        load = lead.expand(-1, self.team, -1).flatten(0, 1).clone()
+        load[:, 2] -= drop
+        arm = (ob.rotation_from_quat(state["quat_wb"]) @ self._mount[:, None])[..., 0]
+        spin = ob.rotation_from_quat(state["quat_wb"])
+        turning = torch.linalg.cross(state["rate_b"], self._mount.expand_as(state["rate_b"]))
+        vel = lead_vel.expand(-1, self.team, -1).flatten(0, 1)
+        vel = vel - (spin @ turning[..., None])[..., 0]
+        pos = load - length[:, None] * down - arm
+        where = self._rows(fresh)[:, None]
+        goal.copy_(torch.where(where, self._rows(drawn), goal))
+        state["vel_w"].copy_(torch.where(where, vel, state["vel_w"]))
+        state["pos_w"].copy_(torch.where(where, pos, state["pos_w"]))
+        for name, value in (("cable_dir_w", down), ("cable_vel_w", torch.zeros_like(down))):
+            state[name].copy_(torch.where(where, value, state[name]))
+
+    @rounded_products(False)
+    def _observe(self, fresh: Tensor) -> TensorDict:
+        """Actor's and critic's view of the current state; ``fresh``: rows that begin."""
+        state, memory, noise = self.views.state, self._memory, self.cfg.task.noise
+        load, goal = self._rows(self.load_w), self.views.goal_w
+        rot_wb = ob.rotation_from_quat(state["quat_wb"])
+        vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
+        poses = hist.push(memory["poses"], torch.cat([vehicle, load], -1), fresh)
+        memory["poses"].copy_(poses)
+        period = self.cfg.sim.control_period
+        pose = hist.at_latency(poses, memory["pose_age"] / period)
+        seen = pose[:, : ob.VEHICLE]
+        offset = ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])
+        frame = torch.cat([seen, offset], -1)
+        frame = frame + torch.randn_like(frame) * noise.observation_step + memory["frame_bias"]
+        valid = None
+        if self.layout.name == "vision":
+            points, valid = self._see(pose, goal)
+            frame = torch.cat([frame[:, : ob.VEHICLE], points.flatten(1)], -1)
+        told = self._told(poses, frame[:, :3])
+        held = state["attached"].float()
+        actor, history = ob.observe(
+            self.layout,
+            frame,
+            valid,
+            memory["previous"],
+            held,
+            memory["history"],
+            fresh,
+            setup=told,
+        )
+        memory["history"].copy_(history)
+        critic = self._privileged(vehicle, load, held, fresh)
+        observed = {"actor": actor, "critic": critic}
+        return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
+
+    def _told(self, poses: Tensor, pos_w: Tensor) -> Tensor:
+        """What the others told of their poses, as old as it is, and that age in control periods."""
+        noise = self.cfg.task.noise.observation_step
+        age = self._rows(self._memory["age"]) / self.cfg.sim.control_period
+        late = hist.at_latency(poses, age)
+        parts = []
+        for k in range(1, self.team):
+            other = self._other(late, k)
+            place = other[:, :3] + torch.randn_like(pos_w) * noise - pos_w
+            parts += [place, other[:, 9 : ob.VEHICLE]]
+        return torch.cat([*parts, age[:, None]], -1)
+
+    def _see(self, pose: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints of goal and load in each vehicle's camera, with noise."""
+        rot_wb, load = ob.rotation_in(pose), pose[:, ob.VEHICLE :]
+        points, valid = keypoints(self.camera, pose[:, :3], rot_wb, goal, load)
+        draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
+        bias = self._memory["keypoint_bias"]
+        return apply_noise(self.cfg.camera.noise, points, valid, bias, draw)
+
+    def _privileged(self, vehicle: Tensor, load: Tensor, held: Tensor, fresh: Tensor) -> Tensor:
+        """Critic's view."""
+        state, memory = self.views.state, self._memory
+        offset = ob.state_part(state["pos_w"], self.views.goal_w, load)
+        history = hist.push(memory["true_history"], offset[:, 2:], fresh)
+        memory["true_history"].copy_(history)
+        own = torch.cat(
+            [
+                vehicle,
+                memory["previous"],
+                state["cable_dir_w"][0],
+                state["release_timer"][:, None],
+                state["mass_scale"][:, None],
+                state["voltage"][:, None],
+                held[:, None],
+            ],
+            -1,
+        )
+        parts = [own] + [self._other(own, k) for k in range(1, self.team)]
+        time = self.episode_length_buf[:, None] * self.cfg.sim.control_period
+        parts += [offset[:, :2], history.flatten(1), self._rows(self.load_vel_w), time]
+        return torch.cat([*parts, self._rows(memory["age"])[:, None]], -1)

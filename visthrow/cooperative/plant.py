@@ -1,0 +1,66 @@
+"""TeamSim: worlds of several vehicles that carry one load."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from sim import solvers
+from sim.hybrid import HybridSim
+from sim.kernels.rope.payload import LOADS
+from sim.params import PlantParams
+from visthrow.cooperative.tree import TreeSolver
+
+
+class TeamSim(HybridSim):
+    """Batched simulator with a row a vehicle: row ``w * team + v`` is vehicle v of world w.
+
+    Blocks, latches and outputs are those of a row. A row that separates while others hold on puts
+    out the landing that would follow there and then; that of the last row is the throw's.
+
+    Attributes:
+        team: vehicles a world, V. worlds: number of worlds W.
+    """
+
+    def __init__(self, params: PlantParams, worlds: int, team: int, *args: Any, **options: Any):
+        """Allocate ``worlds`` teams; the rest is as for :class:`sim.hybrid.HybridSim`.
+
+        ``options["build"]`` makes another solver of the bodies, called with a world and
+        ``team=``. Raises ValueError: fewer than one vehicle, or air that acts on the load.
+        """
+        if team < 1:
+            raise ValueError(f"a team of {team} vehicles; expected 1 or more")
+        self.team, self.worlds = team, worlds
+        self._build = options.pop("build", TreeSolver)
+        super().__init__(params, worlds * team, *args, **options)
+        if unknown := sorted(LOADS & self.extensions):
+            raise ValueError(f"a team's load with {', '.join(unknown)}; expected none of them")
+
+    def _solver(self) -> partial[solvers.Solver]:
+        return partial(self._build, team=self.team)
+
+    @property
+    def load(self) -> tuple["wp.array[Any]", "wp.array[Any]"]:
+        """Position [m] and velocity [m/s] of the loads, each of shape (W,) of vec3."""
+        solver: Any = self._exchange.solver  # type: ignore[union-attr]
+        return solver.load_pos_w, solver.load_vel_w
+
+    def hang(self, load_w: np.ndarray, cable_dir_w: np.ndarray, vel_w: np.ndarray) -> None:
+        """Put level vehicles where straight cables lead from the loads to them.
+
+        Args:
+            load_w: [m], shape (W, 3). vel_w: of all that moves [m/s], shape (W, 3).
+            cable_dir_w: from each mount to the load, shape (W, V, 3).
+        """
+        ropes = self.plants()[1]
+        length = ropes["segment_length"] * self.params.rope.segments
+        directions = cable_dir_w.reshape(-1, 3)
+        rows = np.repeat(load_w, self.team, axis=0)
+        pos_w = rows - length[:, None] * directions - ropes["mount"]
+        segments = self.params.rope.segments
+        self.place(
+            pos_w,
+            vel_w=np.repeat(vel_w, self.team, axis=0),
+            cable_dir_w=np.repeat(directions[:, None], segments, axis=1),
+        )

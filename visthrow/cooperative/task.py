@@ -1,0 +1,122 @@
+"""Schema of the cooperative task: an experiment whose vehicle and rope are those of every member.
+
+The rope's ``payload_mass`` is a member's share of the load."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+from sim.hybrid import rope_variants
+from sim.params import ReleaseParams, VehicleParams
+from visthrow import config
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
+from visthrow.onboard import observations as ob
+from visthrow.task import Experiment, contract_of
+from visthrow.task.measurement import pilots_hover
+
+Range = tuple[NotNegative, NotNegative]
+
+OTHER = 9
+"""Width of what an actor sees of another vehicle: position from its own 3, rotation 6."""
+
+
+@dataclass(frozen=True)
+class TeamParams(Bounded):
+    """A team, its start, what its members tell one another and what goes wrong."""
+
+    vehicles: Annotated[int, Bound(2)] = 2  # V
+    tilt_deg: Range = (25.0, 45.0)  # of the cables from the vertical at the start [deg]
+    across_deg: NotNegative = 20.0  # +- of the formation from across the throw at the start [deg]
+    goal: Range = (1.0, 2.3)  # distance of the goal from the start's centre [m]
+    # age of what a member knows of the others: half of the throws have the lower one [s]
+    age: Range = (0.02, 0.06)
+    rotor_reach: Positive = 0.135  # of a vehicle, centre to the outermost tip of a propeller [m]
+    margin: Positive = 0.1  # gap below which a step costs [m]
+    margin_cost: NotNegative = 50.0  # for each metre less, a step
+    contact_cost: NotNegative = 50.0  # of a contact, besides that of any negative end
+    # vehicle 0 of the worlds: thrust against the controller's map, delay of its latch
+    weak: Range = (1.0, 1.0)  # [-]
+    late: Range = (0.0, 0.0)  # [s]
+    faulty: Annotated[float, Bound(0.0, 1.0)] = 0.0  # share of the worlds with each of the two
+
+
+@dataclass(frozen=True)
+class TeamExperiment(Experiment):
+    """All that the training of a team depends on."""
+
+    team: TeamParams = field(default_factory=TeamParams)
+
+
+LEVELS = 20
+"""Worlds after which faults repeat."""
+
+
+def layout_of(experiment: TeamExperiment) -> ob.Layout:
+    """Layout of a member's observation: as of a single vehicle, then the others and their age."""
+    told = OTHER * (experiment.team.vehicles - 1) + 1
+    return dataclasses.replace(ob.layout_of(experiment.task.observation), setup=told)
+
+
+def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
+    """Vehicles, releases and ropes of the rows, for :class:`visthrow.cooperative.plant.TeamSim`.
+
+    A share ``faulty`` of :data:`LEVELS` worlds has a weak vehicle, as many a late latch, evenly
+    over their ranges; they repeat.
+    """
+    team, vehicle, release = experiment.team, experiment.vehicle, experiment.release
+    vehicles, releases = [], []
+    faults = round(team.faulty * LEVELS)
+    for world in range(LEVELS):
+        weak, late = world < faults, world >= LEVELS - faults
+        part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
+        gain = _within(team.weak, part) if weak else 1.0
+        delay = _within(team.late, part) if late else 0.0
+        for v in range(team.vehicles):
+            vehicles.append(_weakened(vehicle, gain if v == 0 else 1.0))
+            lag = release.lag + (delay if v == 0 else 0.0)
+            releases.append(dataclasses.replace(release, lag=lag))
+    ropes = rope_variants(experiment.rope, experiment.task.start)
+    return {"vehicles": vehicles, "releases": releases, "ropes": ropes}
+
+
+def _within(interval: tuple[float, float], part: float) -> float:
+    low, high = interval
+    return low + (high - low) * part
+
+
+def _weakened(vehicle: VehicleParams, gain: float) -> VehicleParams:
+    """The vehicle with a gain of all its rotors."""
+    gains = tuple(gain * one for one in vehicle.thrust.gain)
+    return dataclasses.replace(vehicle, thrust=dataclasses.replace(vehicle.thrust, gain=gains))
+
+
+Fault = Literal["none", "weak", "late", "old"]
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "weak": {"weak": (0.9, 0.9)},
+    "late": {"late": (0.03, 0.03)},
+    "old": {"age": (0.06, 0.06)},
+}
+"""Conditions of the throws that are measured; each alone."""
+
+
+def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
+    """The experiment from hover across the throw, in every world with one of :data:`FAULTS`."""
+    start = dataclasses.replace(
+        pilots_hover(),
+        tether_variants=experiment.task.start.tether_variants,
+        tether_spread=experiment.task.start.tether_spread,
+    )
+    clean = {"weak": (1.0, 1.0), "late": (0.0, 0.0), "age": (experiment.team.age[0],) * 2}
+    hover = {"tilt_deg": (33.0, 37.0), "across_deg": 5.0, "faulty": 1.0}
+    team = dataclasses.replace(experiment.team, **{**clean, **hover, **FAULTS[fault]})
+    task = dataclasses.replace(experiment.task, start=start)
+    return dataclasses.replace(experiment, task=task, team=team)
+
+
+def team_contract(experiment: TeamExperiment) -> dict[str, Any]:
+    """Conditions that a throw shares with the training of its policy."""
+    contract = contract_of(experiment)
+    contract["observation"]["dimension"] = layout_of(experiment).dimension
+    return contract | {"team": config.to_dict(experiment.team)}

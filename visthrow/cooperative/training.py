@@ -1,0 +1,136 @@
+"""Training of a team's policy by rsl_rl's PPO, and throws with it."""
+
+import contextlib
+import io
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+
+from visthrow.cooperative.env import TeamEnv
+from visthrow.cooperative.task import TeamExperiment, as_flown, team_contract
+from visthrow.onboard.policy import Policy
+from visthrow.training.device import rounded_products
+from visthrow.training.ppo.algorithm import PPOTraining, rsl_rl_config
+from visthrow.training.ranks import Ranks
+
+
+class TeamTraining(PPOTraining):
+    """PPO on :class:`TeamEnv`."""
+
+    def __init__(self, experiment: TeamExperiment, device: str, seed: int):
+        torch.manual_seed(seed)
+        if device.startswith("cuda"):
+            torch.cuda.set_device(device)
+        p, ranks = experiment.ppo, Ranks(device)
+        self.experiment, self.device, self.seed = experiment, device, seed
+        self.iterations, self.samples = p.iterations, p.environments * p.steps
+        self.env = TeamEnv(experiment, device, seed)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.alg = PPO.construct_algorithm(
+                self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
+            )
+        self.alg.train_mode()
+        self._obs = self.env.get_observations()
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._rollouts = 0
+
+    def policy(self, made_by: dict[str, Any] | None = None) -> Policy:
+        """The policy as it stands."""
+        return self.export(team_contract(self.experiment), made_by or {})
+
+    def run(self, seconds: float, iterations: int | None = None) -> Iterator[dict[str, float]]:
+        """Train for a time [s], or so many iterations; yields the figures of each.
+
+        Schedules follow the time where no number of iterations is named.
+        """
+        start, count = time.perf_counter(), 0
+        done = 0.0
+        while done < 1.0:
+            with rounded_products(True):
+                self.collect(done)
+                figures = self.learn(done)
+            count += 1
+            spent = time.perf_counter() - start
+            done = count / iterations if iterations else min(spent / seconds, 1.0)
+            yield figures | {"iteration": count, "seconds": spent}
+
+
+@torch.inference_mode()
+def throw(
+    experiment: TeamExperiment,
+    act: Callable[[torch.Tensor], torch.Tensor],
+    *,
+    fault: str = "none",
+    target: float = 2.0,
+    count: int = 200,
+    device: str = "cpu",
+    seed: int = 12345,
+    build: Any = None,
+    record: Callable[[TeamEnv], None] | None = None,
+) -> dict[str, Any]:
+    """Throw ``count`` times from hover at a target [m] along x, all noise included, as one batch.
+
+    Returns, besides the conditions, ``landed`` (share), ``contact`` (share), mean, median and 95th
+    percentile of the landing error [m], its bias [m], ``duration`` [s] and ``apart`` [s] of the
+    throws that landed clear. A throw whose load comes nearer to a vehicle than both radii in its
+    flight counts as a contact.
+
+    Args:
+        experiment, fault: conditions, see :func:`visthrow.cooperative.task.as_flown`.
+        act: of observations (E, D) -> actions (E, 5).
+        build: another solver of the bodies.
+        record: called with the environment before the first step and after each.
+    """
+    devices = [device] if device.startswith("cuda") else []
+    with torch.random.fork_rng(devices=devices):
+        torch.manual_seed(seed)
+        flown = as_flown(experiment, fault)
+        env = TeamEnv(flown, device, seed, count * experiment.team.vehicles, build)
+        env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
+        observations = env.reset()
+        kept: dict[str, torch.Tensor] = {}
+        waiting = torch.ones(count, dtype=torch.bool, device=device)
+        for _ in range(env.max_episode_length + 1):
+            if record is not None:
+                record(env)
+            observations, _, _, _ = env.step(act(observations["actor"]))
+            ended = waiting & (env.last["released"] | env.last["negative"])
+            for name, value in env.last.items():
+                mask = ended.view(-1, *(1,) * (value.dim() - 1))
+                kept[name] = torch.where(mask, value, kept.get(name, torch.zeros_like(value)))
+            waiting &= ~ended
+            if not bool(waiting.any()):
+                break
+    values = {name: value.cpu().numpy() for name, value in kept.items()}
+    radii = flown.rope.payload_radius + flown.vehicle.collision_radius
+    return {"fault": fault, "target": target, "seed": seed} | _summary(values, target, radii)
+
+
+def _summary(values: dict[str, np.ndarray], target: float, radii: float) -> dict[str, Any]:
+    """Figures of throws."""
+    released = values["released"]
+    touched = values["contact"] | (released & (values["clearance"] < radii))
+    good = released & ~touched
+    result = {
+        "throws": len(good),
+        "landed": float(released.mean()),
+        "contact": float(touched.mean()),
+    }
+    if not good.any():
+        return result
+    error = values["landing_error"][good]
+    bias = values["landing_w"][good, :2].mean(0) - [target, 0.0]
+    return result | {
+        "error_mean": float(error.mean()),
+        "error_median": float(np.median(error)),
+        "error_p95": float(np.quantile(error, 0.95)),
+        "error_sem": float(error.std() / len(error) ** 0.5),
+        "bias": [float(b) for b in bias],
+        "duration_mean": float(values["duration"][good].mean()),
+        "apart_mean": float(values["apart"][good].mean()),
+        "apart_most": float(values["apart"][good].max()),
+    }

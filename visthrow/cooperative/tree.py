@@ -1,0 +1,259 @@
+"""Several vehicles with a cable each to one load, as a tree of rods with the load at its root.
+
+Seen from the load, a cable is a chain of slender rods with a vehicle at its outer end. Every part
+asks for a force ``A a + b`` at its inner joint (equations: :mod:`sim.kernels.rope.chain`); at the
+outermost joint A and b are the inverse of the mount's mobility and what holds it back. The sum over
+the cables gives the acceleration of the load, a second pass those of rods and vehicles.
+
+Integration: half a step of drift, accelerations in the middle, a step of kick, half a step of
+drift. The accelerations are solved twice, the second time with the velocities of the middle.
+``h / 2 D + h^2 / 4 K`` joins a rod's inertia, with its damping D and its stiffness K under the
+pull of the last step, so that a snatch of the cable stays stable."""
+
+import warp as wp
+
+from sim.kernels.quadrotor.rigid_body import angular_acceleration, quat_rate
+from sim.kernels.rope.chain import tangent_basis, viscous
+from sim.solvers import World
+
+
+class TreeSolver:
+    """Bodies of W worlds behind :class:`sim.solvers.Exchange`; row ``w * team + v`` is a vehicle.
+
+    A rope's ``payload_mass`` is the vehicle's share of the load, whose size and turning do not
+    count: all cables end in its centre. A vehicle that lets go keeps its cable.
+
+    Attributes:
+        load_pos_w: [m], shape (W,) of vec3. load_vel_w: [m/s], likewise.
+    """
+
+    capturable = True
+
+    def __init__(self, world: World, team: int) -> None:
+        self.world, self.team = world, team
+        self.worlds = world.count // team
+        vec3 = world.types.vec3
+        self.load_pos_w, self.load_vel_w = (
+            wp.zeros(self.worlds, dtype=vec3, device=world.device) for _ in range(2)
+        )
+        self._place, self._advance = _kernels(world, team)
+
+    def place(self, state, mask) -> None:
+        self._state = state
+        inputs = [state, mask, self.world.bodies, self.load_pos_w, self.load_vel_w]
+        wp.launch(self._place, self.worlds, inputs, device=self.world.device)
+
+    def advance(self, duration: float) -> None:
+        w = self.world
+        state = [self._state, self.load_pos_w, self.load_vel_w, w.bodies, w.wrench]
+        inputs = [*w.packed, w.gravity, duration, *state]
+        wp.launch(self._advance, self.worlds, inputs, device=w.device, block_dim=64)
+
+
+def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Kernels that place and advance the bodies; a thread a world."""
+    t, L, V = world.types, world.params.rope.segments, team
+    N = V * L
+    real, vec3, mat33, quat, Vehicle, Rope = t.real, t.vec3, t.mat33, t.quat, t.Vehicle, t.Rope
+    State, Wrench, Bodies = world.kernels.State, world.kernels.Wrench, world.kernels.Bodies
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def place(
+        # In:
+        state: State,
+        mask: wp.array(dtype=wp.int32),
+        bodies: Bodies,
+        # Out:
+        load_pos: wp.array(dtype=vec3),
+        load_vel: wp.array(dtype=vec3),
+    ):
+        world = wp.tid()
+        for k in range(V):
+            row = world * V + k
+            if mask[row] != 0 and state.attached[row] != 0:
+                load_pos[world] = bodies.payload_pos_w[row]
+                load_vel[world] = bodies.payload_vel_w[row]
+
+    @wp.func
+    def diagonal(x: real):
+        return wp.diag(vec3(x, x, x))
+
+    @wp.func
+    def mobility(p: Vehicle, rope: Rope, rot: mat33):
+        """Acceleration of the mount for a force there, world frame [1/kg]."""
+        arm = rot * wp.skew(rope.mount)
+        one = vec3(real(1.0), real(1.0), real(1.0))
+        turning = arm * wp.diag(wp.cw_div(one, p.body.inertia)) * wp.transpose(arm)
+        return diagonal(real(1.0) / p.body.mass) + turning
+
+    @wp.func
+    def free(p: Vehicle, rope: Rope, rot: mat33, w: vec3, force_b: vec3, torque_b: vec3, g: vec3):
+        """Acceleration of the mount without a cable, world frame."""
+        turn = angular_acceleration(p, w, torque_b)
+        spin = wp.cross(turn, rope.mount) + wp.cross(w, wp.cross(w, rope.mount))
+        return rot * (force_b / p.body.mass + spin) + g
+
+    @wp.func
+    def damped(
+        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), first: int, i: int
+    ):
+        """Damping of the joints between rods as a force on ``n'`` of rod i, and its rate."""
+        c = rope.joint_damping
+        out = vec3()
+        rate = real(0.0)
+        at = first + i
+        if i > 0:
+            out += c * (viscous(n[at], n[at - 1], u[at - 1]) - u[at])
+            rate += c
+        if i < L - 1:
+            out += c * (viscous(n[at], n[at + 1], u[at + 1]) - u[at])
+            rate += c
+        return out, rate
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def advance(
+        # Params:
+        vehicles: wp.array(dtype=Vehicle),
+        ropes: wp.array(dtype=Rope),
+        gravity: real,
+        h: real,
+        # State in:
+        state: State,
+        load_pos: wp.array(dtype=vec3),
+        load_vel: wp.array(dtype=vec3),
+        bodies: Bodies,
+        # In:
+        wrench: Wrench,
+    ):
+        world = wp.tid()
+        g = vec3(real(0.0), real(0.0), -gravity)
+        half = real(0.5) * h
+        first = world * V
+        load_mass = real(0.0)
+        n = wp.zeros(shape=(N,), dtype=vec3)  # in the middle
+        u = wp.zeros(shape=(N,), dtype=vec3)
+        swing = wp.zeros(shape=(N,), dtype=vec3)  # second derivative of n
+        c1 = wp.zeros(shape=(N,), dtype=vec3)
+        c2 = wp.zeros(shape=(N,), dtype=vec3)
+        h1 = wp.zeros(shape=(N,), dtype=real)
+        h2 = wp.zeros(shape=(N,), dtype=real)
+        turn = wp.zeros(shape=(V,), dtype=vec3)  # angular acceleration, body frame
+        for k in range(V):
+            row = first + k
+            load_mass += ropes[row % ropes.shape[0]].payload_mass
+            for i in range(L):
+                rate = bodies.cable_vel_w[i, row]
+                at = k * L + i
+                n[at] = wp.normalize(bodies.cable_dir_w[i, row] + half * rate)
+                u[at] = rate
+
+        acc = vec3()
+        for repeat in range(2):
+            A_all = diagonal(load_mass)
+            b_all = -load_mass * g
+            for k in range(V):
+                row = first + k
+                if state.attached[row] == 0:
+                    continue
+                p = vehicles[row % vehicles.shape[0]]
+                p.body.mass = p.body.mass * state.mass_scale[row]
+                rope = ropes[row % ropes.shape[0]]
+                m = rope.segment_mass
+                l = rope.segment_length
+                w = bodies.rate_b[row]
+                q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], w) * half)
+                w += half * turn[k]
+                rot = wp.quat_to_matrix(q)
+                A = wp.inverse(mobility(p, rope, rot))
+                b = -(A * free(p, rope, rot, w, wrench.force_b[row], wrench.torque_b[row], g))
+                for i in range(L):
+                    at = k * L + i
+                    d = -n[at]
+                    rate = -(u[at] + half * swing[at])
+                    e1, e2 = tangent_basis(d)
+                    a_d = A * d
+                    a1 = A * e1
+                    a2 = A * e2
+                    c = real(0.5) * l
+                    damping, friction = damped(rope, n, u, k * L, i)
+                    tension = wp.max(wp.dot(wrench.pull_w[row], n[at]), real(0.0))
+                    J = m * l * l / real(3.0) + half * friction + half * half * tension * l
+                    s11 = J + l * l * wp.dot(e1, a1)
+                    s12 = l * l * wp.dot(e1, a2)
+                    s22 = J + l * l * wp.dot(e2, a2)
+                    det = real(1.0) / (s11 * s22 - s12 * s12)
+                    square = wp.dot(rate, rate)
+                    push = (c * m) * g - l * b + (l * l * square) * a_d - damping
+                    g1 = wp.dot(e1, push)
+                    g2 = wp.dot(e2, push)
+                    b1 = (c * m) * e1 + l * a1
+                    b2 = (c * m) * e2 + l * a2
+                    c1[at] = det * (s22 * b1 - s12 * b2)
+                    c2[at] = det * (s11 * b2 - s12 * b1)
+                    h1[at] = det * (s22 * g1 - s12 * g2)
+                    h2[at] = det * (s11 * g2 - s12 * g1)
+                    b = b - m * g - square * ((c * m) * d + l * a_d) + h1[at] * b1 + h2[at] * b2
+                    A = A + diagonal(m) - wp.outer(b1, c1[at]) - wp.outer(b2, c2[at])
+                A_all += A
+                b_all += b
+            acc = -(wp.inverse(A_all) * b_all)
+
+            for k in range(V):
+                row = first + k
+                if state.attached[row] == 0:
+                    continue
+                p = vehicles[row % vehicles.shape[0]]
+                p.body.mass = p.body.mass * state.mass_scale[row]
+                rope = ropes[row % ropes.shape[0]]
+                a = acc
+                for j in range(L):
+                    at = k * L + (L - 1 - j)
+                    d = -n[at]
+                    rate = u[at] + half * swing[at]
+                    e1, e2 = tangent_basis(d)
+                    beta = e1 * (h1[at] - wp.dot(c1[at], a)) + e2 * (h2[at] - wp.dot(c2[at], a))
+                    outward = beta - wp.dot(rate, rate) * d
+                    swing[at] = -outward
+                    a += rope.segment_length * outward
+                w = bodies.rate_b[row]
+                q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], w) * half)
+                w += half * turn[k]
+                rot = wp.quat_to_matrix(q)
+                torque = wrench.torque_b[row]
+                lack = a - free(p, rope, rot, w, wrench.force_b[row], torque, g)
+                pull = wp.inverse(mobility(p, rope, rot)) * lack
+                torque += wp.cross(rope.mount, wp.transpose(rot) * pull)
+                turn[k] = angular_acceleration(p, w, torque)
+
+        vel = load_vel[world] + h * acc
+        pos = load_pos[world] + half * (load_vel[world] + vel)
+        load_pos[world] = pos
+        load_vel[world] = vel
+        for k in range(V):
+            row = first + k
+            bodies.payload_pos_w[row] = pos
+            bodies.payload_vel_w[row] = vel
+            if state.attached[row] == 0:
+                continue
+            rope = ropes[row % ropes.shape[0]]
+            out_pos = pos
+            out_vel = vel
+            for i in range(L):
+                at = k * L + i
+                rate = u[at] + h * swing[at]
+                direction = wp.normalize(bodies.cable_dir_w[i, row] + half * (u[at] + rate))
+                rate = rate - direction * wp.dot(direction, rate)
+                bodies.cable_dir_w[i, row] = direction
+                bodies.cable_vel_w[i, row] = rate
+                out_pos -= rope.segment_length * direction
+                out_vel -= rope.segment_length * rate
+            w = bodies.rate_b[row] + h * turn[k]
+            mean = real(0.5) * (bodies.rate_b[row] + w)
+            q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], mean) * half)
+            q = wp.normalize(bodies.quat_wb[row] + quat_rate(q, mean) * h)
+            bodies.quat_wb[row] = q
+            bodies.rate_b[row] = w
+            bodies.pos_w[row] = out_pos - wp.quat_rotate(q, rope.mount)
+            bodies.vel_w[row] = out_vel - wp.quat_rotate(q, wp.cross(w, rope.mount))
+
+    return place, advance
