@@ -114,7 +114,8 @@ class TeamEnv(VecEnv):
 
     def _rows(self, of_worlds: Tensor) -> Tensor:
         """Values of worlds, shape (W, ...), for their rows."""
-        return of_worlds.repeat_interleave(self.team, dim=0)
+        shape = (self.worlds, self.team, *of_worlds.shape[1:])
+        return of_worlds.unsqueeze(1).expand(shape).flatten(0, 1)
 
     def _worlds(self, of_rows: Tensor) -> Tensor:
         """Values of rows as (W, V, ...)."""

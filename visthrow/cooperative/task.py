@@ -27,7 +27,7 @@ class TeamParams(Bounded):
     vehicles: Annotated[int, Bound(2)] = 2  # V
     tilt_deg: Range = (25.0, 45.0)  # of the cables from the vertical at the start [deg]
     across_deg: NotNegative = 20.0  # +- of the formation from across the throw at the start [deg]
-    goal: Range = (1.0, 2.3)  # distance of the goal from the start's centre [m]
+    goal: Range = (0.3, 2.3)  # distance of the goal from the start's centre [m]
     # age of what a member knows of the others: half of the throws have the lower one [s]
     age: Range = (0.02, 0.06)
     rotor_reach: Positive = 0.135  # of a vehicle, centre to the outermost tip of a propeller [m]

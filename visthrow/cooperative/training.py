@@ -21,7 +21,8 @@ from visthrow.training.ranks import Ranks
 class TeamTraining(PPOTraining):
     """PPO on :class:`TeamEnv`."""
 
-    def __init__(self, experiment: TeamExperiment, device: str, seed: int):
+    def __init__(self, experiment: TeamExperiment, device: str, seed: int, eager: bool = False):
+        """Build environment and networks; ``eager``: no rollout is captured in a CUDA graph."""
         torch.manual_seed(seed)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)
@@ -36,7 +37,13 @@ class TeamTraining(PPOTraining):
         self.alg.train_mode()
         self._obs = self.env.get_observations()
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._rollouts = 0
+        self._rollouts, self._eager = 0, eager
+
+    def rollout(self) -> None:
+        if self._eager:
+            self._rollout()
+        else:
+            super().rollout()
 
     def policy(self, made_by: dict[str, Any] | None = None) -> Policy:
         """The policy as it stands."""

@@ -1,0 +1,1 @@
+"""Measurements of several vehicles that throw one load."""

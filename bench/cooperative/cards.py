@@ -1,0 +1,136 @@
+"""Train three seeds of the state policy and one of the vision policy of a pair, a card each, and
+throw them under every condition of :data:`visthrow.cooperative.task.FAULTS`.
+
+Writes a policy and a JSON file with curve and figures for each into a folder."""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+THROWING = 90.0  # time kept for the throws after a training [s]
+KEEPING = 45.0  # between two policies that are kept on the way [s]
+TALKING = 10.0  # between two lines of progress [s]
+EARLY = 150.0  # a job that fails by then is begun again without CUDA graphs [s]
+THROWS = 200
+SEED = 900_000  # of the throws: no training has it
+
+
+def train_and_throw(args: argparse.Namespace) -> None:
+    """One card's work."""
+    from visthrow import config
+    from visthrow.common import provenance
+    from visthrow.common.storage import write_json
+    from visthrow.cooperative.task import FAULTS, TeamExperiment
+    from visthrow.cooperative.training import TeamTraining, throw
+
+    begin = time.time()
+    path = config.find("cooperative", args.config)
+    experiment = config.load(TeamExperiment, path, args.overrides)
+    training = TeamTraining(experiment, args.device, args.seed, args.eager)
+    file = args.out / f"{args.config}-{args.seed}"
+    made_by = {"seed": args.seed, "config": config.to_dict(experiment, defaults=False)}
+    result = {"config": args.config, "seed": args.seed, "built_s": time.time() - begin}
+    result |= {"provenance": provenance.collect(), "curve": [], "throws": []}
+
+    def keep() -> None:
+        training.policy(made_by | provenance.collect()).save(file.with_suffix(".npz"))
+        write_json(file.with_suffix(".json"), result)
+
+    throwing = min(THROWING, 0.3 * args.seconds)
+    seconds = args.until - time.time() - throwing
+    print(f"{file.name}: trains for {seconds:.0f} s", flush=True)
+    spoke = kept = time.time()
+    for figures in training.run(seconds):
+        now = time.time()
+        if not math.isfinite(figures["value"] + figures["surrogate"]):
+            print(f"{file.name}: a loss is not finite: {figures}", flush=True)
+            break
+        if now - spoke > TALKING or figures["iteration"] < 3:
+            spoke = now
+            figures["samples"] = figures["iteration"] * training.samples
+            result["curve"].append(figures)
+            row = {name: round(value, 4) for name, value in figures.items()}
+            print(f"{file.name}: {json.dumps(row)}", flush=True)
+        if now - kept > KEEPING:
+            kept = now
+            keep()
+    else:
+        keep()
+    from visthrow.onboard.policy import Policy
+
+    act = Policy.load(file.with_suffix(".npz")).to(args.device).act
+    for fault in FAULTS:
+        if time.time() > args.until - 10.0:
+            print(f"{file.name}: no time left for {fault}", flush=True)
+            break
+        options = {"fault": fault, "count": args.throws, "device": args.device, "seed": SEED}
+        row = throw(experiment, act, **options)
+        result["throws"].append(row)
+        print(f"{file.name}: {json.dumps(row)}", flush=True)
+        write_json(file.with_suffix(".json"), result)
+
+
+def job(args: argparse.Namespace, card: int, config: str, seed: int, until: float) -> None:
+    """Run one card's work in a process of its own, and once more where it fails early."""
+    env = {**os.environ, "CUDA_VISIBLE_DEVICES": str(card), "PYTHONUNBUFFERED": "1"}
+    begin = time.time()
+    for extra in ([], ["--eager"]):
+        words = [str(args.out), "--config", config, "--seed", str(seed), "--until", str(until)]
+        words += ["--seconds", str(args.seconds), "--device", args.device, *extra]
+        words += ["--throws", str(args.throws)]
+        words += [word for change in args.overrides for word in ("--set", change)]
+        command = [sys.executable, "-m", "bench.cooperative.cards", *words]
+        process = subprocess.Popen(command, env=env)
+        try:
+            status = process.wait(max(until - time.time(), 1.0))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            status = process.wait()
+        spent = time.time() - begin
+        print(f"card {card}: {config} {seed}: status {status} after {spent:.0f} s", flush=True)
+        if status == 0 or spent > EARLY:
+            return
+
+
+def drawn_seeds() -> list[int]:
+    """Four seeds that nobody chose."""
+    return [int.from_bytes(os.urandom(3), "big") % 800_000 for _ in range(4)]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seconds", type=float, default=700.0, help="for all of it")
+    parser.add_argument("--device", default="cuda:0")
+    parser.add_argument("--throws", type=int, default=THROWS)
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    parser.add_argument("--config", help="of configs/cooperative: one card's work")
+    parser.add_argument("--seed", type=int)
+    parser.add_argument("--until", type=float, help="end of one card's work [s since 1970]")
+    parser.add_argument("--eager", action="store_true", help="without CUDA graphs")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.config:
+        train_and_throw(args)
+        return 0
+    until = time.time() + args.seconds
+    configs = ["pair", "pair", "pair", "pair_vision"]
+    jobs = [
+        threading.Thread(target=job, args=(args, card, config, seed, until))
+        for card, (config, seed) in enumerate(zip(configs, drawn_seeds(), strict=True))
+    ]
+    for one in jobs:
+        one.start()
+    for one in jobs:
+        one.join()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,130 @@
+"""The same bodies by MuJoCo, in float64: what a policy of the tree of rods is thrown on besides.
+
+Every vehicle is on a joint of its own with its cable below it; an equality constraint holds the
+cable's end in the load until the vehicle lets go, and the cable then falls with it."""
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from sim.params import RopeParams
+from sim.reference.model import add_chain, add_vehicle, new_spec
+from sim.solvers import World
+from sim.solvers.rods import build_place
+
+STEP = 5e-4  # of RK4 [s]; an exchange is a whole number of them
+STIFF = (2.0 * STEP, 1.0)  # time constant [s] and damping ratio of the constraint
+
+
+class MujocoTeam:
+    """Behind the same interface as :class:`visthrow.cooperative.tree.TreeSolver`, on a CPU."""
+
+    capturable = False
+
+    def __init__(self, world: World, team: int) -> None:
+        """Compile a model a world. Raises ValueError: another device than a CPU."""
+        if world.device != "cpu":
+            raise ValueError(f"the referee on {world.device}; expected 'cpu'")
+        self.world, self.team, self.worlds = world, team, world.count // team
+        pairs, of = world.models()
+        masses = [(pairs[of[row]][0].body, pairs[of[row]][1]) for row in range(world.count)]
+        self._nominal = [
+            _compile(masses[w * team : (w + 1) * team]) for w in range(self.worlds)
+        ]
+        self._data = [mujoco.MjData(model) for model in self._nominal]
+        self._repeats = max(round(world.substep / STEP), 1)
+        segments = world.params.rope.segments
+        shapes = ((world.count, 7), (world.count, 6), *((world.count, 2 * segments),) * 2)
+        self._arrays = [wp.zeros(shape, dtype=wp.float32) for shape in shapes]
+        self._rows = wp.array(np.arange(world.count), dtype=wp.int32)
+        self._kernel = build_place(world, hinges=True)
+        self.load_pos_w, self.load_vel_w = (
+            wp.zeros(self.worlds, dtype=world.types.vec3) for _ in range(2)
+        )
+
+    def place(self, state, mask) -> None:
+        self._state, w = state, self.world
+        wp.launch(self._kernel, w.count, [state, mask, self._rows, *self._arrays])
+        pose, velocity, angles, rates = (array.numpy() for array in self._arrays)
+        spins, scale = state.rate_b.numpy(), state.mass_scale.numpy()
+        load, load_vel = w.bodies.payload_pos_w.numpy(), w.bodies.payload_vel_w.numpy()
+        placed = (mask.numpy() != 0).reshape(self.worlds, self.team).any(1)
+        for world in np.flatnonzero(placed):
+            data, model = self._data[world], self._nominal[world]
+            mujoco.mj_resetData(model, data)
+            for k in range(self.team):
+                row = world * self.team + k
+                joint = model.joint(f"{k}_root")
+                body = model.body(f"{k}_vehicle").id
+                model.body_mass[body] = w.vehicles[row % len(w.vehicles)].body.mass * scale[row]
+                at, speed = joint.qposadr[0], joint.dofadr[0]
+                turn = pose[row, [6, 3, 4, 5]]
+                data.qpos[at : at + 7] = [*pose[row, :3], *turn]
+                data.qvel[speed : speed + 6] = [*velocity[row, :3], *spins[row]]
+                data.qpos[at + 7 : at + 7 + angles.shape[1]] = angles[row]
+                data.qvel[speed + 6 : speed + 6 + rates.shape[1]] = rates[row]
+            data.qpos[:3], data.qvel[:3] = load[row], load_vel[row]
+            self._show(world)
+
+    def advance(self, duration: float) -> None:
+        wrench, attached = self.world.wrench, self._state.attached.numpy()
+        force, torque = wrench.force_b.numpy(), wrench.torque_b.numpy()
+        for world, data in enumerate(self._data):
+            first = world * self.team
+            for k in range(self.team):
+                data.eq_active[k] = attached[first + k]
+                data.ctrl[6 * k : 6 * k + 6] = [*force[first + k], *torque[first + k]]
+            mujoco.mj_step(self._nominal[world], data, self._repeats)
+            self._show(world)
+
+    def _show(self, world: int) -> None:
+        """Copy a world's bodies into the arrays of the exchange."""
+        model, data, bodies = self._nominal[world], self._data[world], self.world.bodies
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        self.load_pos_w.numpy()[world], self.load_vel_w.numpy()[world] = data.qpos[:3], data.qvel[:3]
+        for k in range(self.team):
+            row = world * self.team + k
+            joint = model.joint(f"{k}_root")
+            at, speed = joint.qposadr[0], joint.dofadr[0]
+            bodies.pos_w.numpy()[row] = data.qpos[at : at + 3]
+            bodies.quat_wb.numpy()[row] = data.qpos[[at + 4, at + 5, at + 6, at + 3]]
+            bodies.vel_w.numpy()[row] = data.qvel[speed : speed + 3]
+            bodies.rate_b.numpy()[row] = data.qvel[speed + 3 : speed + 6]
+            first = model.body(f"{k}_rod0").id
+            rods = slice(first, first + self.world.params.rope.segments)
+            along = -data.xmat[rods].reshape(-1, 3, 3)[:, :, 2]
+            bodies.cable_dir_w.numpy()[:, row] = along
+            bodies.cable_vel_w.numpy()[:, row] = np.cross(data.cvel[rods, :3], along)
+            bodies.payload_pos_w.numpy()[row] = data.qpos[:3]
+            bodies.payload_vel_w.numpy()[row] = data.qvel[:3]
+
+
+def _compile(members: list[tuple]) -> "mujoco.MjModel":
+    """Model of a world from the bodies and ropes of its vehicles."""
+    spec = new_spec(constraints=True)
+    spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_RK4
+    load = spec.worldbody.add_body(name="load")
+    load.mass = sum(rope.payload_mass for _, rope in members)
+    load.inertia, load.explicitinertial = [1e-6] * 3, True
+    load.add_site(name="load")
+    for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0]), ("z", [0, 0, 1])):
+        load.add_joint(name=f"load_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    for k, (body, rope) in enumerate(members):
+        spec.attach(_vehicle(body, rope), prefix=f"{k}_", frame=spec.worldbody.add_frame())
+        held = spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"{k}_end", name2="load")
+        held.objtype, held.solref = mujoco.mjtObj.mjOBJ_SITE, list(STIFF)
+        held.solimp = [0.9999, 0.9999, 0.001, 0.5, 2.0]
+    return spec.compile()
+
+
+def _vehicle(body, rope: RopeParams) -> "mujoco.MjSpec":
+    """A vehicle with its cable and the site ``end`` at the cable's lower end."""
+    spec = new_spec(constraints=True)
+    vehicle, mount = add_vehicle(spec, body), list(rope.mount)
+    last = add_chain(
+        spec, rope, vehicle, mount, "universal", 0.0, None, free_root=False, load=False
+    )
+    last.add_site(name="end", pos=[0.0, 0.0, -rope.segment_length])
+    return spec
