@@ -105,7 +105,7 @@ class Exchange:
     def __init__(
         self, kernels: ExchangeKernels, world: dict[str, Any], build: Callable[[World], Solver]
     ) -> None:
-        """Build the solver; ``world``: what :class:`World` is made of, without the shared arrays."""
+        """Build the solver; ``world``: what :class:`World` is made of but the shared arrays."""
         t, params, count, device = (world[k] for k in ("types", "params", "count", "device"))
         rows = dict.fromkeys(("cable_dir_w", "cable_vel_w"), params.rope.segments)
         wrench = {k: (v, False) for k, v in WRENCH_FIELDS.items()}

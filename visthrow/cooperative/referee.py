@@ -28,9 +28,7 @@ class MujocoTeam:
         self.world, self.team, self.worlds = world, team, world.count // team
         pairs, of = world.models()
         masses = [(pairs[of[row]][0].body, pairs[of[row]][1]) for row in range(world.count)]
-        self._nominal = [
-            _compile(masses[w * team : (w + 1) * team]) for w in range(self.worlds)
-        ]
+        self._nominal = [_compile(masses[w * team : (w + 1) * team]) for w in range(self.worlds)]
         self._data = [mujoco.MjData(model) for model in self._nominal]
         self._repeats = max(round(world.substep / STEP), 1)
         segments = world.params.rope.segments
@@ -83,7 +81,10 @@ class MujocoTeam:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
-        self.load_pos_w.numpy()[world], self.load_vel_w.numpy()[world] = data.qpos[:3], data.qvel[:3]
+        self.load_pos_w.numpy()[world], self.load_vel_w.numpy()[world] = (
+            data.qpos[:3],
+            data.qvel[:3],
+        )
         for k in range(self.team):
             row = world * self.team + k
             joint = model.joint(f"{k}_root")

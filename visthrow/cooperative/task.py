@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from sim.hybrid import rope_variants
-from sim.params import ReleaseParams, VehicleParams
+from sim.params import VehicleParams
 from visthrow import config
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 from visthrow.onboard import observations as ob

@@ -54,7 +54,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels that place and advance the bodies; a thread a world."""
     t, L, V = world.types, world.params.rope.segments, team
     N = V * L
-    real, vec3, mat33, quat, Vehicle, Rope = t.real, t.vec3, t.mat33, t.quat, t.Vehicle, t.Rope
+    real, vec3, mat33, Vehicle, Rope = t.real, t.vec3, t.mat33, t.Vehicle, t.Rope
     State, Wrench, Bodies = world.kernels.State, world.kernels.Wrench, world.kernels.Bodies
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -94,9 +94,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
         return rot * (force_b / p.body.mass + spin) + g
 
     @wp.func
-    def damped(
-        rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), first: int, i: int
-    ):
+    def damped(rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), first: int, i: int):
         """Damping of the joints between rods as a force on ``n'`` of rod i, and its rate."""
         c = rope.joint_damping
         out = vec3()
@@ -110,7 +108,8 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
             rate += c
         return out, rate
 
-    @wp.kernel(module="unique", enable_backward=False)
+    # unrolled it takes ten times as long to compile
+    @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
     def advance(
         # Params:
         vehicles: wp.array(dtype=Vehicle),
@@ -148,7 +147,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 u[at] = rate
 
         acc = vec3()
-        for repeat in range(2):
+        for _ in range(2):
             A_all = diagonal(load_mass)
             b_all = -load_mass * g
             for k in range(V):
@@ -159,7 +158,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 p.body.mass = p.body.mass * state.mass_scale[row]
                 rope = ropes[row % ropes.shape[0]]
                 m = rope.segment_mass
-                l = rope.segment_length
+                length = rope.segment_length
                 w = bodies.rate_b[row]
                 q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], w) * half)
                 w += half * turn[k]
@@ -174,25 +173,35 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                     a_d = A * d
                     a1 = A * e1
                     a2 = A * e2
-                    c = real(0.5) * l
+                    c = real(0.5) * length
                     damping, friction = damped(rope, n, u, k * L, i)
                     tension = wp.max(wp.dot(wrench.pull_w[row], n[at]), real(0.0))
-                    J = m * l * l / real(3.0) + half * friction + half * half * tension * l
-                    s11 = J + l * l * wp.dot(e1, a1)
-                    s12 = l * l * wp.dot(e1, a2)
-                    s22 = J + l * l * wp.dot(e2, a2)
+                    J = (
+                        m * length * length / real(3.0)
+                        + half * friction
+                        + half * half * tension * length
+                    )
+                    s11 = J + length * length * wp.dot(e1, a1)
+                    s12 = length * length * wp.dot(e1, a2)
+                    s22 = J + length * length * wp.dot(e2, a2)
                     det = real(1.0) / (s11 * s22 - s12 * s12)
                     square = wp.dot(rate, rate)
-                    push = (c * m) * g - l * b + (l * l * square) * a_d - damping
+                    push = (c * m) * g - length * b + (length * length * square) * a_d - damping
                     g1 = wp.dot(e1, push)
                     g2 = wp.dot(e2, push)
-                    b1 = (c * m) * e1 + l * a1
-                    b2 = (c * m) * e2 + l * a2
+                    b1 = (c * m) * e1 + length * a1
+                    b2 = (c * m) * e2 + length * a2
                     c1[at] = det * (s22 * b1 - s12 * b2)
                     c2[at] = det * (s11 * b2 - s12 * b1)
                     h1[at] = det * (s22 * g1 - s12 * g2)
                     h2[at] = det * (s11 * g2 - s12 * g1)
-                    b = b - m * g - square * ((c * m) * d + l * a_d) + h1[at] * b1 + h2[at] * b2
+                    b = (
+                        b
+                        - m * g
+                        - square * ((c * m) * d + length * a_d)
+                        + h1[at] * b1
+                        + h2[at] * b2
+                    )
                     A = A + diagonal(m) - wp.outer(b1, c1[at]) - wp.outer(b2, c2[at])
                 A_all += A
                 b_all += b

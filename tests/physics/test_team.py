@@ -1,0 +1,139 @@
+"""Several vehicles on one load: conservation laws, a single vehicle's chain, releases."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sim.hybrid import HybridSim
+from sim.params import GRAVITY, PlantParams
+from tests.plants import paper_plant
+from visthrow.cooperative.plant import TeamSim
+
+SAME_BITS = 2e-5
+"""Sums in another order, float32, over half a second [m]."""
+SECOND_ORDER = 1e-3
+"""Of two second-order integrators at 2 ms over 0.6 s of hard flight [m]; both were 0.3 mm off."""
+TILT = np.radians(35.0)
+
+
+def plant(share: float = 0.075, segments: int = 5) -> PlantParams:
+    base = paper_plant()
+    rope = dataclasses.replace(
+        base.rope,
+        segments=segments,
+        length=0.5,
+        payload_mass=share,
+        payload_offset=0.0,
+        payload_inertia=0.0,
+        joint_damping=0.0,
+    )
+    return dataclasses.replace(base, rope=rope)
+
+
+def around(team: int, tilt: float = TILT) -> np.ndarray:
+    """Directions from the mounts to the load, shape (1, V, 3)."""
+    angle = 2.0 * np.pi * np.arange(team) / team
+    side = -np.sin(tilt)
+    down = np.full(team, -np.cos(tilt))
+    return np.stack([side * np.cos(angle), side * np.sin(angle), down], -1)[None]
+
+
+def hung(params: PlantParams, directions: np.ndarray, **options) -> TeamSim:
+    sim = TeamSim(params, 1, directions.shape[1], threads=1, **options)
+    sim.hang(np.array([[0.0, 0.0, 1.0]]), directions, np.array([[0.3, -0.2, 0.1]]))
+    return sim
+
+
+def commands(steps: int, rows: int, seed: int = 0) -> np.ndarray:
+    """Thrust [N] and rates [rad/s] that swing the load hard, the same for all."""
+    time = 0.02 * np.arange(steps)
+    one = [2.9 * (1.0 + 0.7 * np.sin(9.0 * time)), 2.0 * np.sin(5.0 * time)]
+    one += [4.0 * np.sin(7.0 * time), np.full(steps, 0.5)]
+    return np.repeat(np.stack(one, -1)[:, None], rows, axis=1)
+
+
+def test_one_vehicle_is_the_fused_chain():
+    params = plant()
+    team, single = hung(params, np.array([[[0.0, 0.0, -1.0]]])), HybridSim(params, 1)
+    single.place(team.get("pos_w"), vel_w=team.get("vel_w"))
+    for command in commands(30, 1):
+        for sim in (team, single):
+            sim.set_command(command)
+            sim.step()
+    moved = np.abs(single.get("payload_pos_w") - [0.0, 0.0, 1.0]).max()
+    assert moved > 0.2
+    np.testing.assert_allclose(team.load[0].numpy(), single.get("payload_pos_w"), atol=SECOND_ORDER)
+    np.testing.assert_allclose(team.get("pos_w"), single.get("pos_w"), atol=SECOND_ORDER)
+
+
+def test_two_halves_at_one_place_fly_as_one_vehicle_with_half_the_load():
+    down = np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0])
+    one, two = (hung(plant(), np.tile(down, (1, team, 1))) for team in (1, 2))
+    for command in commands(25, 2):
+        one.set_command(command[:1])
+        two.set_command(command)
+        one.step()
+        two.step()
+    np.testing.assert_allclose(two.load[0].numpy(), one.load[0].numpy(), atol=SAME_BITS)
+    np.testing.assert_allclose(two.get("pos_w"), np.repeat(one.get("pos_w"), 2, 0), atol=SAME_BITS)
+
+
+@pytest.mark.parametrize("team", [2, 3])
+def test_momentum_changes_by_gravity_alone(team):
+    sim = hung(plant(), around(team), direct=True)
+    rng = np.random.default_rng(team)
+    sim.place(
+        sim.get("pos_w"),
+        vel_w=sim.get("vel_w"),
+        rate_b=rng.normal(size=(team, 3)),
+        cable_dir_w=sim.get("cable_dir_w"),
+    )
+    sim.step()
+    sim.step()  # the queue holds hover so long
+    before = momentum(sim)
+    for _ in range(10):
+        sim.step()
+    assert np.abs(sim.get("cable_vel_w")).max() > 0.1
+    mass = team * sim.params.total_mass
+    expected = before + [0.0, 0.0, -0.2 * GRAVITY * mass]
+    np.testing.assert_allclose(momentum(sim), expected, atol=2e-4)  # of 1.2 N s
+
+
+def momentum(sim: TeamSim) -> np.ndarray:
+    """Linear momentum of everything [N s]."""
+    rope, rows = sim.params.rope, sim.worlds * sim.team
+    ends = np.repeat(sim.load[1].numpy(), sim.team, axis=0).astype(float)
+    total = sim.params.vehicle.body.mass * sim.get("vel_w").sum(0)
+    total = total + rope.payload_mass * ends.sum(0)
+    for i in reversed(range(rope.segments)):
+        swing = rope.segment_length * sim.get("cable_vel_w")[:, i]
+        total += rope.segment_mass * (ends - 0.5 * swing).sum(0)
+        ends = ends - swing
+    assert len(ends) == rows
+    return total
+
+
+def test_each_end_goes_after_its_own_lag_and_the_last_one_makes_the_landing():
+    params = plant()
+    late = dataclasses.replace(params.release, lag=params.release.lag + 0.03)
+    sim = hung(params, around(2), releases=[params.release, late])
+    gone = {}
+    for k, command in enumerate(commands(12, 2)):
+        sim.set_command(command, np.full(2, k == 2))
+        before = sim.load[1].numpy().copy()
+        sim.step()
+        for row in np.flatnonzero(sim.get("separated")):
+            gone[row] = 0.02 * k + sim.get("separation_time")[row]
+        after = sim.load[1].numpy()
+        if len(gone) == 2:
+            break
+        assert np.abs(after - before).max() < 2.0  # no jump at the first separation
+    assert gone[0] == pytest.approx(0.04 + params.release.lag, abs=1e-5)
+    assert gone[1] == pytest.approx(0.04 + late.lag, abs=1e-5)
+    pos, vel = (array.numpy()[0].astype(float) for array in sim.load)
+    height = params.release.landing_height
+    time = (vel[2] + np.sqrt(vel[2] ** 2 + 2.0 * GRAVITY * (pos[2] - height))) / GRAVITY
+    landing = pos + time * vel - [0.0, 0.0, 0.5 * GRAVITY * time**2]
+    np.testing.assert_allclose(sim.get("landing_w")[1], landing, atol=1e-4)
+    assert np.abs(sim.get("landing_w")[0] - landing).max() > 0.01
