@@ -103,9 +103,9 @@ def _listen(args: argparse.Namespace) -> int:
             time = clock.now()
             came = source.poll(time)
             poses += came
-            runner.hear(source.rivals(time))
+            runner.decider.rivals = source.rivals(time)
             runner.tick(time, came, autopilot.status(time), OperatorInput())
-            last = runner.problems() or last
+            last = runner.decider.problems() or last
             autopilot.tick(time, runner)
             clock.sleep_until(time + runner.pilot.period)
         time = clock.now()
@@ -117,12 +117,12 @@ def _listen(args: argparse.Namespace) -> int:
     for roster in rosters:
         print("".join(f"{line}\n" for line in _link_lines(roster, params, time - begin)), end="")
     problems = (
-        runner.problems()
+        runner.decider.problems()
         + _not_taken(rosters, time - begin)
         + unit_problems(poses, params.frames)
         + [text for good, text in results if not good]
     )
-    held, wanted = runner.machine.held(time), params.states.check_hold
+    held, wanted = runner.machine.lasting(time), params.states.check_hold
     if not problems and held < wanted:
         problems = [
             f"all was well for the last {held:.1f} s; expected {wanted:g} s:"

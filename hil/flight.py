@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hil.control.calibrating import Solver
+from hil.control.calibrating import CalibrationSolver
 from hil.control.loop import Lander, Loop
 from hil.control.realtime import keep, prepare
 from hil.control.recording.latency import Stages
@@ -92,9 +92,9 @@ def fly(args: argparse.Namespace) -> int:
             params, link, args.action == "run" and args.write_parameters, console.say, folder
         )
         runner = Runner(params, policy, backend, mechanism_lag(params))
-        runner.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
+        runner.estimator.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
         refused = prepare(params.realtime)
-        runner.warm_up()
+        runner.commander.warm_up()
         eyes = (
             open_images(params.images, params.camera, clock.now)
             if params.keypoints == "detector"
@@ -117,7 +117,7 @@ def fly(args: argparse.Namespace) -> int:
     solver = (
         None
         if runner.calibrating is None
-        else Solver(params.camera, policy.contract, params.calibration.spreads)
+        else CalibrationSolver(params.camera, policy.contract, params.calibration.spreads)
     )
     operator = Lander(operator, runner.calibrating) if calibrates else operator
     loop = Loop(runner, source, clock, operator, recorder, console.decision, stages, eyes, solver)

@@ -11,7 +11,7 @@ from camera.params import CameraParams
 from hil.control.aim import AimParams
 from hil.control.calibrating import CalibrationParams
 from hil.control.realtime import RealtimeParams
-from hil.control.safety import CheckParams, FenceParams, GuardParams, outside
+from hil.control.safety import CheckParams, FenceParams, GuardParams, box_violation
 from hil.control.states import StateParams
 from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.backends.betaflight import BetaflightParams
@@ -164,11 +164,11 @@ class HilParams(Bounded):
                 f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it"
                 " moves"
             )
-        home = outside(self.home_w, fence.vehicle_low, fence.vehicle_high)
+        home = box_violation(self.home_w, fence.vehicle_low, fence.vehicle_high)
         goal = (
             None
             if GOAL in self.frames
-            else outside(self.goal_w, fence.payload_low, fence.payload_high)
+            else box_violation(self.goal_w, fence.payload_low, fence.payload_high)
         )
         for wrong, text in (
             (

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from hil.control.states import Decision, OperatorInput
+from hil.control.states import OperatorInput, TickRecord
 from visthrow.onboard.calibration import Calibration
 
 ENDING = tuple(
@@ -68,7 +68,7 @@ class Console:
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(text)
 
-    def decision(self, decision: Decision) -> None:
+    def decision(self, decision: TickRecord) -> None:
         """Say a change of state with its reason, or what a state waits for; a reason that was just
         said is not said again.
         """

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from hil.control.runner import Decision, OperatorInput, Runner
+from hil.control.runner import OperatorInput, Runner, TickRecord
 from hil.control.states import State
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
@@ -122,15 +122,15 @@ def fly(
         arm=state == "ready"
     ),
     late: Callable[[float], float] = lambda time: 0.0,
-    watch: Callable[[float, Decision], None] | None = None,
+    watch: Callable[[float, TickRecord], None] | None = None,
     recording: Callable[[float], bool] = lambda time: True,
-) -> list[Decision]:
+) -> list[TickRecord]:
     """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` spoil what the
     runner is told.
     """
     vehicle, decisions, command = Vehicle(), [], None
     waiting: list[Pose] = []
-    mass = (runner.mass, runner.alone)
+    mass = (runner.mass, runner.parts.vehicle_mass)
     while vehicle.time < seconds and runner.machine.state != "done":
         now = vehicle.time + late(vehicle.time)
         decision = runner.tick(
@@ -147,12 +147,12 @@ def fly(
         released = bool(runner.backend.release_times) and now >= runner.backend.release_times[0]
         waiting = []
         for _ in range(SUBSTEPS):
-            vehicle.step(command, released, runner.hang, mass)
-            waiting += poses(vehicle.time, vehicle.poses(runner.hang))
+            vehicle.step(command, released, runner.parts.hang, mass)
+            waiting += poses(vehicle.time, vehicle.poses(runner.parts.hang))
     return decisions
 
 
-def changes(decisions: list[Decision]) -> list[tuple[str, str]]:
+def changes(decisions: list[TickRecord]) -> list[tuple[str, str]]:
     """States passed through, with the reason of each change."""
     out = [(decisions[0].state, decisions[0].reason)]
     for decision in decisions:

@@ -5,7 +5,7 @@ command records them.
 from pathlib import Path
 
 from hil.control.recording.record import Recorder
-from hil.control.runner import Decision, Runner
+from hil.control.runner import Runner, TickRecord
 from tests.hil_flight import Spy, fly, params, simple_policy
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.policy import Policy, find_policy
@@ -24,7 +24,7 @@ def saved_policy(folder: Path, action=AT_ONCE, layout="vision") -> str:
 
 def record_run(
     folder: Path, *overrides: str, seconds: float = 8.0, close: bool = True, **spoiled
-) -> list[Decision]:
+) -> list[TickRecord]:
     """Fly and record; see `tests.hil_flight.fly` for what can be spoiled.
 
     Without ``close`` the run ends as if killed.
@@ -36,7 +36,7 @@ def record_run(
 
     def keep(time, poses, status, words, recording=True):
         decision = tick(time, poses, status, words, recording)
-        times = {"late": 1e-4, "poll": 2e-4, **runner.spent}
+        times = {"late": 1e-4, "poll": 2e-4, **runner.parts.spent}
         recorder.tick(len(decisions), poses, status, words, recording, decision, times)
         decisions.append(decision)
         return decision

@@ -1,10 +1,8 @@
-"""Where a payload would land if the latch tripped now, by its own poses: a release that leads
-astray is held back.
+"""Predicts the landing of a payload that is released now, and refuses a release that would miss.
 
-What comes between now and the landing is not known better than this: until it separates the payload
-keeps the velocity that it has, then it flies freely. For right throws of the shipped policies at 2
-m that is off by 0.05 to 0.20 m: it tells a throw from none, and from a wild one, but not a good one
-from a better one."""
+The prediction is coarse: until separation the payload keeps its velocity, then it flies freely. For
+good throws of the shipped policies at 2 m it is off by 0.05 to 0.20 m. It distinguishes a throw
+from none and from a wild one, but not a good one from a better one."""
 
 import math
 from dataclasses import dataclass
@@ -15,82 +13,78 @@ from hil.poses.track import BodyState
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.hover import GRAVITY
 
-STEP = 0.01  # step of the free flight's midpoint rule [s]: exact without drag
-LONGEST = 3.0  # after which a payload that has not come down is not followed further [s]
+TIME_STEP = 0.01  # step of the free flight's midpoint rule [s]: exact without drag
+LONGEST = 3.0  # flight that is predicted at most [s]
 
 
 @dataclass(frozen=True)
 class AimParams(Bounded):
     """Parameters of the check of predicted landings before a release."""
 
-    # a release whose predicted landing is further from the goal than this is held back [m]
+    # a release with a predicted landing further from the goal than this is refused [m]
     bound: Positive
-    # so long after the first one that was held back the throw ends without a release [s]
+    # from the first refusal to the end of the throw without a release [s]
     patience: Positive
 
 
-class Aim:
-    """Judges the releases that a policy asks for; ``held`` counts those held back so far in this
-    run.
-    """
+class ReleaseCheck:
+    """Judges the releases that a policy asks for; ``refused`` counts the refusals of this run."""
 
     def __init__(
-        self, params: AimParams | None, ahead: float, height: float, rope: dict[str, Any]
+        self, params: AimParams | None, delay: float, height: float, rope: dict[str, Any]
     ) -> None:
         """Take what the policy was trained with.
 
         Args:
-            params: None holds nothing back. height: of the payload's centre as it lands [m].
-            ahead: from the time that a state stands for to separation, if the latch trips now [s].
-            rope: of the policy's contract: mass and drag of the payload.
+            params: None refuses nothing.
+            delay: from the time of a state to the separation, if the latch trips now [s].
+            height: of the payload's centre as it lands [m].
+            rope: of the policy's contract, with mass and drag of the payload.
         """
-        self._params, self._ahead, self._height = params, ahead, height
+        self._params, self._delay, self._height = params, delay, height
         self._drag = rope.get("payload_drag", 0.0) / rope["payload_mass"]
-        self.held = 0
-        self._first: float | None = None  # that was held back in this throw [s]
+        self.refused = 0
+        self._first: float | None = None  # refusal of this throw [s]
 
     def begin(self) -> None:
         """Begin a throw."""
         self._first = None
 
     def landing(self, payload: BodyState) -> tuple[float, float]:
-        """Return where a payload in this state would land [m], world frame, if the latch tripped
-        now.
-        """
+        """Return where a payload in this state lands if the latch trips now [m], world frame."""
         vel = payload.vel
-        pos = tuple(x + self._ahead * v for x, v in zip(payload.pos, vel))
+        pos = tuple(x + self._delay * v for x, v in zip(payload.pos, vel))
         time = 0.0
         while time < LONGEST:
-            middle = tuple(v + 0.5 * STEP * a for v, a in zip(vel, self._acceleration(vel)))
-            after = tuple(x + STEP * v for x, v in zip(pos, middle))
+            middle = tuple(v + 0.5 * TIME_STEP * a for v, a in zip(vel, self._acceleration(vel)))
+            after = tuple(x + TIME_STEP * v for x, v in zip(pos, middle))
             if after[2] < self._height:
                 share = min(max((pos[2] - self._height) / (pos[2] - after[2]), 0.0), 1.0)
                 return pos[0] + share * (after[0] - pos[0]), pos[1] + share * (after[1] - pos[1])
-            vel = tuple(v + STEP * a for v, a in zip(vel, self._acceleration(middle)))
-            pos, time = after, time + STEP
+            vel = tuple(v + TIME_STEP * a for v, a in zip(vel, self._acceleration(middle)))
+            pos, time = after, time + TIME_STEP
         return pos[0], pos[1]
 
     def _acceleration(self, vel: Vector) -> Vector:
         drag = -self._drag * math.hypot(*vel)
         return (drag * vel[0], drag * vel[1], drag * vel[2] - GRAVITY)
 
-    def astray(self, now: float, payload: BodyState, goal_w: Vector) -> str | None:
-        """Return why a release that was asked for at a time [s] is held back, or None."""
+    def miss(self, now: float, payload: BodyState, goal_w: Vector) -> str | None:
+        """Return why a release at a time [s] is refused, or None."""
         if self._params is None:
             return None
         x, y = self.landing(payload)
-        off = math.hypot(x - goal_w[0], y - goal_w[1])
-        if off <= self._params.bound:
+        error = math.hypot(x - goal_w[0], y - goal_w[1])
+        if error <= self._params.bound:
             return None
-        self.held += 1
-        self._first = now if self._first is None else self._first
+        self.refused += 1
+        if self._first is None:
+            self._first = now
         return (
-            f"it would land at ({x:.2f}, {y:.2f}) m, {off:.2f} m from the goal, within"
+            f"it would land at ({x:.2f}, {y:.2f}) m, {error:.2f} m from the goal, within"
             f" {self._params.bound:g} m expected"
         )
 
     def given_up(self, now: float) -> bool:
-        """Return whether this throw is over at a time [s]: nothing better came within the patience
-        after what was held back.
-        """
+        """Return whether the patience is over at a time [s] since the first refused release."""
         return self._first is not None and now - self._first >= self._params.patience

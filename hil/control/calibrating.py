@@ -1,12 +1,9 @@
-"""Hover calibration in a run: a still hover, a small sway of the runner's own, and what they show
-of camera and thrust.
+"""Hover calibration in a run: camera and thrust are estimated from a still hover and a small sway.
 
-The runner hovers and sways and takes down what came; the sums are done elsewhere (`Solver`), so
-that no tick waits for them. What they gave is recorded with the tick that it came in, so that a
-replay decides alike. A throw waits for it, and is refused where it lies outside of what was trained
-or is not known well enough."""
+The runner hovers, sways and records; another process estimates (`CalibrationSolver`), so that no
+tick waits. The result is recorded with the tick that it arrives in, so that a replay repeats it. A
+throw waits for the result, and is refused where it is uncertain or outside the training's range."""
 
-from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -24,46 +21,44 @@ from visthrow.onboard.calibration import Calibration, Hovered, Spreads
 
 @dataclass(frozen=True)
 class CalibrationParams(Bounded):
-    """Parameters of the calibration, and limits of its results for a throw."""
+    """Parameters of the calibration, and limits of its results before a throw."""
 
     still: Positive = calibration.STILL  # of hover before the sway [s]
     sway: Positive = calibration.SWAY  # [s]
     rate: Positive = calibration.SWAY_RATE  # amplitude of the sway's body rates [rad/s]
     frequency: Positive = calibration.SWAY_FREQUENCY  # of the sway [Hz]
     most_tilt_deg: Positive = (
-        10.0  # of the camera, which is corrected for; beyond it the field of view is another one
+        10.0  # of the camera, which is corrected; beyond it the field of view differs too much
     )
-    most_scale: Positive = (
-        0.06  # of the focal length off the nominal one, which is corrected for [-]
-    )
-    most_latency: Positive = 0.06  # of the keypoints, which is made up for [s]
-    thrust: Positive = 0.1  # off the commanded one: twice the spread of masses in training
+    most_scale: Positive = 0.06  # error of the focal length, which is corrected [-]
+    most_latency: Positive = 0.06  # of the keypoints, which is compensated [s]
+    thrust: Positive = 0.1  # relative error: twice the spread of masses in training
     sure_tilt_deg: Positive = 0.5  # standard deviation at most
     sure_latency: Positive = 0.005  # likewise [s]
     spreads: Spreads = field(default_factory=Spreads)  # of poses and keypoints
 
 
-class Solver:
-    """Does the sums in a process of its own, which is started before the flight."""
+class CalibrationSolver:
+    """Estimates calibrations in a process of its own, which starts before the flight."""
 
     def __init__(self, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> None:
         """Start the process; arguments as of `visthrow.onboard.calibration.solved`."""
-        self._with = camera, contract, spreads
+        self._conditions = camera, contract, spreads
         self._pool = ProcessPoolExecutor(1, get_context("spawn"))
         self._pool.submit(_warm).result()
-        self._coming: Future | None = None
+        self._result: Future | None = None
 
     def submit(self, hovered: Hovered) -> None:
-        """Begin; `poll` tells."""
-        self._coming = self._pool.submit(calibration.solved, hovered, *self._with)
+        """Begin to estimate; `poll` returns the result."""
+        self._result = self._pool.submit(calibration.solved, hovered, *self._conditions)
 
     def poll(self) -> Calibration | str | None:
-        """Return what came of it, once; None while there is nothing new."""
-        if self._coming is None or not self._coming.done():
+        """Return a new result, or why there is none, once; None while there is nothing new."""
+        if self._result is None or not self._result.done():
             return None
-        coming, self._coming = self._coming, None
-        error = coming.exception()
-        return coming.result() if error is None else f"{type(error).__name__}: {error}"
+        result, self._result = self._result, None
+        error = result.exception()
+        return result.result() if error is None else f"{type(error).__name__}: {error}"
 
     def close(self) -> None:
         """End the process."""
@@ -79,36 +74,34 @@ def _warm() -> None:
 
 
 class Calibrating:
-    """The hover and the sway of a run; ``found`` is the calibration, None before it came."""
+    """The hover and the sway of a run; ``calibration`` is the result, None before it."""
 
-    def __init__(self, params: CalibrationParams, goal: Callable[[], Vector | None]) -> None:
-        """Begin with nothing; ``goal``: where the goal is [m]."""
-        self.params, self._goal = params, goal
-        self.found: Calibration | None = None
-        self._why = ""
+    def __init__(self, params: CalibrationParams) -> None:
+        """Wait for the first calm hover."""
+        self.params = params
+        self.calibration: Calibration | None = None
+        self._problem = ""  # of the last attempt
         self._begin: float | None = None
         self._rows: list[tuple] = []
         self._due: Hovered | None = None
-        self._waits = False
+        self._solving = False
 
-    def rates(self, now: float, quiet: bool) -> tuple[float, float]:
-        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``quiet``: the
-        vehicle hovers and nothing swings.
+    def rates(self, now: float, calm: bool, goal_w: Vector) -> tuple[float, float]:
+        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``calm``: the vehicle
+        hovers and nothing swings; ``goal_w``: the goal's position [m].
         """
         p = self.params
-        if self.found is not None or self._waits:
+        if self.calibration is not None or self._solving:
             return 0.0, 0.0
-        if self._begin is None:
-            if not quiet:
-                return 0.0, 0.0
+        if self._begin is None and calm:
             self._begin = now
-        since = now - self._begin - p.still
-        if since < 0.0:
+        if self._begin is None or now - self._begin < p.still:
             return 0.0, 0.0
-        if since >= p.sway:
-            self._finish()
+        swayed = now - self._begin - p.still
+        if swayed >= p.sway:
+            self._finish(goal_w)
             return 0.0, 0.0
-        return calibration.sway(since, p.rate, p.frequency)
+        return calibration.sway(swayed, p.rate, p.frequency)
 
     def note(
         self,
@@ -119,78 +112,70 @@ class Calibrating:
         valid: np.ndarray,
         age: float,
     ) -> None:
-        """Take down a tick: the vehicle as of the poses, the commanded thrust [N], normalised
-        keypoints of a new frame, shape (8, 2), their validity, shape (8,), and their age by the
-        frame's stamp beyond that of the poses [s].
+        """Record a tick: the vehicle by its poses, the commanded thrust [N], normalised keypoints
+        of a new frame, shape (8, 2), their validity, shape (8,), and the age of the frame's stamp
+        beyond that of the poses [s].
         """
-        if self._begin is not None and not self._waits and self.found is None:
-            self._rows.append(
-                (
-                    now,
-                    vehicle.pos,
-                    vehicle.quat,
-                    vehicle.vel,
-                    vehicle.rate,
-                    thrust,
-                    points,
-                    valid,
-                    age,
-                )
-            )
+        if self._begin is not None and not self._solving and self.calibration is None:
+            state = (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate)
+            self._rows.append((now, *state, thrust, points, valid, age))
 
     def stop(self) -> None:
-        """Begin anew with the next quiet hover: the vehicle was not ours."""
-        if self.found is None and not self._waits:
+        """Start again with the next calm hover: the vehicle was not ours."""
+        if self.calibration is None and not self._solving:
             self._begin, self._rows = None, []
 
-    def _finish(self) -> None:
-        goal, rows = self._goal(), self._rows
+    def _finish(self, goal_w: Vector) -> None:
+        rows = self._rows
         self._begin, self._rows = None, []
-        if goal is None or len(rows) < 3:
-            self._why = "no picture came in the hover"
+        if len(rows) < 3:
+            self._problem = "no picture arrived in the hover"
             return
-        columns = [np.array(column) for column in zip(*rows)]
-        self._due, self._waits = Hovered(*columns[:8], np.array(goal), columns[8]), True
+        *columns, ages = (np.array(column) for column in zip(*rows))
+        self._due, self._solving = Hovered(*columns, np.array(goal_w), ages), True
 
     def due(self) -> Hovered | None:
-        """Return a hover that is to be solved, once."""
+        """Return a hover to estimate from, once."""
         due, self._due = self._due, None
         return due
 
     def take(self, result: Calibration | str) -> None:
-        """Take what a solver found; where it found nothing the hover and the sway come again."""
-        self._waits = False
+        """Take a solver's result; without one, hover and sway are repeated."""
+        self._solving = False
         if isinstance(result, Calibration):
-            self.found, self._why = result, ""
+            self.calibration = result
         else:
-            self._why = result
+            self._problem = result
 
     def problems(self) -> list[str]:
         """Return why a throw has to wait, or is refused."""
-        p, estimate = self.params, self.found
+        p, estimate = self.params, self.calibration
         if estimate is None:
-            return ["calibrating in the hover" + (f" again: {self._why}" if self._why else "")]
-        tilt, tilts = np.degrees(estimate.turn_b[:2]), np.degrees(estimate.turn_sigma[:2])
-        limits = {
-            f"camera tilted by {np.abs(tilt).max():.1f} deg, {p.most_tilt_deg:g} at most": (
-                np.abs(tilt).max() > p.most_tilt_deg
-            ),
-            f"camera's tilt known to {tilts.max():.2f} deg, {p.sure_tilt_deg:g} at most": (
-                tilts.max() > p.sure_tilt_deg
-            ),
+            again = f" again: {self._problem}" if self._problem else ""
+            return [f"calibrating in the hover{again}"]
+        tilt = np.abs(np.degrees(estimate.turn_b[:2])).max()
+        tilt_sigma = np.degrees(estimate.turn_sigma[:2]).max()
+        thrust = f"thrust {estimate.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected"
+        limits = (
+            (tilt, p.most_tilt_deg, 1.0, "camera tilted by {:.1f} deg, {:g} at most"),
+            (tilt_sigma, p.sure_tilt_deg, 1.0, "camera's tilt known to {:.2f} deg, {:g} at most"),
             (
-                f"focal length off by {100 * abs(estimate.scale):.1f} %, "
-                f"{100 * p.most_scale:g} at most"
-            ): abs(estimate.scale) > p.most_scale,
-            f"keypoints {1e3 * estimate.latency:.0f} ms late, {1e3 * p.most_latency:g} at most": (
-                estimate.latency > p.most_latency
+                abs(estimate.scale),
+                p.most_scale,
+                100.0,
+                "focal length off by {:.1f} %, {:g} at most",
             ),
+            (estimate.latency, p.most_latency, 1e3, "keypoints {:.0f} ms late, {:g} at most"),
             (
-                f"keypoints' latency known to {1e3 * estimate.latency_sigma:.1f} ms, "
-                f"{1e3 * p.sure_latency:g} at most"
-            ): estimate.latency_sigma > p.sure_latency,
-            f"thrust {estimate.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected": (
-                abs(estimate.thrust - 1.0) > p.thrust
+                estimate.latency_sigma,
+                p.sure_latency,
+                1e3,
+                "keypoints' latency known to {:.1f} ms, {:g} at most",
             ),
-        }
-        return [f"{text}: outside of what was trained" for text, broken in limits.items() if broken]
+            (abs(estimate.thrust - 1.0), p.thrust, 1.0, thrust),
+        )
+        return [
+            f"{text.format(unit * value, unit * limit)}: outside of what was trained"
+            for value, limit, unit, text in limits
+            if value > limit
+        ]

@@ -1,5 +1,5 @@
-"""The release of a throw on the runner's side: latched once, separated a known lag later, followed
-by its own poses until it is down.
+"""The release of a throw: latched once, separated a known lag later; its landing is found in the
+payload's poses.
 """
 
 import math
@@ -11,36 +11,34 @@ from hil.errors import RunError
 from hil.poses.pose import Vector
 from visthrow.onboard.hover import GRAVITY
 
-LAG_TOLERANCE = 5e-3  # what the mechanism may take longer than the trained lag [s]
-# a payload that still hangs this long after it should have separated was not released, whatever was
-# answered [s]
+LAG_TOLERANCE = 5e-3  # of the mechanism beyond the trained lag [s]
+# a payload that hangs this long after its separation is stuck, whatever the autopilot answered [s]
 STUCK_AFTER = 0.6
 ROUNDING = 1e-9  # tolerance of differences of times [s]
+GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])
 
-FREE_AFTER, FREE_LEAST, FREE_LONG = 0.02, 5, 0.12
-"""The free fall that a separation is looked for before: poses from this long after the expected one
-[s], so many at least, and over so long [s], in which the air takes a few millimetres.
+FALL_START, FEWEST_FALL_POSES, FALL_TIME = 0.02, 5, 0.12
+"""Free fall by which a separation is detected: from this long after the expected one [s], with so
+many poses at least, and for this long [s], in which drag takes a few millimetres.
 """
 
-BENT, BENT_MOST = 5e-3, 0.1
-"""Distance from the free fall carried backwards, from which on poses say when the rope held [m];
-noise stays below. Poses up to so long before the expected separation are looked at [s].
+BEND, BEND_TIME = 5e-3, 0.1
+"""Distance from the free fall, extended backwards, at which the rope still pulls [m], above the
+noise; poses up to this long before the expected separation are used [s].
 """
 
-# poses before the ground that the landing is carried forward from: free fall needs no model of drag
-# over 0.1 s
-NEAR = 8
+# last poses that a landing is extrapolated from: over 0.1 s free fall needs no drag
+LANDING_POSES = 8
 
-UNSEEN, MOST_BLIND = 0.1, 0.15
+POSE_TIMEOUT, MOST_EXTRAPOLATION = 0.1, 0.15
 """A ball whose poses ended this long ago [s], and no longer than that before the ground [s], has
-landed where its fall leads: the impact itself looks like a jump to a gate that has missed the poses
-before it.
+landed where its fall leads: a gate that has missed those poses takes the impact for a jump.
 """
 
 
 @dataclass(frozen=True)
 class Landing:
-    """One throw as the payload's poses tell it; times on the runner's clock."""
+    """A throw as measured by the payload's poses; times on the runner's clock."""
 
     goal_w: Vector  # [m]
     start: float  # of the throw [s]
@@ -50,66 +48,62 @@ class Landing:
     error: float  # horizontal distance from the goal [m]
     duration: float  # from the throw's start to the landing [s]
     lag: float = 0.0  # trained, from latch to separation [s]
-    separation: float | None = None  # by the poses [s]; None where they do not tell
+    separation: float | None = None  # by the poses [s]; None where they do not show it
     separation_w: Vector | None = None  # payload's centre at that time [m]
 
 
-class Flight:
-    """Collects a payload's poses from the latch on until it is down."""
+class PayloadFlight:
+    """Collects a payload's poses from the latch to the landing."""
 
     def __init__(
         self, goal_w: Vector, start: float, latch: float, height: float, lag: float = 0.0
     ) -> None:
-        """Begin at the latch [s] of a throw; the payload's centre lands at a height [m], and
-        separates a lag after the latch [s].
+        """Begin at the latch [s] of a throw; the payload separates a lag later [s], and its centre
+        lands at a height [m].
         """
-        self.goal_w, self.start, self.latch, self.height, self.lag = (
-            goal_w,
-            start,
-            latch,
-            height,
-            lag,
-        )
+        self.goal_w, self.start, self.latch = goal_w, start, latch
+        self.height, self.lag = height, lag
         self._times: list[float] = []
         self._points: list[Vector] = []
 
     def add(self, time: float, pos: Vector) -> Landing | None:
-        """Take a pose of the payload, measured at a time [s], in our frames [m]; the landing, once
-        it has come down.
+        """Take a pose of the payload, measured at a time [s], in our frames [m]; return the landing
+        once it is down.
         """
         self._times.append(time)
         self._points.append(pos)
-        # The ball may be measured for the last time some centimetres above the ground, or bounce in
-        # between.
-        if len(self._times) < NEAR or pos[2] > self.height + 0.05 or pos[2] > self._points[-2][2]:
+        # The last pose may be some centimetres above the ground, or after a bounce.
+        if (
+            len(self._times) < LANDING_POSES
+            or pos[2] > self.height + 0.05
+            or pos[2] > self._points[-2][2]
+        ):
             return None
         return self._landing()
 
     def overdue(self, now: float) -> Landing | None:
-        """Return the landing of a ball that by a time [s] was lost from sight shortly before the
-        ground.
+        """Return the landing of a payload whose poses ended shortly before the ground, by a time
+        [s].
         """
         times = self._times
-        free = len(times) >= NEAR and times[-NEAR] > self.latch + self.lag
-        if not free or now - times[-1] < UNSEEN:
+        if len(times) < LANDING_POSES or times[-LANDING_POSES] <= self.latch + self.lag:
+            return None
+        if now - times[-1] < POSE_TIMEOUT:
             return None
         landing = self._landing()
-        return (
-            landing
-            if landing.time - times[-1] < MOST_BLIND and landing.time < now - UNSEEN
-            else None
-        )
+        extrapolated = landing.time - times[-1]
+        landed = extrapolated < MOST_EXTRAPOLATION and landing.time < now - POSE_TIMEOUT
+        return landing if landed else None
 
     def _landing(self) -> Landing:
         times, points = np.array(self._times), np.array(self._points)
         last = times[-1]
-        window = slice(max(0, len(times) - NEAR), len(times))
-        x, vx = _parabola(times[window] - last, points[window])
-        drop = x[2] - self.height
-        fall = (vx[2] + np.sqrt(max(vx[2] ** 2 + 2.0 * GRAVITY * drop, 0.0))) / GRAVITY
-        point = x + fall * vx
+        pos, vel = _parabola(times[-LANDING_POSES:] - last, points[-LANDING_POSES:])
+        drop = pos[2] - self.height
+        fall = (vel[2] + np.sqrt(max(vel[2] ** 2 + 2.0 * GRAVITY * drop, 0.0))) / GRAVITY
+        point = pos + fall * vel
         point[2] = self.height
-        when = float(last + fall)
+        time = float(last + fall)
         landed = tuple(point.tolist())
         error = float(np.hypot(landed[0] - self.goal_w[0], landed[1] - self.goal_w[1]))
         released = separation(times, points, self.latch + self.lag)
@@ -117,10 +111,10 @@ class Flight:
             self.goal_w,
             self.start,
             self.latch,
-            when,
+            time,
             landed,
             error,
-            when - self.start,
+            time - self.start,
             self.lag,
             *(released or (None, None)),
         )
@@ -129,48 +123,47 @@ class Flight:
 def separation(
     times: np.ndarray, points: np.ndarray, expected: float
 ) -> tuple[float, Vector] | None:
-    """Return when [s] and where [m] the rope let go: where the poses leave the free fall after it,
-    carried backwards.
+    """Return the time [s] and place [m] of the separation: where the poses leave the free fall that
+    follows it, extended backwards.
 
-    While the rope holds, its pull bends the path away from the free fall by ``a (t_s - t)^2 / 2``;
-    the root of the distance is a line in time that ends at the separation. None where too few poses
-    were seen on either side of the expected time [s]."""
-    free = (times > expected + FREE_AFTER) & (times < expected + FREE_AFTER + FREE_LONG)
-    if np.count_nonzero(free) < FREE_LEAST:
+    While the rope pulls, the path departs from the free fall by ``a (t_s - t)^2 / 2``; the root of
+    the distance is a line in time that ends at the separation. None with too few poses on either
+    side of the expected time [s]."""
+    begin = expected + FALL_START
+    free = (times > begin) & (times < begin + FALL_TIME)
+    if np.count_nonzero(free) < FEWEST_FALL_POSES:
         return None
     x, v = _parabola(times[free] - expected, points[free])
-    when = times - expected
-    off = np.linalg.norm(
-        points + [0.0, 0.0, 0.5 * GRAVITY] * when[:, None] ** 2 - x - when[:, None] * v, axis=1
-    )
-    bent = (when > -BENT_MOST) & (when < FREE_AFTER) & (off > BENT)
+    lead = times - expected
+    fall = x + lead[:, None] * v
+    distance = np.linalg.norm(points + 0.5 * GRAVITY_UP * lead[:, None] ** 2 - fall, axis=1)
+    bent = (lead > -BEND_TIME) & (lead < FALL_START) & (distance > BEND)
     if np.count_nonzero(bent) < 3:
         return None
-    slope, offset = np.polyfit(when[bent], np.sqrt(off[bent]), 1)
-    if not slope < 0.0 or not -BENT_MOST < -offset / slope < BENT_MOST:
+    slope, offset = np.polyfit(lead[bent], np.sqrt(distance[bent]), 1)
+    if not slope < 0.0 or not -BEND_TIME < -offset / slope < BEND_TIME:
         return None
     root = -offset / slope
-    point = x + root * v - [0.0, 0.0, 0.5 * GRAVITY * root * root]
+    point = x + root * v - 0.5 * GRAVITY_UP * root * root
     return float(expected + root), tuple(point.tolist())
 
 
 def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position and velocity at time 0 of the free fall that fits poses best, shape (3,)
-    each.
-    """
-    lifted = points + [0.0, 0.0, 0.5 * GRAVITY] * times[:, None] ** 2
+    """Fit a free fall to poses; return its position and velocity at time 0, shape (3,) each."""
+    lifted = points + 0.5 * GRAVITY_UP * times[:, None] ** 2
     fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]
     return fit[0], fit[1]
 
 
 class Latch:
-    """Whether the payload hangs, by what was asked for and by its own poses.
+    """The release of the payload, and whether it hangs by its own poses.
 
     Attributes:
-        at: of the release [s]; None until there is one in this throw. commanded: when the mechanism
-            is told of it [s].
-        lag: trained, from latch to separation [s]. count: releases so far. stuck: payloads that
-            stayed on.
+        at: time of the release [s]; None before there is one in this throw.
+        command_time: of the mechanism's command [s].
+        lag: trained, from latch to separation [s].
+        count: releases so far.
+        stuck: payloads that stayed on.
         landings: of the throws so far.
     """
 
@@ -181,79 +174,81 @@ class Latch:
         hang: float,
         tolerance: float,
         height: float,
-        later: float = 0.0,
+        command_delay: float = 0.0,
     ) -> None:
         """Start with the payload hanging; raises `RunError` where the mechanism is slower than the
         policy was trained for.
 
         Args:
-            lag: trained, from latch to separation [s]. mechanism_lag: of the mechanism, from its
-                command to separation [s].
-            hang: of the payload's centre below the vehicle's at rest [m]. tolerance: within which
-                the payload counts as hanging [m].
-            height: of the payload's centre as it lands [m]. later: by which all that the policy
-                decides comes later than in training [s].
+            lag: trained, from latch to separation [s].
+            mechanism_lag: of the mechanism, from its command to separation [s].
+            hang: of the payload's centre below the vehicle's at rest [m].
+            tolerance: within which the payload counts as hanging [m].
+            height: of the payload's centre as it lands [m].
+            command_delay: by which commands act later than in training [s].
         """
-        if mechanism_lag > lag + later + LAG_TOLERANCE:
+        if mechanism_lag > lag + command_delay + LAG_TOLERANCE:
             raise RunError(
                 f"the mechanism takes {mechanism_lag:g} s from command to separation, the policy"
                 f" was trained with {lag:g} s; train one for the slower mechanism"
             )
-        self.lag, self._wait = lag, max(0.0, lag + later - mechanism_lag)
+        self.lag, self._wait = lag, max(0.0, lag + command_delay - mechanism_lag)
         self._hang, self._tolerance, self._height = hang, tolerance, height
         self.at: float | None = None
-        self.commanded = -math.inf
+        self.command_time = -math.inf
         self.count = self.stuck = 0
         self.landings: list[Landing] = []
-        self._begun = 0.0
-        self._flight: Flight | None = None
+        self._start = 0.0
+        self._flight: PayloadFlight | None = None
 
     def rearm(self) -> None:
-        """Take the payload for hung on again: the operator has armed the next throw."""
+        """Forget the last release: the payload hangs again, and the next throw is armed."""
         self.at = None
 
     def begin(self, now: float) -> None:
         """Note the start of a throw [s]."""
-        self._begun = now
+        self._start = now
 
     def trip(self, now: float, goal_w: Vector) -> float:
-        """Latch at a time [s]; returns when the mechanism is to be told, so that it separates after
-        the trained lag [s].
+        """Latch at a time [s]; return the time of the mechanism's command [s], from which it
+        separates after the trained lag.
         """
-        self.at, self.commanded, self.count = now, now + self._wait, self.count + 1
-        self._flight = Flight(goal_w, self._begun, now, self._height, self.lag)
-        return self.commanded
+        self.at, self.command_time = now, now + self._wait
+        self.count += 1
+        self._flight = PayloadFlight(goal_w, self._start, now, self._height, self.lag)
+        return self.command_time
 
     def separated(self, now: float) -> bool:
-        """Return whether the payload is off by now [s], as far as latch and lag tell."""
+        """Return whether the payload has separated by a time [s], by latch and lag."""
         return self.at is not None and now - self.at >= self.lag - ROUNDING
 
-    def hangs_still(self, now: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
-        """Return whether the payload hangs on the vehicle at a time [s], by the latch and then by
-        both places [m], if known.
+    def payload_hangs(self, now: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
+        """Return whether the payload hangs on the vehicle at a time [s], by the latch and by the
+        positions [m]; None for a payload without a fresh pose.
         """
+        if payload_w is None:
+            return self.at is None
+        excess = math.dist(vehicle_w, payload_w) - self._hang
         if self.at is None:  # it may have come off by itself
-            return (
-                payload_w is None or math.dist(vehicle_w, payload_w) < self._hang + self._tolerance
-            )
-        if payload_w is None or now - self.at < self.lag + STUCK_AFTER:
+            return excess < self._tolerance
+        if now - self.at < self.lag + STUCK_AFTER:
             return False
-        hangs = abs(math.dist(vehicle_w, payload_w) - self._hang) < self._tolerance
+        hangs = abs(excess) < self._tolerance
         if hangs and self._flight is not None:
             self.stuck, self._flight = self.stuck + 1, None
         return hangs
 
     def follow(self, time: float, payload_w: Vector) -> None:
-        """Take a pose of the payload in: measured at a time [s], in our frames [m]."""
+        """Take a pose of the payload, measured at a time [s], in our frames [m]."""
         if self._flight is not None:
-            self._down(self._flight.add(time, payload_w))
+            self._note_landing(self._flight.add(time, payload_w))
 
     def overdue(self, now: float) -> None:
-        """Look for a payload that was lost from sight shortly before the ground."""
+        """Note the landing of a payload whose poses ended shortly before the ground."""
         if self._flight is not None:
-            self._down(self._flight.overdue(now))
+            self._note_landing(self._flight.overdue(now))
 
-    def _down(self, landing: Landing | None) -> None:
+    def _note_landing(self, landing: Landing | None) -> None:
         if landing is not None:
             self.landings.append(landing)
             self._flight = None

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from hil.control.calibrating import Calibrating, Solver
+from hil.control.calibrating import Calibrating, CalibrationSolver
 from hil.control.realtime import collected
 from hil.control.recording.latency import Stages
 from hil.control.recording.record import Recorder
 from hil.control.runner import Runner
-from hil.control.states import Decision, OperatorInput, State
+from hil.control.states import OperatorInput, State, TickRecord
 from hil.links.backends.base import Backend, DryRun
 from hil.links.clock import Clock, Ticker
 from hil.poses.sources.base import Source
@@ -53,7 +53,7 @@ class Lander:
 
     def words(self, state: str) -> OperatorInput:
         said = self._operator.words(state)
-        return replace(said, arm=False, land=said.land or self._calibrating.found is not None)
+        return replace(said, arm=False, land=said.land or self._calibrating.calibration is not None)
 
 
 @dataclass
@@ -65,13 +65,13 @@ class Loop:
     clock: Clock  # of the ticks
     operator: Operator  # who arms
     recorder: Recorder | None = None  # of the run's folder
-    tell: Callable[[Decision], None] | None = (
+    tell: Callable[[TickRecord], None] | None = (
         # called with the first decision of each state, and of each reason why it does not go on
         None
     )
     stages: Stages = field(default_factory=Stages)  # filled with the times of each stage
     eyes: Eyes | None = None  # a camera, where keypoints are a detector's
-    solver: Solver | None = None  # of its calibration
+    solver: CalibrationSolver | None = None  # of its calibration
     ours: int = 0  # ticks that were missed because one of ours took too long
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
@@ -127,7 +127,7 @@ class Loop:
             source,
         )
         early = source.poll(clock.now())
-        runner.take(early)
+        runner.take_poses(early)
         _wait(clock, ticker.due(), backend, source)
         due, missed = ticker.due(), ticker.missed
         now, start = ticker.take(), time.perf_counter()
@@ -138,13 +138,13 @@ class Loop:
         if over:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
-        runner.hear(source.rivals(now))
+        runner.decider.rivals = source.rivals(now)
         end = time.perf_counter()
         if self.eyes is not None:
-            self.eyes.hint = runner.hint(now)
-            runner.look(self.eyes.poll(now))
+            self.eyes.hint = runner.estimator.hint(now)
+            runner.estimator.take_detections(self.eyes.poll(now))
         if self.solver is not None and (result := self.solver.poll()) is not None:
-            runner.calibrated(result)
+            runner.commander.calibration = result
         decision = runner.tick(now, late, status, words, recording)
         if self.solver is not None and (hovered := runner.calibrating.due()) is not None:
             self.solver.submit(hovered)
@@ -152,7 +152,7 @@ class Loop:
             "late": ticker.late,
             "poll": polled - start,
             **self.stages.poses(early + late, now),
-            **runner.spent,
+            **runner.parts.spent,
         }
         if "total" in times:
             times["total"] += end - start
@@ -169,7 +169,7 @@ class Loop:
         gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
         self._ended = clock.now()
 
-    def _tell(self, decision: Decision) -> None:
+    def _tell(self, decision: TickRecord) -> None:
         """Say a change of state and a new reason to wait at once, and one that differs in its
         numbers alone every few seconds.
         """

@@ -1,4 +1,4 @@
-"""What stands between a decision and the vehicle: output guard, geofences, checks before flight."""
+"""Output guard, geofences and pre-throw checks between a decision and the vehicle."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Guard:
         self.clipped = self.slewed = self.refused = 0
 
     def reset(self) -> None:
-        """Forget the last command: after a silence nothing is known of what the vehicle does."""
+        """Forget the last command: after a silence the vehicle's state is unknown."""
         self._last = None
 
     def check(self, command: tuple[float, ...]) -> tuple[float, ...] | None:
@@ -61,9 +61,7 @@ class Guard:
 
 @dataclass(frozen=True)
 class FenceParams(Bounded):
-    """Boxes in our world that vehicle and payload may not leave, and the goal may not lie outside
-    of.
-    """
+    """Boxes in our world that vehicle and payload may not leave; the goal is in the payload's."""
 
     vehicle_low: tuple[float, float, float]  # [m]
     vehicle_high: tuple[float, float, float]  # [m]
@@ -73,47 +71,45 @@ class FenceParams(Bounded):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for body, lowest, highest in (
-            ("vehicle", self.vehicle_low, self.vehicle_high),
-            ("payload", self.payload_low, self.payload_high),
-        ):
-            if any(low >= high for low, high in zip(lowest, highest)):
+        for body in ("vehicle", "payload"):
+            lower, upper = getattr(self, f"{body}_low"), getattr(self, f"{body}_high")
+            if any(low >= high for low, high in zip(lower, upper)):
                 raise ConfigError(
-                    f"{body}_low is {lowest} m, {body}_high {highest} m; expected ascending corners"
+                    f"{body}_low is {lower} m, {body}_high {upper} m; expected ascending corners"
                 )
 
 
-def outside(point: Vector, low: Vector, high: Vector) -> str | None:
-    """Return the first axis along which a point lies outside of a box, with its value;
-    None inside.
-    """
-    for axis, x, lowest, highest in zip("xyz", point, low, high):
-        if not lowest <= x <= highest:
-            return f"{axis} {x:.2f} m beyond {lowest:g} to {highest:g} m"
+def box_violation(point: Vector, low: Vector, high: Vector) -> str | None:
+    """Return the first axis on which a point is outside a box, with its value; None inside."""
+    for axis, x, lower, upper in zip("xyz", point, low, high):
+        if not lower <= x <= upper:
+            return f"{axis} {x:.2f} m beyond {lower:g} to {upper:g} m"
     return None
 
 
-def fence_broken(params: FenceParams, vehicle: BodyState, payload: BodyState | None) -> str | None:
-    """Return which fence is broken, or will be at the end of braking, or None.
-
-    A payload that flies freely, None, cannot brake.
+def fence_violation(
+    params: FenceParams, vehicle: BodyState, payload: BodyState | None
+) -> str | None:
+    """Return which fence is violated, or will be at the end of braking, or None; the payload is
+    None where it flies freely.
     """
     stop = tuple(
         x + v * abs(v) / (2.0 * params.deceleration) for x, v in zip(vehicle.pos, vehicle.vel)
     )
-    bodies = [("vehicle", vehicle.pos, "vehicle"), ("vehicle's braking point", stop, "vehicle")]
-    bodies += [] if payload is None else [("payload", payload.pos, "payload")]
-    for name, point, box in bodies:
-        if found := outside(point, getattr(params, f"{box}_low"), getattr(params, f"{box}_high")):
-            return f"{name} {found}"
-    return None
+    points = [("vehicle", vehicle.pos), ("vehicle's braking point", stop)]
+    for name, point in points:
+        violation = box_violation(point, params.vehicle_low, params.vehicle_high)
+        if violation is not None:
+            return f"{name} {violation}"
+    if payload is None:
+        return None
+    violation = box_violation(payload.pos, params.payload_low, params.payload_high)
+    return None if violation is None else f"payload {violation}"
 
 
 @dataclass(frozen=True)
 class CheckParams:
-    """Limits of the checks before arming; each catches a mistake that no single
-    pose betrays.
-    """
+    """Limits of the pre-throw checks; each catches a mistake that no single pose shows."""
 
     tilt_deg: float  # of the vehicle: a wrong quaternion order stands it on its head
     # that the vehicle is put up with: 90 or 180 deg off, an axis or a quaternion is exchanged
@@ -136,7 +132,7 @@ def failed_checks(
     home_w: Vector,
     hang: float,
 ) -> list[str]:
-    """Return what speaks against a throw, in words; ``hang`` is what the payload hangs below the
+    """Return the failed pre-throw checks, in words; ``hang`` is the payload's distance below the
     vehicle at rest [m].
     """
     failed = []
@@ -145,16 +141,17 @@ def failed_checks(
     tilt, heading = map(math.degrees, tilt_and_heading(vehicle.quat))
     if tilt > params.tilt_deg:
         failed.append(f"vehicle tilted by {tilt:.0f} deg (quaternion order or body axes wrong?)")
-    off = (heading - params.heading_deg + 180.0) % 360.0 - 180.0
-    if abs(off) > params.heading_tolerance_deg:
+    error = (heading - params.heading_deg + 180.0) % 360.0 - 180.0
+    if abs(error) > params.heading_tolerance_deg:
         failed.append(
             f"heading {heading:.0f} deg, not {params.heading_deg:g} (axes, yaw offset or quaternion"
             " wrong?)"
         )
-    below = math.dist(payload.pos, (vehicle.pos[0], vehicle.pos[1], vehicle.pos[2] - hang))
-    if below > params.rope_tolerance:
+    x, y, z = vehicle.pos
+    offset = math.dist(payload.pos, (x, y, z - hang))
+    if offset > params.rope_tolerance:
         failed.append(
-            f"payload {below:.2f} m from where it should hang (bodies exchanged, or an offset"
+            f"payload {offset:.2f} m from where it should hang (bodies exchanged, or an offset"
             " wrong?)"
         )
     distance = math.dist(vehicle.pos, home_w)
@@ -163,8 +160,10 @@ def failed_checks(
     speed = math.hypot(*vehicle.vel)
     if speed > params.speed:
         failed.append(f"vehicle moves at {speed:.2f} m/s")
-    if found := outside(goal_w, fence.payload_low, fence.payload_high):
-        failed.append(f"goal {found}")
-    if broken := fence_broken(fence, vehicle, payload):
-        failed.append(broken)
+    goal_violation = box_violation(goal_w, fence.payload_low, fence.payload_high)
+    if goal_violation is not None:
+        failed.append(f"goal {goal_violation}")
+    violation = fence_violation(fence, vehicle, payload)
+    if violation is not None:
+        failed.append(violation)
     return failed

@@ -1,12 +1,12 @@
-"""State machine of a run: what stale poses, fences, time-outs and a silent autopilot lead to; pure
-logic.
+"""State machine of a run: its reaction to the operator, stale poses, fences, time-outs and a silent
+autopilot. Pure logic.
 
     idle -> check -> ready -> armed -> throw -> recover -> ready (more throws) or land -> done
     any -> abort -> done
 
 ``idle`` waits for poses and the autopilot, ``check`` for the checks to hold for a while. From
 ``ready`` on the runner commands: its hover controller holds the vehicle. Each throw needs its own
-word of the operator."""
+command of the operator."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -46,11 +46,11 @@ class StateParams(Bounded):
     check: Positive  # for the checks to pass; then abort
     check_hold: Positive  # for which all checks must hold
     ready: Positive  # for the operator; then land
-    armed: Positive  # for the swing to become quiet; then back to ready, not armed
+    armed: Positive  # for the swing to calm down; then back to ready, not armed
     armed_least: Positive  # in armed before the throw
-    quiet: Positive  # for which vehicle and payload must be quiet
+    quiet: Positive  # for which vehicle and payload must be calm
     throw: Positive  # for the policy to release; then recover with the payload
-    recover: Positive  # for the hover to become quiet again; then land
+    recover: Positive  # for the hover to calm down again; then land
     land: Positive  # for the descent; then done
     abort: Positive  # after which an aborted run ends
 
@@ -61,51 +61,56 @@ class Inputs:
 
     vehicle: int
     payload: int
-    connected: bool = True  # the autopilot is there, in the mode and armed as it must be
+    connected: bool = True  # the autopilot answers, in the right mode, armed
     failed_checks: tuple[str, ...] = ()
-    fence: str | None = None  # which fence is broken
-    still: bool = False  # vehicle at home and vehicle and payload slow
-    separated: bool = False  # latch plus trained lag has passed in this throw
+    fence: str | None = None  # which fence is violated
+    calm: bool = False  # vehicle at home, vehicle and payload slow
+    separated: bool = False  # the trained lag after the latch is over in this throw
     released: bool = False  # the latch has tripped in this throw
     lost: bool = False  # the payload has come off by itself
-    astray: bool = False  # releases that were asked for were held back, and nothing better came
-    grounded: bool = False  # the descent has arrived
+    astray: bool = False  # releases were refused, and no better one came in time
+    grounded: bool = False  # the vehicle has landed
     failure: str | None = None  # of policy, guard, release or of the runner itself
-    arm: bool = False  # the operator's words
+    arm: bool = False  # the operator's commands
     land: bool = False
     abort: bool = False
-    recording: bool = True  # all could be recorded so far
+    recording: bool = True  # everything was recorded so far
     following: bool = True  # the autopilot follows commands
-    note: str = ""  # of the autopilot: what is wrong, or what it waits for
-    why: str = ""  # of the abort, where it was no word
-    streams: tuple[str, ...] = ()  # what is wrong with how the poses come, before the take-over
-    disagrees: str | None = None  # how the first hover is not the policy's vehicle's
+    note: str = ""  # of the autopilot: a problem, or what it waits for
+    why: str = ""  # reason of an abort that the operator did not type
+    streams: tuple[str, ...] = ()  # problems of the pose streams, before the take-over
+    disagrees: str | None = None  # how the first hover contradicts the policy's vehicle
 
     def missing(self) -> list[str]:
-        """Return what has to be there before anything is checked, and is not."""
-        texts = [
-            f"no fresh pose of the {n}"
-            for n, level in (("vehicle", self.vehicle), ("payload", self.payload))
-            if level >= HOLD
-        ]
-        return (
-            texts
-            if self.connected
-            else [*texts, "autopilot not ready" + (f" ({self.note})" if self.note else "")]
-        )
+        """Return what is missing before the checks begin."""
+        texts = []
+        if self.vehicle >= HOLD:
+            texts.append("no fresh pose of the vehicle")
+        if self.payload >= HOLD:
+            texts.append("no fresh pose of the payload")
+        if not self.connected:
+            texts.append("autopilot not ready" + (f" ({self.note})" if self.note else ""))
+        return texts
+
+    def poses_are_stale(self) -> bool:
+        """Return whether the pose of vehicle or payload is stale."""
+        return max(self.vehicle, self.payload) >= HOLD
 
 
 class Machine:
-    """The state, since when, and why.
+    """The state, and the time and reason of its last change.
 
     Attributes:
-        state: now. reason: of the last change. since: time of it [s].
-        throws: throws begun. cancelled: throws that ended without a release.
-        flown: whether this run has ever commanded the vehicle. aborted: whether it was ended by an
-            abort.
+        state: of this tick.
+        reason: of the last change.
+        since: time of the last change [s].
+        throws: throws begun.
+        cancelled: throws that ended without a release.
+        flown: whether this run has ever commanded the vehicle.
+        aborted: whether an abort ended the run.
         handed_back: whether the vehicle went back to the autopilot's own hold, or to the pilot.
-        left_fence: how the vehicle left its fence after a throw; that ends the run by a landing,
-            and is no abort.
+        left_fence: how the vehicle left its fence after a throw, which ends the run by a landing
+            without an abort.
     """
 
     def __init__(
@@ -114,185 +119,172 @@ class Machine:
         """Begin in idle.
 
         Args:
-            params: times. throws: after which it lands.
-            patient: idle and check may last for ever, as where poses are only looked at.
-            sends: whether commands go to a vehicle. Where they do not, no fence ends what others
-                fly before a throw is armed.
+            params: time-outs and durations.
+            throws: after which it lands.
+            patient: whether idle and check have no time-out, as where poses are only observed.
+            sends: whether commands go to a vehicle. Without, no fence applies before a throw is
+                armed: others fly.
         """
-        self.params, self.most, self.patient, self.sends = params, throws, patient, sends
+        self.params, self.max_throws = params, throws
+        self.patient, self.sends = patient, sends
         self.state, self.reason = State.IDLE, "start"
         self.since: float | None = None
         self.throws = self.cancelled = 0
         self.flown = self.aborted = False
         self.left_fence: str | None = None
         self.handed_back = False
-        self._held: float | None = None  # since when what must last has lasted
+        self._lasting_since: float | None = None  # of the condition that must last [s]
 
-    def step(self, now: float, seen: Inputs) -> State:
-        """Move on by one tick; returns the state to act in."""
+    def step(self, now: float, inputs: Inputs) -> State:
+        """Advance by one tick; return the state to act in."""
         if self.since is None:
             self.since = now
-        urgent = self._urgent(seen)
+        urgent = self._abort_reason(inputs)
         if self.state is State.ABORT:
-            # What was never ours needs no descent.
+            # A vehicle that was never ours needs no descent.
             if not self.flown or now - self.since > self.params.abort:
                 self._go(now, State.DONE, self.reason)
         elif self.state is not State.DONE:
-            if seen.disagrees is not None and self.state in (State.READY, State.ARMED):
+            if inputs.disagrees is not None and self.state in (State.READY, State.ARMED):
                 self.handed_back = True
-                self._go(now, State.ABORT, f"handed back: {seen.disagrees}")
+                self._go(now, State.ABORT, f"handed back: {inputs.disagrees}")
             elif urgent is not None:
                 self._go(now, State.ABORT, urgent)
             else:
-                _STEPS[self.state](self, now, seen)
+                _STEPS[self.state](self, now, inputs)
         return self.state
 
-    def _urgent(self, seen: Inputs) -> str | None:
-        if seen.abort:
-            return seen.why or "the operator said abort"
-        if seen.failure is not None:
-            return seen.failure
+    def _abort_reason(self, inputs: Inputs) -> str | None:
+        if inputs.abort:
+            return inputs.why or "the operator said abort"
+        if inputs.failure is not None:
+            return inputs.failure
         if self.state not in FLYING:
             return None
-        if seen.vehicle >= ABORT:
+        if inputs.vehicle >= ABORT:
             return "no new pose of the vehicle"
         spectating = self.state is State.READY and not self.sends
-        if (
-            seen.fence is not None
-            and not spectating
-            and not (self.state is State.RECOVER and seen.released)
-        ):
-            return f"fence: {seen.fence}"
-        if not seen.connected:
-            return "the autopilot is silent, disarmed or in another mode" + (
-                f": {seen.note}" if seen.note else ""
-            )
+        recovering = self.state is State.RECOVER and inputs.released
+        if inputs.fence is not None and not spectating and not recovering:
+            return f"fence: {inputs.fence}"
+        if not inputs.connected:
+            note = f": {inputs.note}" if inputs.note else ""
+            return f"the autopilot is silent, disarmed or in another mode{note}"
         return None
 
     def _go(self, now: float, state: State, reason: str) -> None:
         if self.state is State.THROW and state is not State.THROW and reason != "separated":
             self.cancelled += 1
-        self.state, self.reason, self.since, self._held = state, reason, now, None
+        self.state, self.reason, self.since = state, reason, now
+        self._lasting_since = None
         self.throws += state is State.THROW
         self.flown |= state in FLYING
         self.aborted |= state is State.ABORT
 
-    def waits(self, seen: Inputs) -> str:
-        """Return why it does not go on, in words; empty where nothing is in the way but time."""
+    def _go_land(self, now: float, inputs: Inputs, reason: str = "") -> None:
+        self._go(now, State.LAND, "the operator said land" if inputs.land else reason)
+
+    def waits(self, inputs: Inputs) -> str:
+        """Return what the state waits for, in words; empty where it waits for time alone."""
         texts: list[str] = []
-        if self.state in (State.IDLE, State.CHECK, State.READY, State.ARMED):
-            if self.state in (State.IDLE, State.CHECK):
-                texts = [*seen.missing(), *seen.streams]
-            texts += seen.failed_checks if self.state is not State.IDLE else ()
+        if self.state in (State.IDLE, State.CHECK):
+            texts += [*inputs.missing(), *inputs.streams]
+        if self.state in (State.CHECK, State.READY, State.ARMED):
+            texts += inputs.failed_checks
         if self.state in (State.READY, State.ARMED):
-            texts += [] if seen.payload < HOLD else ["no fresh pose of the payload"]
-            texts += [] if seen.recording else ["the recording failed"]
-            texts += (
-                []
-                if seen.following
-                else ["it does not follow yet" + (f" ({seen.note})" if seen.note else "")]
-            )
-        if self.state in (State.ARMED, State.RECOVER) and not seen.still:
-            texts.append("not quiet yet")
-        if self.state is State.READY and not texts and not seen.arm:
+            if inputs.payload >= HOLD:
+                texts.append("no fresh pose of the payload")
+            if not inputs.recording:
+                texts.append("the recording failed")
+            if not inputs.following:
+                note = f" ({inputs.note})" if inputs.note else ""
+                texts.append(f"the autopilot does not follow yet{note}")
+        if self.state in (State.ARMED, State.RECOVER) and not inputs.calm:
+            texts.append("not calm yet")
+        if self.state is State.READY and not texts and not inputs.arm:
             texts.append("the operator's word: arm")
         return "; ".join(texts)
 
     def _lasted(self, now: float, holds: bool, time: float) -> bool:
+        """Return whether a condition has held for a time [s]."""
         if not holds:
-            self._held = None
+            self._lasting_since = None
             return False
-        if self._held is None:
-            self._held = now
-        return now - self._held >= time - 1e-9
+        if self._lasting_since is None:
+            self._lasting_since = now
+        return now - self._lasting_since >= time - 1e-9
 
-    def held(self, now: float) -> float:
-        """Return for how long what must last has lasted [s]."""
-        return 0.0 if self._held is None else now - self._held
+    def lasting(self, now: float) -> float:
+        """Return for how long the condition that must last has held [s]."""
+        return 0.0 if self._lasting_since is None else now - self._lasting_since
 
     def _late(self, now: float) -> bool:
         return now - self.since > getattr(self.params, self.state.value)
 
-    def _idle(self, now: float, seen: Inputs) -> None:
-        if max(seen.vehicle, seen.payload) < HOLD and seen.connected:
+    def _idle(self, now: float, inputs: Inputs) -> None:
+        if not inputs.missing():
             self._go(now, State.CHECK, "poses and autopilot are there")
         elif self._late(now) and not self.patient:
-            self._go(now, State.ABORT, f"{', '.join(seen.missing())}, for {self.params.idle:g} s")
+            self._go(now, State.ABORT, f"{', '.join(inputs.missing())}, for {self.params.idle:g} s")
 
-    def _check(self, now: float, seen: Inputs) -> None:
-        good = not (seen.missing() or seen.failed_checks or seen.streams)
+    def _check(self, now: float, inputs: Inputs) -> None:
+        good = not (inputs.missing() or inputs.failed_checks or inputs.streams)
         if self._lasted(now, good, self.params.check_hold):
             self._go(now, State.READY, "checks passed")
         elif self._late(now) and not self.patient:
-            self._go(
-                now, State.ABORT, f"checks: {self.waits(seen) or 'poses or autopilot come and go'}"
-            )
+            reason = self.waits(inputs) or "poses or autopilot come and go"
+            self._go(now, State.ABORT, f"checks: {reason}")
 
-    def _ready(self, now: float, seen: Inputs) -> None:
-        if seen.land or self._late(now):
-            self._go(
-                now, State.LAND, "the operator said land" if seen.land else "nobody armed a throw"
-            )
-        elif (
-            seen.arm
-            and seen.following
-            and seen.recording
-            and not seen.failed_checks
-            and seen.payload < HOLD
-        ):
+    def _ready(self, now: float, inputs: Inputs) -> None:
+        if inputs.land or self._late(now):
+            self._go_land(now, inputs, "nobody armed a throw")
+        elif not (inputs.arm and inputs.following and inputs.recording):
+            return
+        elif not inputs.failed_checks and inputs.payload < HOLD:
             self._go(now, State.ARMED, "the operator armed this throw")
 
-    def _armed(self, now: float, seen: Inputs) -> None:
-        long = now - self.since >= self.params.armed_least
-        if seen.land:
-            self._go(now, State.LAND, "the operator said land")
-        elif max(seen.vehicle, seen.payload) >= HOLD or not (seen.recording and seen.following):
-            self._go(
-                now, State.READY, "disarmed: stale poses, not followed, or the recording failed"
-            )
-        elif self._lasted(now, seen.still and not seen.failed_checks, self.params.quiet) and long:
-            self._go(now, State.THROW, "quiet")
+    def _armed(self, now: float, inputs: Inputs) -> None:
+        if inputs.land:
+            self._go_land(now, inputs)
+        elif inputs.poses_are_stale() or not (inputs.recording and inputs.following):
+            reason = "disarmed: stale poses, not followed, or the recording failed"
+            self._go(now, State.READY, reason)
+        elif self._lasted(now, inputs.calm and not inputs.failed_checks, self.params.quiet) and (
+            now - self.since >= self.params.armed_least
+        ):
+            self._go(now, State.THROW, "calm")
         elif self._late(now):
-            self._go(
-                now,
-                State.READY,
-                f"disarmed: {self.waits(seen) or 'the swing did not become quiet'}",
-            )
+            reason = self.waits(inputs) or "the swing did not calm down"
+            self._go(now, State.READY, f"disarmed: {reason}")
 
-    def _throw(self, now: float, seen: Inputs) -> None:
-        if seen.separated:
+    def _throw(self, now: float, inputs: Inputs) -> None:
+        if inputs.separated:
             self._go(now, State.RECOVER, "separated")
-        elif seen.released:
-            return  # what is latched cannot be taken back: fly on until it is off
-        elif max(seen.vehicle, seen.payload) >= HOLD:
+        elif inputs.released:
+            return  # a latched release cannot be taken back: fly on until the separation
+        elif inputs.poses_are_stale():
             self._go(now, State.RECOVER, "stale poses")
-        elif seen.lost:
+        elif inputs.lost:
             self._go(now, State.RECOVER, "the payload has come off by itself")
-        elif seen.astray:
+        elif inputs.astray:
             self._go(now, State.RECOVER, "the policy released where it would miss")
         elif self._late(now):
             self._go(now, State.RECOVER, "the policy did not release in time")
 
-    def _recover(self, now: float, seen: Inputs) -> None:
-        # An old pose is always quiet: what stands still there is the motion capture.
-        if (
-            seen.fence is not None
-        ):  # it brakes as hard as it can, and what was to be done is done: no more throws
-            self.left_fence = seen.fence
-            self._go(now, State.LAND, f"after the throw, fence: {seen.fence}")
-        elif self._lasted(now, seen.still and seen.vehicle < HOLD, self.params.quiet):
-            again = self.throws < self.most
-            self._go(now, State.READY if again else State.LAND, "hovering again")
-        elif seen.land or self._late(now):
-            self._go(
-                now,
-                State.LAND,
-                "the operator said land" if seen.land else "not quiet again in time",
-            )
+    def _recover(self, now: float, inputs: Inputs) -> None:
+        if inputs.fence is not None:  # the payload is off and the vehicle brakes: no more throws
+            self.left_fence = inputs.fence
+            self._go(now, State.LAND, f"after the throw, fence: {inputs.fence}")
+        # A stale pose never moves: that says nothing about the vehicle.
+        elif self._lasted(now, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
+            state = State.READY if self.throws < self.max_throws else State.LAND
+            self._go(now, state, "hovering again")
+        elif inputs.land or self._late(now):
+            self._go_land(now, inputs, "not calm again in time")
 
-    def _land(self, now: float, seen: Inputs) -> None:
-        if seen.grounded or self._late(now):
-            self._go(now, State.DONE, "landed" if seen.grounded else "landing took too long")
+    def _land(self, now: float, inputs: Inputs) -> None:
+        if inputs.grounded or self._late(now):
+            self._go(now, State.DONE, "landed" if inputs.grounded else "landing took too long")
 
 
 _STEPS = {
@@ -304,25 +296,22 @@ _STEPS = {
     State.RECOVER: Machine._recover,
     State.LAND: Machine._land,
 }
-"""By state.
-
-A name put together at each tick would stay in Python's cache of attributes, a new one for each.
-"""
+"""Step of each state. Names assembled at each tick would fill Python's attribute cache."""
 
 
 @dataclass(frozen=True)
 class OperatorInput:
-    """Return the operator's commands since the last tick."""
+    """The operator's commands since the last tick."""
 
     arm: bool = False
     land: bool = False
     abort: bool = False
-    why: str = ""  # of the abort, where it was no word: a signal, the end of the run's time
+    why: str = ""  # reason of an abort that was not typed: a signal, the end of the run's time
 
 
 @dataclass
-class Decision:
-    """All that one tick saw and decided; plain values, as they are recorded."""
+class TickRecord:
+    """The inputs and decisions of one tick, in plain values as they are recorded."""
 
     time: float
     state: str
@@ -332,13 +321,11 @@ class Decision:
     observation: list[float] | None = None
     keypoints: list | None = None
     valid: list | None = None
-    release: bool = False  # the policy asked for it and it was done
+    release: bool = False  # the policy's release was executed
     note: str = ""
-    waits: str = ""  # why it does not go on
-    seen: list | None = (
-        None  # of a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
-    )
-    rivals: list[str] | None = None  # for whom two senders speak, in words
-    calibration: dict | str | None = (
-        None  # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
-    )
+    waits: str = ""  # what the state waits for
+    # in a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
+    detection: list | None = None
+    rivals: list[str] | None = None  # bodies or autopilots that two senders speak for
+    # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
+    calibration: dict | str | None = None

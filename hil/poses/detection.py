@@ -95,7 +95,7 @@ class Detections:
             max(found.latency, 0.0),
         )
 
-    def along(self, now: float, pos: Vector, quat: Quaternion) -> None:
+    def note_vehicle(self, now: float, pos: Vector, quat: Quaternion) -> None:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than
         these.
         """

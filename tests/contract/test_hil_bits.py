@@ -91,7 +91,7 @@ def seen_by_the_runner(flown, poses, policy: str) -> tuple[np.ndarray, np.ndarra
     for n in range(streams * steps):
         goal_w = tuple(flown["goal_w"].reshape(-1, 3)[n - n % steps].astype(float).tolist())
         if n % steps == 0:
-            runner.params = dataclasses.replace(runner.params, goal_w=goal_w)
+            runner.parts.params = dataclasses.replace(runner.parts.params, goal_w=goal_w)
             runner.pilot.start()
         decision = runner.tick(TICK * n, poses[n], Status(True), OperatorInput())
         observations.append(decision.observation)

@@ -15,9 +15,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 CEILINGS = {
-    "bound function words": 1900,
+    "bound function words": 1860,
     "first lines without a subject": 119,
-    "class names twice": 29,
+    "class names twice": 26,
     "file names twice": 28,
     "wide lines": 1,
     "fmt: skip": 0,

@@ -126,7 +126,7 @@ def test_another_thrust_line(kind, share):
 def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)
-    assert f"handed back: {AXES[axis]}: it turns against its commands" in said
+    assert f"handed back: {AXES[axis]}: the vehicle turns against its commands" in said
 
 
 @pytest.mark.parametrize("kind", KINDS)

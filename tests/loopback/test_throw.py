@@ -128,7 +128,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     source = MavlinkSource(link, params.source.senders, clock.now)
     backend = make_backend(params, link)
     runner = Runner(params, Policy.load(find_policy(params.policy)), backend, mechanism_lag(params))
-    runner.warm_up()
+    runner.commander.warm_up()
     # The fake goes away in mid flight, which ends the run: half a second later it is done.
     command = [sys.executable, "-m", "visthrow.cli", "hil", "fake", "--device", f"udpout:{device}"]
     fake = subprocess.Popen(

@@ -150,7 +150,7 @@ def peers(
         backend = make_backend(params, link, write, tell)
     loaded = loaded or Policy.load(find_policy(policy))
     runner = Runner(params, loaded, backend, mechanism_lag(params))
-    runner.watcher = getattr(backend, "place", None)
+    runner.estimator.watcher = getattr(backend, "place", None)
     return runner, source, clock, fake
 
 

@@ -124,9 +124,9 @@ class Samples:
         self._last: dict[str, float] = {}
         self._vehicle: Pose | None = None  # the last one: where the rope hangs
         self._follows: float | None = None  # since when the autopilot does
-        self.spun_up = (
-            SPUN_UP * self.runner.pilot.policy.contract["vehicle"]["motor"]["time_constant"]
-        )
+        contract = self.runner.pilot.policy.contract
+        self.spun_up = SPUN_UP * contract["vehicle"]["motor"]["time_constant"]
+        self._mount_b = np.array(contract["rope"]["mount"], dtype=float)
 
     def flush(self) -> FlightLog:
         """Return the log of what was added since the last call."""
@@ -182,8 +182,8 @@ class Samples:
             self._note(payload_vel_w=pose.vel)
             vehicle = self._vehicle
             if attached and vehicle is not None and vehicle.quat is not None:
-                mount = matrix_of_quat(np.array([vehicle.quat]))[0] @ np.array(self.runner.mount_b)
-                self.recorder.add(time, cable_points_w=np.stack([vehicle.pos + mount, pose.pos]))
+                mount_w = matrix_of_quat(np.array([vehicle.quat]))[0] @ self._mount_b
+                self.recorder.add(time, cable_points_w=np.stack([vehicle.pos + mount_w, pose.pos]))
         elif sample.body == VEHICLE:
             self._vehicle = pose
             self.recorder.add(time, pos_w=pose.pos, vel_w=sample.vel_w)
@@ -206,7 +206,7 @@ def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dic
     pictures.
     """
     params, policy = playback.params, playback.runner.pilot.policy
-    goal_w = playback.runner.seen_goal_w or params.goal_w
+    goal_w = playback.runner.estimator.goal_w or params.goal_w
     simulated = ", of a simulated vehicle" if provenance.get("simulated") else ""
     return {
         "policy": provenance.get("policy", Path(params.policy).stem),

@@ -11,7 +11,7 @@ from typing import Any
 
 from hil.control.recording.record import SUMMARY, load_run, opened, pack
 from hil.control.runner import Runner
-from hil.control.states import Decision, OperatorInput, State
+from hil.control.states import OperatorInput, State, TickRecord
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.detection import Detection
@@ -40,7 +40,7 @@ class Tick:
     """One tick of a run: as recorded, as decided, and the poses that were taken in it."""
 
     line: dict[str, Any]
-    decision: Decision
+    decision: TickRecord
     samples: list[Sample]
     ages: dict[str, float]  # of the poses' content by body [s]
     attached: bool  # whether the payload hangs on the vehicle: until the release's lag is over
@@ -53,7 +53,7 @@ class Playback:
     def __init__(self, params: HilParams, policy: Policy) -> None:
         """Start before the first tick; see `hil.control.recording.record.load_run` for both."""
         self.params, self.runner = params, Runner(params, policy, DryRun())
-        self.runner.watcher = lambda body, track: self._samples.append(
+        self.runner.estimator.watcher = lambda body, track: self._samples.append(
             Sample(body, *track.sample())
         )
         self._samples: list[Sample] = []
@@ -61,11 +61,14 @@ class Playback:
     def feed(self, line: dict[str, Any], poses: list[Pose]) -> Tick:
         """Run one recorded tick."""
         self._samples, runner, time = [], self.runner, line["time"]
-        if line.get("seen") is not None:
-            runner.look([Detection.of(line["seen"])])
-        if (found := line.get("calibration")) is not None:
-            runner.calibrated(found if isinstance(found, str) else Calibration.of(found))
-        runner.hear(line.get("rivals") or [])
+        detection = line.get("detection", line.get("seen"))  # runs of before call it "seen"
+        if detection is not None:
+            runner.estimator.take_detections([Detection.of(detection)])
+        calibration = line.get("calibration")
+        if isinstance(calibration, dict):
+            calibration = Calibration.of(calibration)
+        runner.commander.calibration = calibration
+        runner.decider.rivals = line.get("rivals") or []
         decision = runner.tick(
             time, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
         )
@@ -76,7 +79,7 @@ class Playback:
             self._samples,
             ages,
             not runner.latch.separated(time),
-            runner.seen_goal_w,
+            runner.estimator.goal_w,
         )
 
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hil.control.states import Decision, OperatorInput
+from hil.control.states import OperatorInput, TickRecord
 from hil.errors import RunError
 from hil.links.backends.base import Status
 from hil.links.writer import Writer
@@ -98,7 +98,7 @@ class Recorder:
         status: Status,
         words: OperatorInput,
         recording: bool,
-        decision: Decision,
+        decision: TickRecord,
         times: dict[str, float],
     ) -> None:
         """Record one tick; never raises and never waits.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hil.control.aim import Aim, AimParams
+from hil.control.aim import AimParams, ReleaseCheck
 from hil.control.runner import Runner
 from hil.errors import ConfigError
 from hil.params import HilParams
@@ -46,32 +46,35 @@ def fallen(pos, vel, drag):
 @pytest.mark.parametrize("vel", [(4.0, 0.3, 2.0), (-1.0, 2.0, -3.0), (0.0, 0.0, 0.0)])
 def test_prediction_against_an_integrator(vel, drag):
     pos = (0.4, -0.1, 1.2)
-    found = Aim(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(at(pos, vel))
+    found = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(at(pos, vel))
     assert found == pytest.approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
 
 
 def test_a_payload_below_the_ground_or_without_end_is_judged():
-    aim = Aim(None, AHEAD, HEIGHT, ROPE)
+    aim = ReleaseCheck(None, AHEAD, HEIGHT, ROPE)
     assert aim.landing(at((1.0, 2.0, -0.1), (0.0, 0.0, -1.0))) == pytest.approx((1.0, 2.0))
     assert all(map(math.isfinite, aim.landing(at((1.0, 2.0, 1.0), (0.0, 0.0, 100.0)))))
 
 
 def test_what_is_held_back_and_when_it_is_given_up():
-    aim, goal = Aim(AimParams(bound=0.5, patience=0.4), AHEAD, HEIGHT, ROPE), (2.0, 0.0, 0.0)
+    aim, goal = (
+        ReleaseCheck(AimParams(bound=0.5, patience=0.4), AHEAD, HEIGHT, ROPE),
+        (2.0, 0.0, 0.0),
+    )
     good, bad = at((0.5, 0.0, 1.2), (2.4, 0.0, 1.5)), at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     aim.begin()
-    assert aim.astray(1.0, good, goal) is None
-    assert "2.00 m from the goal, within 0.5 m expected" in aim.astray(1.1, bad, goal)
-    assert aim.astray(1.2, good, goal) is None, "the policy may ask again"
+    assert aim.miss(1.0, good, goal) is None
+    assert "2.00 m from the goal, within 0.5 m expected" in aim.miss(1.1, bad, goal)
+    assert aim.miss(1.2, good, goal) is None, "the policy may ask again"
     for x, y in ((2.51, 0.0), (1.49, 0.0), (2.0, 0.51), (2.0, -0.51), (2.36, 0.36)):
         near = at((2.0 + 0.95 * (x - 2.0), 0.95 * y, 1.0), (0.0, 0.0, 0.0))
-        assert aim.astray(1.25, near, goal) is None
-        assert aim.astray(1.25, at((x, y, 1.0), (0.0, 0.0, 0.0)), goal)
-    assert aim.astray(1.3, bad, goal)
-    assert (aim.given_up(1.49), aim.given_up(1.51), aim.held) == (False, True, 7)
+        assert aim.miss(1.25, near, goal) is None
+        assert aim.miss(1.25, at((x, y, 1.0), (0.0, 0.0, 0.0)), goal)
+    assert aim.miss(1.3, bad, goal)
+    assert (aim.given_up(1.49), aim.given_up(1.51), aim.refused) == (False, True, 7)
     aim.begin()
     assert not aim.given_up(9.0)
-    assert Aim(None, AHEAD, HEIGHT, ROPE).astray(1.0, bad, goal) is None, (
+    assert ReleaseCheck(None, AHEAD, HEIGHT, ROPE).miss(1.0, bad, goal) is None, (
         "without a table all is let go"
     )
 

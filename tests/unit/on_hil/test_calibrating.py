@@ -122,11 +122,11 @@ class Hall:
                         ),
                     ]
             if now > self.late + 0.02:
-                self.runner.look([self.detection(now)])
+                self.runner.estimator.take_detections([self.detection(now)])
             if (due := self.runner.calibrating.due()) is not None:
                 p = self.runner.params
-                self.runner.calibrated(
-                    solved(due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads)
+                self.runner.commander.calibration = solved(
+                    due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads
                 )
             decision = self.runner.tick(
                 now, poses, self.runner.backend.status(now), OperatorInput(arm=arm)
@@ -147,7 +147,7 @@ class Hall:
         true, _ = keypoints(
             self.camera, tensors[0], rotation_from_quat(tensors[1]), self.goal, tensors[2]
         )
-        shown, valid = self.runner.detections.keypoints(self.plant.time)
+        shown, valid = self.runner.parts.detections.keypoints(self.plant.time)
         assert valid.all()
         return float(np.sqrt(np.square(shown - true.numpy()).mean()))
 
@@ -164,7 +164,7 @@ def hall():
 
 
 def test_tilt_latency_and_thrust_are_found_in_the_runners_own_hover(hall):
-    found = hall.runner.calibrating.found
+    found = hall.runner.calibrating.calibration
     assert found is not None, hall.runner.calibrating.problems()
     np.testing.assert_allclose(np.degrees(found.turn_b), TILT_DEG, atol=0.15)
     assert found.latency == pytest.approx(LATENCY, abs=0.004)
@@ -215,7 +215,7 @@ def test_a_throw_lands_by_a_camera_that_is_turned_stretched_and_late(hall):
 
 def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     fine = Calibration((0.0, 0.0, 0.0), (1e-3, 1e-3, 1e-3), 0.01, 1e-3, 1.0, 1e-3, 1.0, 150)
-    calibrating = Calibrating(CalibrationParams(), lambda: (2.0, 0.0, 0.0))
+    calibrating = Calibrating(CalibrationParams())
     assert calibrating.problems() == ["calibrating in the hover"]
     calibrating.take("the ball was not seen")
     assert calibrating.problems() == ["calibrating in the hover again: the ball was not seen"]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hil.control.latch import Flight, separation
+from hil.control.latch import PayloadFlight, separation
 from hil.control.recording import flightlogs, view
 from hil.control.recording.flightlogs import read, throws
 from hil.control.recording.record import load_run
@@ -197,7 +197,7 @@ def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
     """
     fall = math.sqrt(2 * (1.1 - 0.04) / 9.81)
     for before, found in ((0.06, True), (0.25, False)):
-        flight = Flight((2.0, 0.0, 0.0), 0.0, 0.0, 0.04, 0.11)
+        flight = PayloadFlight((2.0, 0.0, 0.0), 0.0, 0.0, 0.04, 0.11)
         for t in np.arange(0.0, 0.11 + fall - before, 0.01):
             free = max(t - 0.11, 0.0)
             assert flight.add(t, (4.0 * free, 0.0, 1.1 - 0.5 * 9.81 * free * free)) is None

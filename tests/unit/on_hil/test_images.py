@@ -370,10 +370,10 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
     command = ["hil", "record", "--out", str(out)]
     assert main([*command, *(word for setting in settings for word in ("--set", setting))]) == 0
     ticks = list(lines(out / "ticks.jsonl"))
-    looked = [line for line in ticks if line["seen"] is not None]
+    looked = [line for line in ticks if line["detection"] is not None]
     assert len(looked) == FRAMES
     for line in looked[1:]:
-        index = round(line["seen"][0] / PERIOD)
+        index = round(line["detection"][0] / PERIOD)
         assert all(line["valid"])
         off = np.abs(np.array(line["keypoints"]) - true_keypoints(index))
         assert off.max() < WORST

@@ -8,8 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from hil.control.runner import WARM_CALLS, OperatorInput, Runner
+from hil.control.runner import OperatorInput, Runner
 from hil.control.states import Inputs, Machine
+from hil.control.tick.commander import WARM_CALLS, Commander
 from hil.errors import RunError
 from hil.links.backends.base import Status
 from hil.params import HilParams
@@ -73,7 +74,7 @@ def test_a_throw_from_idle_to_done():
     (landing,) = pilot.latch.landings
     np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
     assert landing.error == pytest.approx(2.0, abs=0.02)
-    fall = math.sqrt(2 * (1.333 - pilot.hang - 0.04) / 9.81)
+    fall = math.sqrt(2 * (1.333 - pilot.parts.hang - 0.04) / 9.81)
     assert landing.duration == pytest.approx(LAG + fall, abs=0.02)
     assert not pilot.errors
 
@@ -91,7 +92,7 @@ def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
 def test_a_warm_up_changes_no_bit(monkeypatch):
     """It calls the policy on a copy, before the run and as a throw is armed."""
     called = []
-    warm, act = Runner.warm_up, Pilot.act
+    warm, act = Commander.warm_up, Pilot.act
 
     def counted(pilot, *args):
         called.append(pilot)
@@ -99,12 +100,12 @@ def test_a_warm_up_changes_no_bit(monkeypatch):
 
     monkeypatch.setattr(Pilot, "act", counted)
     pilot = runner()
-    pilot.warm_up()
+    pilot.commander.warm_up()
     decisions = fly(pilot, 4.0)
     assert sum(each is not pilot.pilot for each in called) == 2 * WARM_CALLS
-    monkeypatch.setattr(Runner, "warm_up", lambda self, vehicle=None: None)
+    monkeypatch.setattr(Commander, "warm_up", lambda self, vehicle=None: None)
     assert fly(runner(), 4.0) == decisions
-    monkeypatch.setattr(Runner, "warm_up", warm)
+    monkeypatch.setattr(Commander, "warm_up", warm)
 
 
 def test_nothing_is_released_without_the_operators_word():
@@ -344,14 +345,14 @@ def test_no_throw_on_pictures_that_do_not_show(name):
     corners = tuple(map(tuple, (ahead / np.linalg.norm(ahead, axis=1, keepdims=True)).tolist()))
     shown = {"goal": corners, "ball": (0.0, 0.1, math.sqrt(0.99), 0.08)}
     pilot = runner(NEVER)
-    pilot.detections = Detections(pilot.pilot.camera, 0.1)
+    pilot.parts.detections = Detections(pilot.pilot.camera, 0.1)
 
     def watch(time, decision):
         seen = {
             thing: None if thing == name and hidden[0] <= time < hidden[1] else rays
             for thing, rays in shown.items()
         }
-        pilot.look([Detection(time, seen["goal"], seen["ball"])])
+        pilot.estimator.take_detections([Detection(time, seen["goal"], seen["ball"])])
 
     decisions = fly(pilot, hidden[1] + 2.0, watch=watch)
     begun = when(decisions, "throw")
@@ -432,7 +433,9 @@ def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
         if time > START:
             pilot.pilot.act = broken
         if decision.state == "abort":
-            places.append((pilot.tracks["vehicle"].state(time).pos[0], pilot.hovering.place_w[0]))
+            places.append(
+                (pilot.tracks["vehicle"].state(time).pos[0], pilot.parts.hovering.place_w[0])
+            )
 
     fly(pilot, START + 0.2, watch=watch)
     assert places[0][0] > 0.15
@@ -501,7 +504,7 @@ def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
     wrong. Neither is called a swing.
     """
     pilot = runner(AT_ONCE, "states.armed=1.5", "states.armed_least=1.0")
-    pilot._thrust_off = lambda: (
+    pilot.decider.thrust_problems = lambda: (
         ["hovering takes 1.10 times the weight"] if pilot.machine.state == "armed" else []
     )
     decisions = fly(pilot, 5.0)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hil.control.safety import FenceParams, Guard, GuardParams, fence_broken, outside
+from hil.control.safety import FenceParams, Guard, GuardParams, box_violation, fence_violation
 from hil.poses.track import BodyState
 
 DECELERATION = 12.0  # m/s^2
@@ -36,11 +36,11 @@ def test_the_vehicle_is_stopped_where_it_could_not_brake(axis, side):
     still = moved(axis, limit - side * distance)
     for factor, broken in ((0.99, False), (1.01, True)):
         vehicle = body(still, moved(axis, side * speed * factor, (0.0, 0.0, 0.0)))
-        reason = fence_broken(FENCE, vehicle, None)
+        reason = fence_violation(FENCE, vehicle, None)
         assert bool(reason) is broken, (axis, side, factor)
         assert not broken or "braking point" in reason
     away = body(still, moved(axis, -side * speed * 1.01, (0.0, 0.0, 0.0)))
-    assert fence_broken(FENCE, away, None) is None, "moving away from the wall is no danger"
+    assert fence_violation(FENCE, away, None) is None, "moving away from the wall is no danger"
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -54,14 +54,14 @@ def test_vehicle_and_payload_have_boxes_of_their_own(axis, side):
         for shift, broken in ((-NEAR, False), (NEAR, True)):
             place = body(moved(axis, limit + side * shift))
             vehicle, payload = (place, None) if name == "vehicle" else (body(), place)
-            reason = fence_broken(FENCE, vehicle, payload)
+            reason = fence_violation(FENCE, vehicle, payload)
             assert bool(reason) is broken, (name, axis, side, shift)
             assert not broken or reason.startswith(f"{name} {'xyz'[axis]}")
 
 
 def test_a_payload_that_flies_is_not_watched():
-    assert fence_broken(FENCE, body(), None) is None
-    assert outside((0.0, 0.0, 0.0), (-1.0,) * 3, (1.0,) * 3) is None
+    assert fence_violation(FENCE, body(), None) is None
+    assert box_violation((0.0, 0.0, 0.0), (-1.0,) * 3, (1.0,) * 3) is None
 
 
 @pytest.mark.parametrize("axis", range(4))

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from hil.control.states import Decision, OperatorInput
+from hil.control.states import OperatorInput, TickRecord
 from hil.errors import RunError
 from hil.flight import require_fake
 from hil.params import HilParams
@@ -135,7 +135,7 @@ def test_a_reason_is_not_said_twice(capsys):
         ("idle", "start", "no pose"),
         ("idle", "start", "disarmed"),
     ):
-        console.decision(Decision(1.0, state, reason, waits=waits))
+        console.decision(TickRecord(1.0, state, reason, waits=waits))
     console.close()
     said = [line.split(maxsplit=2)[2] for line in capsys.readouterr().err.splitlines()]
     assert [" ".join(line.split()) for line in said] == [

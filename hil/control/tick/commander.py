@@ -1,0 +1,263 @@
+"""Act: the last step of a tick, from the decided state to commands and releases."""
+
+import copy
+import math
+from time import perf_counter
+
+import numpy as np
+
+from hil.control.safety import Guard, box_violation
+from hil.control.states import FLYING, Inputs, State, TickRecord
+from hil.control.tick.body_estimate import Estimate
+from hil.control.tick.flight_parts import FlightParts
+from hil.links.backends.base import FOLLOW, LAND, Status
+from hil.links.backends.base import HOLD as HOLDING
+from hil.poses.gate import ABORT, HOLD
+from hil.poses.track import BodyState
+from visthrow.onboard.calibration import Calibration
+from visthrow.onboard.hover import GRAVITY
+from visthrow.onboard.pilot import PilotOutput
+
+HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
+"""Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on
+poses [m/s, rad].
+"""
+
+# an aborted run without poses levels the vehicle for this long and then falls silent: the
+# autopilot's failsafes act [s]
+LEVEL_TIME = 0.5
+
+# calls of the policy before it flies: the first one compiles, the others warm the caches
+WARM_CALLS = 3
+
+Command = tuple[float, ...]  # thrust [N] and body rates [rad/s]
+
+
+def can_hand_over(vehicle: BodyState) -> bool:
+    """Return whether a vehicle is slow and level enough for the autopilot's own hold."""
+    x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
+    level = 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
+    return level and math.hypot(*vehicle.vel) < HAND_OVER_SPEED
+
+
+class Commander:
+    """Acts in a state: commands the vehicle, asks for the autopilot's modes, releases the payload.
+
+    Attributes:
+        guard: with its counts.
+        calibration: result for the next tick, or why there is none.
+    """
+
+    def __init__(self, parts: FlightParts) -> None:
+        """Start in idle."""
+        self.parts = parts
+        action = parts.pilot.policy.contract["action"]
+        max_rate = tuple(map(float, action["max_rate"]))
+        self.guard = Guard(parts.params.guard, float(action["max_thrust"]), max_rate)
+        self.calibration: Calibration | str | None = None
+        self._state: str = State.IDLE
+        self._release_end = math.inf  # after which no release of this throw is sent [s]
+
+    def enter(self, estimate: Estimate, state: str) -> None:
+        """Do what a change of state requires."""
+        parts, now, previous = self.parts, estimate.time, self._state
+        if state != previous:
+            self._state = state
+            self._change_state(estimate, previous, state)
+        if now >= self._release_end or state == State.ABORT:
+            parts.backend.stop_release()
+            self._release_end = math.inf
+
+    def act(self, estimate: Estimate, status: Status, record: TickRecord, begin: float) -> None:
+        """Command the vehicle, and note in the tick's record what was sent; ``begin`` of the tick
+        is a reading of `perf_counter`.
+        """
+        parts, state = self.parts, record.state
+        command = self._wanted_command(estimate, record)
+        if parts.calibrating is not None:
+            command = self._add_sway(estimate, status, command, record)
+        hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW
+        if hovers and command is not None and parts.response is not None:
+            doublet = (0.0, *parts.response.rates())
+            command = tuple(value + rate for value, rate in zip(command, doublet))
+        self._ask_mode(estimate, state, status)
+        observes = parts.params.observe and record.action is None
+        if observes and estimate.is_complete and estimate.vehicle.quat:
+            self._run_policy(estimate, record)
+        record.command = self._guarded(command if self._is_ours(state, status) else None, record)
+        if record.command is not None:
+            ready = perf_counter()
+            parts.backend.send(record.command, record.time)
+            parts.spent["send"] = perf_counter() - ready
+            parts.spent["total"] = perf_counter() - begin
+        self._note_hover(estimate, record.command if hovers else None)
+        if record.release:
+            parts.backend.release(parts.latch.trip(record.time, estimate.goal_w))
+        if state == State.ABORT and parts.machine.flown:
+            end = parts.backend.surrender if parts.machine.handed_back else parts.backend.abort
+            end(record.time)
+
+    def warm_up(self, vehicle: BodyState | None = None) -> None:
+        """Call the policy a few times on a copy: the first calls are slow."""
+        pilot, params = copy.copy(self.parts.pilot), self.parts.params
+        pos = np.array([params.home_w if vehicle is None else vehicle.pos])
+        level, zero = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
+        payload_w, goal_w = pos - [0.0, 0.0, self.parts.hang], np.array(params.goal_w)
+        for _ in range(WARM_CALLS):
+            pilot.act(pos, level, zero, zero, payload_w, goal_w)
+
+    def _change_state(self, estimate: Estimate, previous: str, state: str) -> None:
+        parts, now, latch = self.parts, estimate.time, self.parts.latch
+        if previous == State.THROW:
+            # Where commands act late, a fast mechanism gets its command only after the policy's
+            # own time of separation.
+            latched = state == State.RECOVER and latch.at is not None
+            self._release_end = latch.command_time if latched else now
+        if state == State.ARMED:
+            latch.rearm()
+            parts.backend.rearm()
+            self.warm_up(estimate.vehicle)
+        if state == State.THROW:
+            parts.pilot.start()
+            latch.begin(now)
+            parts.aim.begin()
+        if state in (State.READY, State.RECOVER) and previous in (State.CHECK, State.THROW):
+            parts.hovering.hold(parts.params.home_w)
+        if state in (State.LAND, State.ABORT) and estimate.vehicle is not None:
+            parts.hovering.hold(estimate.vehicle.pos)
+
+    def _wanted_command(self, estimate: Estimate, record: TickRecord) -> Command | None:
+        """Return the command of a state, before the guard; None for none."""
+        parts, state = self.parts, record.state
+        if state not in FLYING and state != State.ABORT:
+            return None
+        mass = parts.mass if parts.carries_payload(estimate) else parts.vehicle_mass
+        if not estimate.is_flyable:
+            if state == State.ABORT and record.time - parts.machine.since > LEVEL_TIME:
+                return None
+            record.note = "level: no fresh pose"
+            return (mass * GRAVITY, 0.0, 0.0, 0.0)
+        if state == State.THROW:
+            return self._throw(estimate, record)
+        if state in (State.LAND, State.ABORT):
+            parts.hovering.descend()
+        return parts.hovering.command(estimate.vehicle, mass)
+
+    def _throw(self, estimate: Estimate, record: TickRecord) -> Command:
+        """Return the policy's command, and note whether its release is executed."""
+        parts = self.parts
+        output = self._run_policy(estimate, record)
+        if output.release[0] and parts.latch.at is None:
+            problem = self._release_problem(estimate)
+            record.release = problem is None
+            if problem is not None:
+                record.note = f"release refused: {problem}"
+                parts.pilot.not_released()
+        return tuple(map(float, output.command[0]))
+
+    def _release_problem(self, estimate: Estimate) -> str | None:
+        """Return why the payload must not be released now, or None."""
+        fence, payload = self.parts.params.fence, estimate.payload
+        violation = box_violation(payload.pos, fence.payload_low, fence.payload_high)
+        if violation is not None:
+            return f"payload {violation}"
+        return self.parts.aim.miss(estimate.time, payload, estimate.goal_w)
+
+    def _run_policy(self, estimate: Estimate, record: TickRecord) -> PilotOutput:
+        """Run the policy on the estimate, and note its input and output."""
+        parts, vehicle, now = self.parts, estimate.vehicle, record.time
+        keypoints = None if parts.detections is None else parts.detections.keypoints(now)
+        output: PilotOutput = parts.pilot.act(
+            np.array([vehicle.pos]),
+            np.array([vehicle.quat]),
+            np.array([vehicle.vel]),
+            np.array([vehicle.rate]),
+            np.array([estimate.payload.pos]),
+            np.array(estimate.goal_w),
+            not parts.latch.separated(now),
+            keypoints,
+            now,
+        )
+        parts.spent["observation"], parts.spent["policy"] = parts.pilot.spent
+        record.action = output.action[0].tolist()
+        record.observation = output.observation[0].tolist()
+        if output.keypoints is not None:
+            record.keypoints = output.keypoints[0].tolist()
+            record.valid = output.valid[0].tolist()
+        return output
+
+    def _add_sway(
+        self, estimate: Estimate, status: Status, command: Command | None, record: TickRecord
+    ) -> Command | None:
+        """Return the command with the sway of a calibration, and give the calibration what came in
+        this tick.
+        """
+        parts, calibrating, now = self.parts, self.parts.calibrating, record.time
+        result, self.calibration = self.calibration, None
+        if result is not None:
+            calibrating.take(result)
+            record.calibration = result if isinstance(result, str) else result.values()
+            if isinstance(result, Calibration):
+                parts.detections.correct(result)
+        follows = record.state == State.READY and status.mode == FOLLOW
+        if command is None or not (follows and estimate.is_complete and estimate.has_attitude):
+            calibrating.stop()
+            return command
+        thrust, roll, pitch, yaw = command
+        calm = parts.is_calm(estimate, holding=False)
+        added_roll, added_pitch = calibrating.rates(now, calm, estimate.goal_w)
+        if record.detection is not None and parts.detections.fresh is not None:
+            stamp, points, valid = parts.detections.fresh
+            age = now - estimate.shown_age - stamp
+            calibrating.note(now, estimate.vehicle, thrust, points, valid, age)
+        return (thrust, roll + added_roll, pitch + added_pitch, yaw)
+
+    def _ask_mode(self, estimate: Estimate, state: str, status: Status) -> None:
+        """Ask the autopilot to follow, or to hold and land by itself where it can."""
+        parts, backend, now = self.parts, self.parts.backend, estimate.time
+        if state in (State.READY, State.ARMED, State.THROW):
+            backend.ask(FOLLOW, now)
+            if status.mode != FOLLOW:
+                parts.hovering.reset()
+        elif state == State.RECOVER and backend.holds:
+            vehicle = estimate.vehicle
+            lost = vehicle is None or estimate.vehicle_level >= HOLD
+            if lost or can_hand_over(vehicle) or status.mode == HOLDING:
+                backend.ask(HOLDING, now)
+        elif state == State.LAND and backend.holds:
+            backend.ask(LAND, now)
+
+    def _is_ours(self, state: str, status: Status) -> bool:
+        """Return whether commands are sent: not to a vehicle that was handed or taken over, that
+        hears nothing or was never ours.
+        """
+        hovers = state in (State.READY, State.ARMED)
+        if self.parts.machine.handed_back or (status.mode in (HOLDING, LAND) and not hovers):
+            return False
+        return state != State.ABORT or (status.connected and self.parts.machine.flown)
+
+    def _guarded(self, command: Command | None, record: TickRecord) -> Command | None:
+        """Return a command within its limits; one that is not finite ends the run."""
+        if command is None:
+            self.guard.reset()
+            return None
+        limited = self.guard.check(command)
+        if limited is None:
+            machine, failure = self.parts.machine, f"command {command} is not finite"
+            machine.step(record.time, Inputs(ABORT, ABORT, failure=failure))
+            record.state, record.reason = machine.state.value, machine.reason
+            record.release = False
+            self.parts.backend.stop_release()
+        return limited
+
+    def _note_hover(self, estimate: Estimate, command: Command | None) -> None:
+        """Note the command of a tick in which the vehicle hovered by ours; None for another one."""
+        parts = self.parts
+        share = None if command is None else command[0] / (parts.mass * GRAVITY)
+        parts.hovering.note(share)
+        if parts.response is None:
+            return
+        if command is not None and estimate.has_attitude:
+            parts.response.note(command, estimate.vehicle)
+        else:
+            parts.response.pause()

@@ -1,0 +1,165 @@
+"""Decide: the second step of a tick, from what is known to the state that is acted in."""
+
+from collections import deque
+
+from hil.control.safety import failed_checks, fence_violation
+from hil.control.states import Inputs, OperatorInput, State, TickRecord
+from hil.control.tick.body_estimate import Estimate
+from hil.control.tick.flight_parts import FlightParts
+from hil.links.backends.base import FAILED, FOLLOW, PENDING, Status
+from hil.links.backends.base import HOLD as HOLDING
+from hil.poses.gate import HOLD
+from hil.poses.pose import GOAL
+from visthrow.onboard.hover import GRAVITY
+
+GROUND = 0.12  # height of the vehicle that counts as landed [m]
+# reports that the autopilot's hover thrust is averaged over, and kept; share of the weight below
+# which it stands on the ground
+FEWEST_REPORTS, MOST_REPORTS, GROUND_SHARE = 25, 50, 0.3
+
+
+class Decider:
+    """Moves the state machine on.
+
+    Attributes:
+        inputs: of the machine at the last tick; None before it.
+        rivals: bodies or autopilots that two senders speak for, in words; see
+            `hil.links.roster.Roster`.
+    """
+
+    def __init__(self, parts: FlightParts) -> None:
+        """Start before the first tick."""
+        self.parts = parts
+        self.inputs: Inputs | None = None
+        self.rivals: list[str] = []
+        self._shares: deque[float] = deque(maxlen=MOST_REPORTS)  # autopilot's thrust over weight
+
+    def decide(
+        self, estimate: Estimate, status: Status, words: OperatorInput, recording: bool
+    ) -> TickRecord:
+        """Return the record of a tick with its state and reason."""
+        machine = self.parts.machine
+        self.inputs = inputs = self._inputs(estimate, status, words, recording)
+        state = machine.step(estimate.time, inputs)
+        waits = machine.waits(inputs)
+        record = TickRecord(estimate.time, state.value, machine.reason, waits=waits)
+        if inputs.streams:
+            record.rivals = self.rivals or None
+        return record
+
+    def _inputs(
+        self, estimate: Estimate, status: Status, words: OperatorInput, recording: bool
+    ) -> Inputs:
+        parts, now = self.parts, estimate.time
+        state, latch, vehicle = parts.machine.state, parts.latch, estimate.vehicle
+        failure, fence, calm = status.fault, None, False
+        if status.release == FAILED and state in (State.THROW, State.RECOVER):
+            failure = "the release was refused or not answered"
+        checks = self._failed_checks(estimate, status)
+        if vehicle is not None:
+            # A release that is not answered yet may still happen.
+            if state in (State.ARMED, State.RECOVER) and status.release != PENDING:
+                calm = parts.is_calm(estimate, status.mode == HOLDING)
+            # A landing crosses the fence's floor on purpose.
+            if state is not State.LAND:
+                hanging = estimate.payload if latch.at is None else None
+                fence = fence_violation(parts.params.fence, vehicle, hanging)
+        return Inputs(
+            estimate.vehicle_level,
+            estimate.payload_level,
+            connected=status.connected,
+            failed_checks=tuple(checks),
+            fence=fence,
+            calm=calm,
+            separated=latch.separated(now),
+            released=latch.at is not None,
+            lost=latch.at is None and not parts.carries_payload(estimate),
+            astray=parts.aim.given_up(now),
+            grounded=vehicle is not None and vehicle.pos[2] < GROUND,
+            failure=failure,
+            arm=words.arm,
+            land=words.land,
+            abort=words.abort,
+            recording=recording,
+            following=status.mode == FOLLOW,
+            note=status.note,
+            why=words.why,
+            streams=tuple(self._stream_problems(now)),
+            disagrees=None if parts.response is None else parts.response.problem,
+        )
+
+    def _failed_checks(self, estimate: Estimate, status: Status) -> list[str]:
+        """Return the failed pre-throw checks, in words."""
+        parts, params, state = self.parts, self.parts.params, self.parts.machine.state
+        # After a throw the payload may have been attached again; only the operator's next word
+        # resets the latch.
+        thrown = state is State.THROW or (parts.latch.at is not None and state is not State.READY)
+        if thrown or not estimate.is_complete:
+            return ["a body has no pose yet"]
+        checks = failed_checks(
+            params.check,
+            params.fence,
+            estimate.vehicle,
+            estimate.payload,
+            estimate.goal_w,
+            params.home_w,
+            parts.hang,
+        )
+        if estimate.goal_level >= HOLD:
+            checks.append("the goal's pose is stale")
+        self._note_thrust(status)
+        checks += self.thrust_problems()
+        if parts.detections is not None and state in (State.READY, State.ARMED):
+            checks += parts.detections.problems(estimate.time)
+            if parts.calibrating is not None:
+                checks += parts.calibrating.problems()
+        return checks
+
+    def _note_thrust(self, status: Status) -> None:
+        """Note the thrust that the autopilot hovers with by itself, until the take-over."""
+        if status.thrust is None or self.parts.machine.flown:
+            self._shares.clear()
+        else:
+            self._shares.append(status.thrust / (self.parts.mass * GRAVITY))
+
+    def thrust_problems(self) -> list[str]:
+        """Return whether hovering takes another thrust than the weight, the autopilot's own hover
+        before the take-over, then ours: the calibration is wrong, the vehicle another, or the
+        battery low.
+        """
+        parts, flown, problems = self.parts, self.parts.machine.flown, []
+        ratio, tolerance = parts.hovering.share(), parts.thrust_tolerance
+        if len(self._shares) >= FEWEST_REPORTS:
+            ratio = sum(self._shares) / len(self._shares)
+        wrong = ratio is not None and abs(ratio - 1.0) > tolerance
+        if wrong and (flown or ratio > GROUND_SHARE):
+            hover = "hovering takes" if flown else "its own hover takes"
+            problems.append(
+                f"{hover} {ratio:.2f} times the weight, within {tolerance:g} of 1 expected:"
+                " calibrate the thrust, or weigh the vehicle"
+            )
+        if flown and parts.response is not None and parts.response.running:
+            problems.append("its response to body rates is being checked")
+        return problems
+
+    def _stream_problems(self, now: float) -> list[str]:
+        """Return what is wrong with the streams of poses; nothing after the take-over."""
+        if self.parts.machine.state not in (State.IDLE, State.CHECK):
+            return []
+        problems = [
+            f"{body}: {text}"
+            for body, track in self.parts.tracks.items()
+            if body != GOAL
+            for text in track.stream.problems(now)
+        ]
+        return problems + self.rivals
+
+    def problems(self) -> list[str]:
+        """Return what forbids the take-over of the vehicle, as of the last tick."""
+        inputs, tracks = self.inputs, self.parts.tracks
+        if inputs is None:
+            return ["no tick has run yet"]
+        missing = [f"no good pose of the {n}" for n, t in tracks.items() if not t.accepted]
+        if missing:
+            return [*missing, *inputs.streams]
+        return [*inputs.missing(), *inputs.streams, *inputs.failed_checks]
