@@ -14,9 +14,9 @@ def latch_of(**changes) -> Latch:
     return Latch(LAG, **numbers | changes)
 
 
-@pytest.mark.parametrize(("later", "wait"), [(0.0, 0.02), (0.01, 0.03)])
-def test_a_faster_mechanism_is_commanded_so_much_later(later, wait):
-    latch = latch_of(later=later)
+@pytest.mark.parametrize(("delay", "wait"), [(0.0, 0.02), (0.01, 0.03)])
+def test_a_faster_mechanism_is_commanded_so_much_later(delay, wait):
+    latch = latch_of(command_delay=delay)
     assert latch.trip(1.0, ORIGIN) == pytest.approx(1.0 + wait)
     assert [latch.separated(1.0 + dt) for dt in (0.0, 0.049, 0.05)] == [False, False, True]
 
@@ -32,12 +32,12 @@ def test_a_mechanism_as_slow_as_the_lag_is_taken_and_a_slower_one_refused():
 def test_a_payload_that_stays_at_the_ropes_end_was_not_released(distance, axis):
     latch = latch_of()
     place = tuple(distance if i == axis else 0.0 for i in range(3))
-    assert latch.hangs_still(0.0, ORIGIN, place) == (distance < HANG + TOLERANCE)
+    assert latch.payload_hangs(0.0, ORIGIN, place) == (distance < HANG + TOLERANCE)
     latch.trip(1.0, ORIGIN)
     due = 1.0 + LAG + STUCK_AFTER
-    assert not latch.hangs_still(due - 0.01, ORIGIN, place), "it may be about to leave"
-    assert not latch.hangs_still(due + 0.01, ORIGIN, None)
+    assert not latch.payload_hangs(due - 0.01, ORIGIN, place), "it may be about to leave"
+    assert not latch.payload_hangs(due + 0.01, ORIGIN, None)
     near = abs(distance - HANG) < TOLERANCE
-    assert latch.hangs_still(due + 0.01, ORIGIN, place) == near
-    latch.hangs_still(due + 0.03, ORIGIN, place)
+    assert latch.payload_hangs(due + 0.01, ORIGIN, place) == near
+    latch.payload_hangs(due + 0.03, ORIGIN, place)
     assert latch.stuck == near, "each throw counts once"

@@ -9,7 +9,7 @@ from hil.poses.gate import ABORT, HOLD, OK, WARN
 
 TICK = 0.125  # [s]; a power of two, so that times are exact
 PARAMS = StateParams(4.0, 5.0, 0.5, 6.0, 3.0, 1.0, 0.5, 2.0, 3.0, 4.0, 1.5)
-GOOD = Inputs(OK, OK, still=True)
+GOOD = Inputs(OK, OK, calm=True)
 WAYS = {
     "idle": [],
     "check": ["check"],
@@ -58,9 +58,9 @@ STAYS = {
         {"arm": True, "failed_checks": ("tilted",)},
         {"arm": True, "payload": HOLD},
     ],
-    "armed": [{"still": False}, {"failed_checks": ("tilted",)}],
+    "armed": [{"calm": False}, {"failed_checks": ("tilted",)}],
     "throw": [{}, {"released": True, "payload": HOLD}, {"released": True, "lost": True}],
-    "recover": [{"still": False}],
+    "recover": [{"calm": False}],
 }
 
 
@@ -96,7 +96,7 @@ def test_what_keeps_a_state_keeps_it_until_its_time_is_over(state, given):
         ("throw", {"lost": True}, "recover", TICK),
         ("throw", {"astray": True}, "recover", TICK),
         ("recover", {"released": True}, "land", 0.625),
-        ("recover", {"land": True, "still": False}, "land", TICK),
+        ("recover", {"land": True, "calm": False}, "land", TICK),
         ("recover", {"released": True, "fence": "x"}, "land", TICK),
     ],
 )
@@ -108,8 +108,8 @@ def test_what_leads_on_and_when(state, given, follows, seconds):
 
 def test_quiet_must_last_without_a_break():
     walk = Walk("armed")
-    walk.after(1.0, still=False)
-    assert [walk.after(0.375), walk.after(TICK, still=False)] == ["armed", "armed"]
+    walk.after(1.0, calm=False)
+    assert [walk.after(0.375), walk.after(TICK, calm=False)] == ["armed", "armed"]
     assert [walk.after(0.5), walk.after(TICK)] == ["armed", "throw"]
 
 
