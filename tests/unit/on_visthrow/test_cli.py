@@ -116,7 +116,7 @@ def test_help_imports_nothing_heavy():
 
 
 def test_help_of_train_names_the_policies_that_the_readme_shows():
-    shown = re.findall(r"^\| (\w+): ", (ROOT / "README.md").read_text(), re.MULTILINE)
+    shown = re.findall(r"^\| `(\w+)` ", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert shown == ["state", "vision", "vision_located"]
     assert set(shown) <= set(re.findall(r"\w+", run("train", "--help").stdout))
 
