@@ -50,33 +50,38 @@ def crossed(trained: str) -> list[list[str]]:
     return [throws(f"state_fast-{trained}", solver) for solver in CROSSED]
 
 
+FEWER = ["--set", "ppo.environments=8192"]
 Work = list[tuple[list[list[str]], float, float]]
-WORK: list[Work] = [
-    [([rates("physx", counts=("65536",))], 900.0, 0.0)],
-    [
-        ([rates("mujoco_warp")], 130.0, 0.0),
-        ([training("state_two_cables", "mujoco_warp")], 900.0, 50.0),
-        ([throws("state_two_cables-mujoco_warp", "mujoco_warp")], 110.0, 0.0),
+WORK: dict[str, Work] = {
+    "mujoco": [
+        (
+            [
+                training(name, "mujoco_warp") + FEWER
+                for name in ("state_two_cables", "state_box", "state_fast")
+            ],
+            900.0,
+            140.0,
+        ),
+        ([rates("mujoco_warp")], 85.0, 0.0),
+        (
+            [throws(f"{x}-mujoco_warp", "mujoco_warp") for x in ("state_two_cables", "state_box")]
+            + [throws("state_fast-mujoco_warp", solver) for solver in ("mujoco_warp", "chain")],
+            110.0,
+            0.0,
+        ),
     ],
-    [
-        ([training("state_fast", "mujoco_warp")], 900.0, 50.0),
-        (crossed("mujoco_warp"), 110.0, 0.0),
-    ],
-    [
-        ([training("state_box", "mujoco_warp")], 900.0, 50.0),
-        ([throws("state_box-mujoco_warp", "mujoco_warp")], 110.0, 0.0),
-    ],
-]
-"""Of each card: commands that run at once, the time that they may take [s], and the time that they
+    "physx": [([rates("physx", counts=("65536",))], 900.0, 0.0)],
+}
+"""Of a card: commands that run at once, the time that they may take [s], and the time that they
 must leave for what comes after them [s]."""
 
 
-def work(card: int, out: Path, until: float) -> None:
-    """Do one card's commands, group after group; what outlasts its time is ended."""
-    env = {**os.environ, "CUDA_VISIBLE_DEVICES": str(card), "PYTHONUNBUFFERED": "1"}
+def work(name: str, card: str, out: Path, until: float) -> None:
+    """Do the commands of a name on a card; what outlasts its time is ended."""
+    env = {**os.environ, "CUDA_VISIBLE_DEVICES": card, "PYTHONUNBUFFERED": "1"}
     changes: list[str] = []
-    with open(out / f"card{card}.log", "w") as log:
-        for group, most, reserve in WORK[card]:
+    with open(out / f"{name}.log", "w") as log:
+        for group, most, reserve in WORK[name]:
             limit = min(most, until - time.time() - reserve)
             if f"throws-{PROBE}" in " ".join(group[0]):
                 changes = probe(group[0], limit, out, env, log)
@@ -137,12 +142,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seconds", type=float, default=430.0, help="for all of it")
+    parser.add_argument("--only", nargs="+", default=list(WORK), choices=list(WORK))
     args = parser.parse_args()
+    devices = os.environ.get("CUDA_VISIBLE_DEVICES", "0,1,2,3").split(",")
     args.out.mkdir(parents=True, exist_ok=True)
     until = time.time() + args.seconds
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        cards = [threading.Thread(target=work, args=(n, place, until)) for n in range(len(WORK))]
+        cards = [
+            threading.Thread(target=work, args=(name, card, place, until))
+            for name, card in zip(args.only, devices)
+        ]
         for card in cards:
             card.start()
         for card in cards:
