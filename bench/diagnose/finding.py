@@ -113,15 +113,24 @@ class Kind:
         )
 
 
-def kinds(rng: np.random.Generator, count: int = 7) -> list[Kind]:
-    """Draw a ``count`` of single effects, a pair, a law, lost commands and two with nothing hidden,
-    anew in every run.
+def kinds(rng: np.random.Generator) -> list[Kind]:
+    """Seven single effects, a pair, a law, lost commands and two with nothing hidden, drawn anew in
+    every run.
     """
-    singles = [Kind((str(name),), "rod") for name in rng.permutation(SINGLE)[:count]]
+    singles = [Kind((str(name),), "rod") for name in rng.permutation(SINGLE)[:7]]
     singles[-1] = replace(singles[-1], plant="string")
     pair = Kind(tuple(map(str, rng.choice(PAIRED, 2, replace=False))), "rod")
     law = Kind((str(rng.choice(UNKNOWN_LAWS)),), "rod")
     return [*singles, pair, law, Kind((), "rod", lost=LOST), Kind((), "rod"), Kind((), "string")]
+
+
+def draw_few(rng: np.random.Generator) -> list[Kind]:
+    """Draw some of the kinds: two single effects, one of them on the string, either the law or the
+    pair and lost commands, and one with nothing hidden.
+    """
+    *singles, pair, law, lost, nothing, _ = kinds(rng)
+    either = [[law], [pair, lost]][rng.integers(2)]
+    return [singles[0], singles[-1], *either, nothing]
 
 
 def right(recipe: Recipe, verdict: dict) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from sim.kernels.state import COLLISION, NONFINITE
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions, observations
@@ -181,30 +182,44 @@ def test_reward_terms_by_hand():
     assert rewards.proximity(p, torch.tensor([0.35]), 0.25).item() == 0.0
 
 
-def test_ends_of_an_episode():
+SAFE = {"pos": (0.0, 0.0, 1.3), "payload": (0.0, 0.0, 0.9), "tilt": 0.0, "time": 1.0, "status": 0}
+ENDS = [  # what is changed, to a value just inside and just outside; whether it counts once latched
+    ("pos", (0.0, 0.0, 2.999), (0.0, 0.0, 3.001), True),
+    ("pos", (0.0, 0.0, 0.501), (0.0, 0.0, 0.499), True),
+    ("pos", (2.999, 0.0, 1.3), (3.001, 0.0, 1.3), True),
+    ("pos", (0.0, -2.999, 1.3), (0.0, -3.001, 1.3), True),
+    ("pos", (-2.12, 2.12, 1.3), (-2.13, 2.13, 1.3), True),
+    ("tilt", 99.9, 100.1, False),
+    ("payload", (0.3, 0.0, 1.299), (0.3, 0.0, 1.301), False),
+    ("payload", (0.0, 0.0, 0.041), (0.0, 0.0, 0.039), False),
+    ("time", 4.98, 5.0, False),
+    ("status", 0, COLLISION, True),
+    ("status", 0, NONFINITE, True),
+]
+
+
+@pytest.mark.parametrize(("name", "inside", "outside", "always"), ENDS)
+def test_an_end_of_an_episode_just_inside_and_just_outside(name, inside, outside, always):
     bounds = experiment().task.bounds
-    pos = torch.tensor([[0, 0, 1.3], [0, 0, 0.4], [0, 0, 3.1], [2.5, 2.5, 1.3], [0, 0, 1.3]])
-    height, far = (mask.tolist() for mask in terminations.out_of_bounds(bounds, pos).values())
-    assert height == [False, True, True, False, False]
-    assert far == [False, False, False, True, False]
-    level = torch.eye(3).expand(5, 3, 3)
-    low = pos - torch.tensor([0.0, 0.0, 0.4])
-    status = torch.tensor([0, 0, 0, 0, 4], dtype=torch.int32)
-    free = torch.zeros(5, dtype=torch.bool)
-    ended = terminations.negative(
-        bounds, pos, level, low, status, free, torch.full((5,), 1.0), 0.04
-    )
-    assert ended.tolist() == [False, True, True, True, True]
-    above = pos + torch.tensor([0.0, 0.0, 0.1])
-    fine = torch.zeros(5, dtype=torch.int32)
-    for latched, expected in (
-        (free, True),
-        (~free, False),
-    ):  # once latched, only collision and bounds count
-        got = terminations.negative(
-            bounds, pos[:1], level[:1], above[:1], fine[:1], latched[:1], torch.tensor([5.0]), 0.04
+    for value, ends in ((inside, False), (outside, True)):
+        case = SAFE | ({"payload": (0.0, 0.0, 0.4)} if name == "pos" else {}) | {name: value}
+        tilt = math.radians(case["tilt"])
+        turned = torch.eye(3)[None].clone()
+        turned[0, 1:, 1:] = torch.tensor(
+            [[math.cos(tilt), -math.sin(tilt)], [math.sin(tilt), math.cos(tilt)]]
         )
-        assert got.item() is expected
+        for latched in (False, True):
+            ended = terminations.negative(
+                bounds,
+                torch.tensor([case["pos"]]),
+                turned,
+                torch.tensor([case["payload"]]),
+                torch.tensor([case["status"]], dtype=torch.int32),
+                torch.tensor([latched]),
+                torch.tensor([case["time"]]),
+                0.04,
+            )
+            assert ended.item() == (ends and (always or not latched))
 
 
 def test_commands_and_their_inverse():

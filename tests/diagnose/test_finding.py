@@ -33,7 +33,7 @@ def suite():
     """Kinds of worlds and the first seed, drawn by the system and printed."""
     seed = int.from_bytes(os.urandom(4), "little")
     print(f"seed {seed}")
-    return finding.kinds(np.random.default_rng(seed), 3), seed
+    return finding.draw_few(np.random.default_rng(seed)), seed
 
 
 @pytest.fixture(scope="module")

@@ -136,6 +136,8 @@ def basalt(kind, **numbers):
 
 K = list(KB)
 RT = (-0.28, 0.07, 2e-4, 2e-5)
+DISTORTED = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+RATIONAL = (0.5, -0.1, 0.0001, -0.0002, 0.01, 0.8, -0.05, 0.02)
 MEI = (1.9, -0.02, 0.1, 1e-4, 1e-4)
 POLY = dict(k2=-0.01, k3=-0.02, k4=0.004, k5=-0.003, k6=0.002, k7=-0.0004)
 WIDE = [FX, FY, CX, CY]
@@ -189,6 +191,14 @@ LENSES = {
             projection_parameters=dict(zip(["fx", "fy", "cx", "cy"], NARROW)),
         ),
         pinhole(*RT, f=NARROW[:2]),
+    ),
+    "camodocal pinhole full": (
+        camodocal(
+            "PINHOLE_FULL",
+            distortion_parameters=dict(zip(DISTORTED, RATIONAL)),
+            projection_parameters=dict(zip(["fx", "fy", "cx", "cy"], WIDE)),
+        ),
+        pinhole(*RATIONAL),
     ),
     "camodocal polyfisheye": (
         camodocal(
@@ -254,8 +264,8 @@ LENSES = {
     ),
     "ros rational": (
         f"height: {H}\nwidth: {W}\ndistortion_model: rational_polynomial\n"
-        f"d: [0.5, -0.1, 1.0e-4, -2.0e-4, 0.01, 0.8, -0.05, 0.02]\nk: {MATRIX}\n",
-        pinhole(0.5, -0.1, 1e-4, -2e-4, 0.01, 0.8, -0.05, 0.02),
+        f"d: {list(RATIONAL)}\nk: {MATRIX}\n",
+        pinhole(*RATIONAL),
     ),
     "opencv": (
         f"%YAML:1.0\n---\nimage_width: {W}\nimage_height: {H}\nfisheye_model: 1\n"

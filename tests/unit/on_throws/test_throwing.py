@@ -33,9 +33,9 @@ ENERGY_DRIFT = (
 JOIN = 2e-3  # [m]: what the ball moves at most between two samples beyond v dt, half g dt^2
 
 
-def dropping_policy(name: str = "state", release: float = 1.0) -> Policy:
+def dropping_policy(name: str = "state", release: float = 1.0, overrides=()) -> Policy:
     """A policy that hovers with fixed thrust and asks for the release at once."""
-    experiment = config.load(Experiment, config.find("train", name))
+    experiment = config.load(Experiment, config.find("train", name), overrides)
     contract = contract_of(experiment)
     weight = 9.81 * (
         experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass
@@ -182,15 +182,10 @@ def test_a_flights_modes_and_commands(flown):
 
 
 def test_a_flight_without_release_fails_and_recovers(tmp_path):
-    path = tmp_path / "holder.npz"
-    dropping_policy(release=-1.0).save(path)
-    loaded = load_policy(path)
-    bounds = dataclasses.replace(loaded.experiment.task.bounds, time_limit=0.3)
-    task = dataclasses.replace(loaded.experiment.task, bounds=bounds)
-    log = fly(
-        dataclasses.replace(loaded, experiment=dataclasses.replace(loaded.experiment, task=task)),
-        [1.0, 0.0, 0.0],
-    )
+    path, out = tmp_path / "holder.npz", tmp_path / "out"
+    dropping_policy(release=-1.0, overrides=["task.bounds.time_limit=0.3"]).save(path)
+    assert main(["fly", "--policy", str(path), "--target", "1.0", "--out", str(out)]) == 1
+    log = FlightLog.load(out / "flight.npz")
     assert not log.meta["result"]["success"]
     assert "no release within 0.3 s" in log.meta["result"]["failure"]
     assert "landing" not in log
@@ -205,12 +200,9 @@ def test_fly_writes_its_files(dropper, tmp_path, capsys):
                 "fly",
                 "--policy",
                 str(dropper),
-                "--target",
-                "0.5",
-                "--out",
-                str(out),
-                "--json",
-                str(out / "r.json"),
+                *("--target", "0.5", "0.3", "--seed", "4", "--out", str(out)),
+                *("--json", str(out / "r.json"), "--save", str(tmp_path / "saved.npz")),
+                *("--export", str(tmp_path / "flight.csv")),
             ]
         )
         == 0
@@ -218,7 +210,11 @@ def test_fly_writes_its_files(dropper, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "landing at x" in told
     assert {p.name for p in out.iterdir()} == {"flight.npz", "throw.rrd", "throw.png", "r.json"}
-    result = json.loads((out / "r.json").read_text())["result"]
+    figures = json.loads((out / "r.json").read_text())
+    result = figures["result"]
+    assert (figures["goal_w"], figures["seed"]) == ([0.5, 0.3, 0.0], 4)
+    assert load_policy(tmp_path / "saved.npz").policy.obs_dim == load_policy(dropper).policy.obs_dim
+    assert "pos_w" in (tmp_path / "flight.csv").read_text().splitlines()[0]
     assert f"{result['error']:.3f} m from the target" in told
     verified = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "throw.rrd")],
@@ -243,9 +239,9 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
         "--json",
         str(out / "c.json"),
     ]
-    assert main([*words, "--device", "cpu"]) == 0
+    assert main([*words, "--device", "cpu", "--seed", "3"]) == 0
     told = capsys.readouterr().out
-    assert "`hybrid`, seed 0" in told
+    assert "`hybrid`, seed 3" in told
     assert "No vehicle was flown" in told
     rows = list(csv.DictReader((out / "compare-hybrid.csv").open()))
     assert len(rows) == 10
@@ -383,7 +379,10 @@ def test_names_are_made_unique(dropper):
         (["compare", "DROPPER", "--throws", "0"], "--throws 0"),
         (["compare", "DROPPER", "--targets", "9"], "from 0 to 3 m"),
         (["compare", "DROPPER", "--targets", "1", "1"], "twice"),
+        (["compare", "DROPPER", "--targets", "3.01"], "from 0 to 3 m"),
+        (["compare", "DROPPER", "--targets", "-0.01"], "from 0 to 3 m"),
         (["compare", "DROPPER", "--plant", "real"], "no plant 'real'"),
+        (["compare", "DROPPER", "--calibrate", "--plant", "reference"], "--calibrate on plant"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, capsys):

@@ -155,6 +155,21 @@ def test_ctrl_c_is_status_130(command, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+def test_a_reader_that_goes_away_is_no_failure():
+    """As in ``visthrow config train | head -1``."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "visthrow.cli", "config", "vehicle", "paper"], stdout=subprocess.PIPE
+    )
+    child.stdout.close()
+    assert child.wait() == 0
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(command, tmp_path, capsys):
+    command(KeyboardInterrupt())
+    assert cli.main(["try", "--json", str(tmp_path)]) == 2
+    assert "it is a folder" in capsys.readouterr().err
+
+
 def test_a_missing_optional_package_names_the_extra(command, capsys):
     command(ModuleNotFoundError("No module named 'mujoco'", name="mujoco"))
     assert cli.main(["try"]) == 2
