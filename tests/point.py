@@ -18,10 +18,13 @@ HANG = 0.383
 
 
 class PointPlant(LevelPlant):
-    """See `hil.rehearsal.fake.WirePlant`; every mass is ``times`` the training's."""
+    """See `hil.rehearsal.fake.WirePlant`; every mass is ``times`` the training's, and yaw follows
+    with a time constant of its own [s].
+    """
 
-    def __init__(self, times: float = 1.0) -> None:
+    def __init__(self, times: float = 1.0, yaw_lag: float = LAG) -> None:
         super().__init__()
+        self._lags = np.array([LAG, LAG, LAG, yaw_lag])
         self.mass = tuple(times * mass for mass in LevelPlant.mass)
         self._pos, self._vel, self._quat = self.home_w.copy(), np.zeros(3), (0.0, 0.0, 0.0, 1.0)
         self._acts = np.array([self.mass[0] * GRAVITY, 0.0, 0.0, 0.0])
@@ -30,7 +33,7 @@ class PointPlant(LevelPlant):
         """See `WirePlant`."""
         super().step(command, release, after)
         dt = self.period
-        self._acts = self._acts + dt / LAG * (np.array(command) - self._acts)
+        self._acts = self._acts + dt / self._lags * (np.array(command) - self._acts)
         up = np.array(rotate_one(self._quat, (0.0, 0.0, 1.0)))
         hangs = bool(super().state["attached"])
         force = self._acts[0] / self.mass[0 if hangs else 1] * up

@@ -1,7 +1,13 @@
 """Compares a vehicle's response in its first hover with the commands.
 
-Poses show another weight, another thrust line or a reversed rate before the vehicle has sunk. A
-doublet of all three body rates makes it turn, so that signs show in a calm hover."""
+A vehicle of another weight, another thrust line, or with the sign of a rate turned is told from the
+policy's before it has sunk. A doublet of all three body rates makes it turn, so that signs are seen
+where it hovers calmly. An autopilot that reports its body rates is judged by them within a tenth of
+a second, against how they wander in its own hover. By poses alone that is not possible: in this
+time it turns by less than they scatter, so a doublet is judged when it was answered.
+
+An axis may be slower than the training's: it is judged by the time constant that explains its
+answer best, and doublets grow longer until it is known."""
 
 import math
 from collections import deque
@@ -13,93 +19,117 @@ from visthrow.common.rotations import rotate_one
 from visthrow.onboard.hover import GRAVITY
 
 AXES = ("roll", "pitch", "yaw")
-STROKE = 0.16  # of the doublet, one way, then the other [s]
-ROUNDS = 3  # doublets at most
-LAG = 0.05  # time constant of the response to a command [s]
+STROKES = (0.16, 0.32, 0.64)  # of the doublets, one way, then the other [s]
+LAGS = (0.05, 0.15, 0.45)  # time constants of an answer to a command that are tried [s]
 DEADS = 6
-"""Number of dead times that are tried [ticks]: real autopilots are half way after 25 to 100 ms. For
-each axis the one that explains most counts.
+"""Dead times before an answer that are tried, in ticks: real autopilots are half way after 25 to
+100 ms. Of an axis the pair of time constant and dead time counts that explains most.
 """
+RATE_NOISE = 0.01  # least change of a reported rate from tick to tick in a hover [rad/s]
+HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
+FEWEST_RATES = 4  # reported changes that a sign is taken from
 FALL, FALL_DEAD = 0.4, 2  # time over which the thrust is judged [s], its dead time in ticks
 ANGLE_NOISE, HEIGHT_NOISE = 0.006, 0.002  # of an attitude, a height between poses [rad], [m]
-CERTAIN, CERTAIN_SIGN = 4.0, 5.0  # significant deviations, in standard deviations of the noise
-FEWEST_HEIGHTS = 5  # for a vertical acceleration
+CERTAIN, CERTAIN_SIGN = 4.0, 5.0  # deviations of the noise beyond which something is known
+FEWEST_HEIGHTS = 5  # heights that a vertical acceleration is taken from
 
 
 class Response:
-    """Judges the first hover by our commands; ``problem`` says what disagrees, or is None."""
+    """Judges the first hover that is ours.
+
+    Attributes:
+        problem: what does not agree, in words; None so far.
+        reported: changes of its rates that the autopilot has reported.
+        time: that the vehicle has been ours and judged [s].
+    """
 
     def __init__(self, period: float, mass: float, tolerance: float, probe: float) -> None:
         """Wait for the first tick.
 
         Args:
-            period: between two ticks [s].
-            mass: of vehicle, rope and payload [kg].
-            tolerance: of the thrust, relative.
-            probe: rate of the doublets [rad/s]; with 0 the hover's own commands show the signs.
+            period: between two ticks [s]. mass: of vehicle, rope and payload [kg].
+            tolerance: of the thrust, relative. probe: rate of the doublets [rad/s]; 0: none, and
+                signs are judged by what the hover happens to command.
         """
         self._period, self._probe = period, probe
         self._mass, self._allowed = mass, tolerance * GRAVITY
         self.problem: str | None = None
         self._ticks = 0
+        strokes = [round(stroke / period) for stroke in STROKES]
+        self._signs = [sign for count in strokes for sign in [1] * count + [-1] * count]
+        self._ends = 2 * np.cumsum(strokes) + DEADS  # ticks at which a doublet was answered
         hover = np.array([mass * GRAVITY, 0.0, 0.0, 0.0])
         self._commands = deque([hover] * DEADS, maxlen=DEADS)  # the newest first
-        self._responses = np.tile(hover, (DEADS, 1))  # expected, by dead time [N, rad/s]
+        # expected now, by time constant and dead time [N, rad/s]
+        self._responses = np.tile(hover, (len(LAGS), DEADS, 1))
+        self._shares = 1.0 - np.exp(-period / np.array(LAGS))[:, None, None]
         self._last: BodyState | None = None
         self._speed = self._height = 0.0  # expected from the commands, upwards [m/s], [m]
         self._heights: list[float] = []  # above the expected ones [m]
-        self._agreement, self._noise = np.zeros((DEADS, 3)), np.full((DEADS, 3), 1e-9)
+        tried = (len(LAGS), DEADS, 3)
+        self._agreement, self._noise = np.zeros(tried), np.full(tried, 1e-9)
+        # of changes that were reported and those that commands lead to: their product, the squares
+        self._sums = np.full((3, *tried), 1e-9)
+        self._before = deque(maxlen=HOVERED)  # reported rates of the autopilot's own hover
+        self._reported: np.ndarray | None = None
+        self.reported = 0
         self._confirmed = np.zeros(3, dtype=bool)  # axes that turned as commanded
+
+    @property
+    def time(self) -> float:
+        return (self._ticks - 1) * self._period
 
     @property
     def running(self) -> bool:
         """Whether the first hover is still being judged."""
         return self._probe > 0.0 and self.problem is None and not self._confirmed.all()
 
-    @property
-    def _scores(self) -> np.ndarray:
-        """Return the evidence that each axis turns as commanded, in deviations, shape (3,)."""
-        scores = self._agreement / np.sqrt(self._noise)
-        best = np.abs(scores).argmax(axis=0)
-        return scores[best, np.arange(3)]
-
     def rates(self) -> tuple[float, float, float]:
-        """Return the doublet's body rates of this tick [rad/s]."""
-        strokes = math.floor(self._ticks * self._period / STROKE)
-        if not self.running or strokes >= 2 * ROUNDS:
+        """Return the doublet's body rates of this tick [rad/s]; of axes that are known, none."""
+        if not self.running or self._ticks >= len(self._signs):
             return (0.0, 0.0, 0.0)
-        return (self._probe * (1 - 2 * (strokes % 2)),) * 3
+        stroke = self._probe * self._signs[self._ticks]
+        return tuple(0.0 if known else stroke for known in self._confirmed)
 
-    def note(self, command: tuple[float, ...], vehicle: BodyState) -> None:
-        """Note a tick's command, thrust [N] and body rates [rad/s], and the vehicle's state."""
+    def note(
+        self,
+        command: tuple[float, ...],
+        vehicle: BodyState,
+        rates: tuple[float, ...] | None = None,
+    ) -> None:
+        """Note the command of a tick, thrust [N] and body rates [rad/s], where the vehicle is at
+        that tick, and the body rates that the autopilot last reported [rad/s].
+        """
         if self._confirmed.all() and self._ticks * self._period > FALL:
             return
         if self._last is not None:
             self._judge_thrust(vehicle)
-            self._judge_signs(vehicle)
+            self._judge_rates(rates)
+            self._judge_turns(vehicle)
         self._last = vehicle
         self._ticks += 1
         self._commands.appendleft(np.array(command))
-        share = 1.0 - math.exp(-self._period / LAG)
-        change = share * (np.array(self._commands) - self._responses)
+        change = self._shares * (np.array(self._commands) - self._responses)
         self._responses = self._responses + change
-        # sums of turns telescope: an attitude's noise counts once for each change of the rate
-        self._noise += (ANGLE_NOISE * change[:, 1:]) ** 2
+        # sums of turns telescope: the noise of an attitude counts as often as the rate changes
+        self._noise += (ANGLE_NOISE * change[..., 1:]) ** 2
 
-    def pause(self) -> None:
-        """Note a tick in which the vehicle did not follow our commands."""
+    def pause(self, rates: tuple[float, ...] | None = None) -> None:
+        """Note a tick in which nothing of ours was followed, and the rates reported then."""
         self._last = None
+        if rates is not None and not self._ticks:
+            self._before.append(rates)
 
     def _judge_thrust(self, vehicle: BodyState) -> None:
         if self._ticks * self._period > FALL:
             return
         up = rotate_one(vehicle.quat, (0.0, 0.0, 1.0))[2]
-        self._speed += (self._responses[FALL_DEAD, 0] / self._mass * up - GRAVITY) * self._period
+        self._speed += (self._responses[0, FALL_DEAD, 0] / self._mass * up - GRAVITY) * self._period
         self._height += self._speed * self._period
         self._heights.append(vehicle.pos[2] - self._height)
         if len(self._heights) < FEWEST_HEIGHTS:
             return
-        # initial position and velocity are as unknown as the acceleration
+        # place and speed at the beginning are as unknown as the acceleration that is looked for
         terms = np.vander(self._period * np.arange(len(self._heights)), 3)
         inverse = np.linalg.inv(terms.T @ terms)
         wrong = 2.0 * float((inverse @ terms.T @ np.array(self._heights))[0])
@@ -107,27 +137,64 @@ class Response:
         if abs(wrong) > self._allowed + CERTAIN * noise:
             motion = "sinks" if wrong < 0.0 else "rises"
             self.problem = (
-                f"thrust: the vehicle {motion} by {abs(wrong):.1f} m/s2 against its commands;"
-                " weight, hover share or slope is wrong"
+                f"thrust: the vehicle {motion} by {abs(wrong):.1f} m/s2 against its commands; weight, hover"
+                " share or slope is wrong"
             )
 
-    def _judge_signs(self, vehicle: BodyState) -> None:
-        self._agreement += self._responses[:, 1:] * turn_between(self._last.quat, vehicle.quat)
-        doublet = round(2.0 * STROKE / self._period)
-        if self._ticks < doublet + DEADS or (self._ticks - DEADS) % doublet:
-            return  # judged after the response to a whole doublet
-        self._confirmed |= self._scores > CERTAIN_SIGN
-        wrong = (self._scores < -CERTAIN_SIGN) & ~self._confirmed
+    def _judge_rates(self, rates: tuple[float, ...] | None) -> None:
+        """Judge by reported rates: by how each goes on from the last one, so that what the vehicle
+        did before it was ours does not count.
+        """
+        last, self._reported = self._reported, None if rates is None else np.array(rates)
+        if last is None or self._reported is None or (last == self._reported).all():
+            return
+        change = self._reported - last + self._shares * last
+        wanted = self._shares * np.array(self._commands)[:, 1:]
+        self._sums += [change * wanted, wanted**2, change**2 + 0.0 * wanted]
+        self.reported += 1
+        if self.reported < FEWEST_RATES:
+            return
+        product, expected, reported = self._sums
+        explains = np.abs(product / np.sqrt(expected * reported))
+        scores = product / np.sqrt(expected) / self._wandering()
+        self._judge(best_scores(scores, explains))
+
+    def _wandering(self) -> np.ndarray:
+        """Return how a reported rate changes by itself from tick to tick [rad/s]."""
+        if len(self._before) < 2:
+            return np.full((len(LAGS), 1, 3), RATE_NOISE)
+        before = np.array(self._before)
+        changes = before[1:] - before[:-1] + self._shares * before[:-1]
+        return np.maximum(np.sqrt((changes**2).mean(axis=1, keepdims=True)), RATE_NOISE)
+
+    def _judge_turns(self, vehicle: BodyState) -> None:
+        """Judge by poses, whenever all of a doublet was answered."""
+        self._agreement += self._responses[..., 1:] * turn_between(self._last.quat, vehicle.quat)
+        if self._ticks not in self._ends:
+            return
+        scores = self._agreement / np.sqrt(self._noise)
+        self._judge(best_scores(scores, np.abs(scores)))
+        if self.running and self._ticks == self._ends[-1]:
+            self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
+
+    def _judge(self, scores: np.ndarray) -> None:
+        """Take how surely each axis turns as it is told, in deviations, shape (3,)."""
+        self._confirmed |= scores > CERTAIN_SIGN
+        wrong = (scores < -CERTAIN_SIGN) & ~self._confirmed
         if self.problem is None and wrong.any():
             self.problem = (
                 f"{_names(wrong)}: the vehicle turns against its commands; a sign is wrong"
             )
-        elif self.running and self._ticks > ROUNDS * doublet:
-            self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
 
 
-def _names(mask: np.ndarray) -> str:
-    return ", ".join(np.array(AXES)[mask])
+def best_scores(scores: np.ndarray, explains: np.ndarray) -> np.ndarray:
+    """Return the score of each axis by the time constant and dead time that explain most."""
+    which = explains.reshape(-1, 3).argmax(axis=0)
+    return scores.reshape(-1, 3)[which, np.arange(3)]
+
+
+def _names(which: np.ndarray) -> str:
+    return ", ".join(axis for axis, one in zip(AXES, which) if one)
 
 
 def turn_between(first: tuple[float, ...], second: tuple[float, ...]) -> np.ndarray:

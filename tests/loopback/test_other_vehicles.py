@@ -25,13 +25,18 @@ SUNK = 0.1  # [m]
 LONGEST = 9.0  # a vehicle that is the policy's has thrown by then [s]
 
 
-def fly(kind, times=1.0, spoil=lambda fake: None):
+SLOW = 0.5  # time constant of a slow yaw [s]; half of a step after 0.35 s, as PX4's SIH has it
+AT_ONCE = 0.1  # in which a sign is seen by reported rates [s]
+BY_POSES = 0.5  # and by poses alone [s]
+
+
+def fly(kind, times=1.0, spoil=lambda fake: None, plant=None):
     """Fly until a run is refused, given back or thrown.
 
     Returns the runner, what it said, and how far the vehicle had sunk while it was ours [m].
     """
     taken = () if kind in ("betaflight", "crazyflie") else (f"{kind}.take=true",)
-    plant, waits = PointPlant(times), []
+    plant, waits = plant or PointPlant(times), []
     runner, source, clock, fake = peers(
         plant, kind=kind, loaded=NEVER, seed=3, overrides=(*QUICK, *taken)
     )
@@ -96,6 +101,19 @@ def test_the_policys_own_vehicle_throws(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_slow_yaw_is_not_a_dead_one(kind):
+    runner, said, _ = fly(kind, plant=PointPlant(yaw_lag=SLOW))
+    assert runner.machine.state is State.THROW, said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_yaw_that_does_not_turn_is_handed_back(kind):
+    runner, said, sunk = fly(kind, plant=PointPlant(yaw_lag=1e6))
+    require_refused(runner, said, sunk)
+    assert "handed back: yaw: the vehicle does not turn as commanded" in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
 def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, times):
     weight = 2.668 * times
@@ -127,6 +145,8 @@ def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)
     assert f"handed back: {AXES[axis]}: the vehicle turns against its commands" in said
+    most = AT_ONCE if runner.response.reported else BY_POSES
+    assert runner.response.time <= most + 1e-9
 
 
 @pytest.mark.parametrize("kind", KINDS)

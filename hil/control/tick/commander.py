@@ -90,7 +90,7 @@ class Commander:
             parts.backend.send(record.command, record.time)
             parts.spent["send"] = perf_counter() - ready
             parts.spent["total"] = perf_counter() - begin
-        self._note_hover(estimate, record.command if hovers else None)
+        self._note_hover(estimate, record.command if hovers else None, status.rates)
         if record.release:
             parts.backend.release(parts.latch.trip(record.time, estimate.goal_w))
         if state == State.ABORT and parts.machine.flown:
@@ -250,14 +250,18 @@ class Commander:
             self.parts.backend.stop_release()
         return limited
 
-    def _note_hover(self, estimate: Estimate, command: Command | None) -> None:
-        """Note the command of a tick in which the vehicle hovered by ours; None for another one."""
+    def _note_hover(
+        self, estimate: Estimate, command: Command | None, rates: tuple[float, ...] | None
+    ) -> None:
+        """Note the command of a tick in which the vehicle hovered by ours, None for another one,
+        and the body rates that the autopilot reported [rad/s].
+        """
         parts = self.parts
         share = None if command is None else command[0] / (parts.mass * GRAVITY)
         parts.hovering.note(share)
         if parts.response is None:
             return
         if command is not None and estimate.has_attitude:
-            parts.response.note(command, estimate.vehicle)
+            parts.response.note(command, estimate.vehicle, rates)
         else:
-            parts.response.pause()
+            parts.response.pause(rates)

@@ -4,6 +4,7 @@ link.
 Who flies is decided by the pilot. A mode that the runner did not ask for counts as a pilot who has
 taken over: the runner stops commanding and asks for nothing any more, an abort included."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,9 +24,10 @@ STREAM = (
     (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000),
     (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
     (mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000),
+    (mav.MAVLINK_MSG_ID_ATTITUDE, 20_000),
 )
 """Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust
-in hover, and the mode, which a heartbeat of 1 Hz tells up to a second late.
+in hover, the mode, which a heartbeat of 1 Hz tells up to a second late, and body rates.
 """
 
 COMMAND_VALUES = 7  # of COMMAND_LONG
@@ -173,6 +175,9 @@ class MavlinkAutopilot(Autopilot, ABC):
             self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
         elif kind == "PARAM_ERROR":
             self.audit.refuse(message.param_id, message.error)
+        elif kind == "ATTITUDE":
+            rates = (message.rollspeed, -message.pitchspeed, -message.yawspeed)
+            self.rates = rates if all(map(math.isfinite, rates)) else None
         elif kind == "ATTITUDE_TARGET":
             self.share, self._exact = message.thrust, True
         elif kind == "VFR_HUD" and not self._exact:  # in whole percent

@@ -41,6 +41,8 @@ class Status:
     )
     # that it hovers with by itself, by its own report and the calibration [N]; None: not known
     thrust: float | None = None
+    # body rates that it last reported [rad/s], x forward, y left, z up; None: it reports none
+    rates: tuple[float, ...] | None = None
 
 
 class Backend:
@@ -224,6 +226,7 @@ class Autopilot(Backend):
     Attributes:
         audit: of its settings. release_record: of this throw. texts: that it said, the newest last.
         share: last share of thrust that it reported, 0 to 1. voltage: of its battery [V].
+        rates: body rates that it last reported [rad/s], x forward, y left, z up.
     """
 
     audit = Audit()
@@ -231,6 +234,7 @@ class Autopilot(Backend):
     params: Any
     share: float | None = None
     voltage: float | None = None
+    rates: tuple[float, ...] | None = None
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -256,7 +260,7 @@ class Autopilot(Backend):
             thrust = self.params.thrust.thrust(self.share, self.voltage)
         reason = note or self._hint() or self.release_record.note
         good = not note and fault is None
-        return Status(good, reason, self.release_record.state, mode, fault, thrust)
+        return Status(good, reason, self.release_record.state, mode, fault, thrust, self.rates)
 
     def release(self, when: float) -> None:
         self.release_record.start(when)
