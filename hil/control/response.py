@@ -89,7 +89,7 @@ class Response:
         if not self.running or self._ticks >= len(self._signs):
             return (0.0, 0.0, 0.0)
         stroke = self._probe * self._signs[self._ticks]
-        return tuple(0.0 if known else stroke for known in self._confirmed)
+        return tuple(0.0 if confirmed else stroke for confirmed in self._confirmed)
 
     def note(
         self,
@@ -137,8 +137,8 @@ class Response:
         if abs(wrong) > self._allowed + CERTAIN * noise:
             motion = "sinks" if wrong < 0.0 else "rises"
             self.problem = (
-                f"thrust: the vehicle {motion} by {abs(wrong):.1f} m/s2 against its commands; weight, hover"
-                " share or slope is wrong"
+                f"thrust: the vehicle {motion} by {abs(wrong):.1f} m/s2 against its commands;"
+                " weight, hover share or slope is wrong"
             )
 
     def _judge_rates(self, rates: tuple[float, ...] | None) -> None:
@@ -149,8 +149,8 @@ class Response:
         if last is None or self._reported is None or (last == self._reported).all():
             return
         change = self._reported - last + self._shares * last
-        wanted = self._shares * np.array(self._commands)[:, 1:]
-        self._sums += [change * wanted, wanted**2, change**2 + 0.0 * wanted]
+        commanded = self._shares * np.array(self._commands)[:, 1:]
+        self._sums += [change * commanded, commanded**2, change**2 + 0.0 * commanded]
         self.reported += 1
         if self.reported < FEWEST_RATES:
             return
