@@ -1,5 +1,5 @@
 """Train three seeds of the state policy and one of the vision policy of a pair, a card each, and
-throw them under every condition of :data:`visthrow.cooperative.task.FAULTS`.
+throw them under every condition of :data:`visthrow.cooperative.team.FAULTS`.
 
 Writes a policy and a JSON file with curve and figures for each into a folder."""
 
@@ -26,8 +26,8 @@ def train_and_throw(args: argparse.Namespace) -> None:
     from visthrow import config
     from visthrow.common import provenance
     from visthrow.common.storage import write_json
-    from visthrow.cooperative.task import FAULTS, TeamExperiment
-    from visthrow.cooperative.training import TeamTraining, throw
+    from visthrow.cooperative.team import FAULTS, TeamExperiment
+    from visthrow.cooperative.team_training import TeamTraining, throw
 
     begin = time.time()
     path = config.find("cooperative", args.config)

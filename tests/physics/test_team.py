@@ -8,7 +8,7 @@ import pytest
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, PlantParams
 from tests.plants import paper_plant
-from visthrow.cooperative.plant import TeamSim
+from visthrow.cooperative.team_sim import TeamSim
 
 SAME_BITS = 2e-5
 """Sums in another order, float32, over half a second [m]."""

@@ -16,6 +16,7 @@ SCHEMAS = {
     "task": "visthrow.task:TaskParams",
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
+    "cooperative": "visthrow.cooperative.team:TeamExperiment",
     "fleet": "sim.fleet:FleetParams",
     "ppo": "visthrow.task:PPOParams",
     "sweep": "visthrow.paper.sweep:SweepList",

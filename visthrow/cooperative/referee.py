@@ -26,8 +26,8 @@ class MujocoTeam:
         if world.device != "cpu":
             raise ValueError(f"the referee on {world.device}; expected 'cpu'")
         self.world, self.team, self.worlds = world, team, world.count // team
-        pairs, of = world.models()
-        masses = [(pairs[of[row]][0].body, pairs[of[row]][1]) for row in range(world.count)]
+        pairs, kinds = world.models()
+        masses = [(pairs[kinds[row]][0].body, pairs[kinds[row]][1]) for row in range(world.count)]
         self._nominal = [_compile(masses[w * team : (w + 1) * team]) for w in range(self.worlds)]
         self._data = [mujoco.MjData(model) for model in self._nominal]
         self._repeats = max(round(world.substep / STEP), 1)
@@ -40,11 +40,11 @@ class MujocoTeam:
             wp.zeros(self.worlds, dtype=world.types.vec3) for _ in range(2)
         )
 
-    def place(self, state, mask) -> None:
-        self._state, w = state, self.world
+    def place(self, mask) -> None:
+        w, state = self.world, self.world.state
         wp.launch(self._kernel, w.count, [state, mask, self._rows, *self._arrays])
         pose, velocity, angles, rates = (array.numpy() for array in self._arrays)
-        spins, scale = state.rate_b.numpy(), state.mass_scale.numpy()
+        scale = state.mass_scale.numpy()
         load, load_vel = w.bodies.payload_pos_w.numpy(), w.bodies.payload_vel_w.numpy()
         placed = (mask.numpy() != 0).reshape(self.worlds, self.team).any(1)
         for world in np.flatnonzero(placed):
@@ -55,17 +55,16 @@ class MujocoTeam:
                 joint = model.joint(f"{k}_root")
                 body = model.body(f"{k}_vehicle").id
                 model.body_mass[body] = w.vehicles[row % len(w.vehicles)].body.mass * scale[row]
-                at, speed = joint.qposadr[0], joint.dofadr[0]
-                turn = pose[row, [6, 3, 4, 5]]
-                data.qpos[at : at + 7] = [*pose[row, :3], *turn]
-                data.qvel[speed : speed + 6] = [*velocity[row, :3], *spins[row]]
-                data.qpos[at + 7 : at + 7 + angles.shape[1]] = angles[row]
+                start, speed = joint.qposadr[0], joint.dofadr[0]
+                data.qpos[start : start + 7] = pose[row]
+                data.qvel[speed : speed + 6] = velocity[row]
+                data.qpos[start + 7 : start + 7 + angles.shape[1]] = angles[row]
                 data.qvel[speed + 6 : speed + 6 + rates.shape[1]] = rates[row]
             data.qpos[:3], data.qvel[:3] = load[row], load_vel[row]
             self._show(world)
 
     def advance(self, duration: float) -> None:
-        wrench, attached = self.world.wrench, self._state.attached.numpy()
+        wrench, attached = self.world.wrench, self.world.state.attached.numpy()
         force, torque = wrench.force_b.numpy(), wrench.torque_b.numpy()
         for world, data in enumerate(self._data):
             first = world * self.team
@@ -88,16 +87,16 @@ class MujocoTeam:
         for k in range(self.team):
             row = world * self.team + k
             joint = model.joint(f"{k}_root")
-            at, speed = joint.qposadr[0], joint.dofadr[0]
-            bodies.pos_w.numpy()[row] = data.qpos[at : at + 3]
-            bodies.quat_wb.numpy()[row] = data.qpos[[at + 4, at + 5, at + 6, at + 3]]
+            start, speed = joint.qposadr[0], joint.dofadr[0]
+            bodies.pos_w.numpy()[row] = data.qpos[start : start + 3]
+            bodies.quat_wb.numpy()[row] = data.qpos[[start + 4, start + 5, start + 6, start + 3]]
             bodies.vel_w.numpy()[row] = data.qvel[speed : speed + 3]
             bodies.rate_b.numpy()[row] = data.qvel[speed + 3 : speed + 6]
             first = model.body(f"{k}_rod0").id
             rods = slice(first, first + self.world.params.rope.segments)
-            along = -data.xmat[rods].reshape(-1, 3, 3)[:, :, 2]
-            bodies.cable_dir_w.numpy()[:, row] = along
-            bodies.cable_vel_w.numpy()[:, row] = np.cross(data.cvel[rods, :3], along)
+            directions = -data.xmat[rods].reshape(-1, 3, 3)[:, :, 2]
+            bodies.cable_dir_w.numpy()[:, row] = directions
+            bodies.cable_vel_w.numpy()[:, row] = np.cross(data.cvel[rods, :3], directions)
             bodies.payload_pos_w.numpy()[row] = data.qpos[:3]
             bodies.payload_vel_w.numpy()[row] = data.qvel[:3]
 
@@ -114,9 +113,9 @@ def _compile(members: list[tuple]) -> "mujoco.MjModel":
         load.add_joint(name=f"load_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
     for k, (body, rope) in enumerate(members):
         spec.attach(_vehicle(body, rope), prefix=f"{k}_", frame=spec.worldbody.add_frame())
-        held = spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"{k}_end", name2="load")
-        held.objtype, held.solref = mujoco.mjtObj.mjOBJ_SITE, list(STIFF)
-        held.solimp = [0.9999, 0.9999, 0.001, 0.5, 2.0]
+        hold = spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"{k}_end", name2="load")
+        hold.objtype, hold.solref = mujoco.mjtObj.mjOBJ_SITE, list(STIFF)
+        hold.solimp = [0.9999, 0.9999, 0.001, 0.5, 2.0]
     return spec.compile()
 
 

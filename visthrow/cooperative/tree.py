@@ -38,14 +38,14 @@ class TreeSolver:
         )
         self._place, self._advance = _kernels(world, team)
 
-    def place(self, state, mask) -> None:
-        self._state = state
-        inputs = [state, mask, self.world.bodies, self.load_pos_w, self.load_vel_w]
+    def place(self, mask) -> None:
+        w = self.world
+        inputs = [w.state, mask, w.bodies, self.load_pos_w, self.load_vel_w]
         wp.launch(self._place, self.worlds, inputs, device=self.world.device)
 
     def advance(self, duration: float) -> None:
         w = self.world
-        state = [self._state, self.load_pos_w, self.load_vel_w, w.bodies, w.wrench]
+        state = [w.state, self.load_pos_w, self.load_vel_w, w.bodies, w.wrench]
         inputs = [*w.packed, w.gravity, duration, *state]
         wp.launch(self._advance, self.worlds, inputs, device=w.device, block_dim=64)
 
@@ -99,12 +99,12 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
         c = rope.joint_damping
         out = vec3()
         rate = real(0.0)
-        at = first + i
+        rod = first + i
         if i > 0:
-            out += c * (viscous(n[at], n[at - 1], u[at - 1]) - u[at])
+            out += c * (viscous(n[rod], n[rod - 1], u[rod - 1]) - u[rod])
             rate += c
         if i < L - 1:
-            out += c * (viscous(n[at], n[at + 1], u[at + 1]) - u[at])
+            out += c * (viscous(n[rod], n[rod + 1], u[rod + 1]) - u[rod])
             rate += c
         return out, rate
 
@@ -142,9 +142,9 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
             load_mass += ropes[row % ropes.shape[0]].payload_mass
             for i in range(L):
                 rate = bodies.cable_vel_w[i, row]
-                at = k * L + i
-                n[at] = wp.normalize(bodies.cable_dir_w[i, row] + half * rate)
-                u[at] = rate
+                rod = k * L + i
+                n[rod] = wp.normalize(bodies.cable_dir_w[i, row] + half * rate)
+                u[rod] = rate
 
         acc = vec3()
         for _ in range(2):
@@ -166,16 +166,16 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 A = wp.inverse(mobility(p, rope, rot))
                 b = -(A * free(p, rope, rot, w, wrench.force_b[row], wrench.torque_b[row], g))
                 for i in range(L):
-                    at = k * L + i
-                    d = -n[at]
-                    rate = -(u[at] + half * swing[at])
+                    rod = k * L + i
+                    d = -n[rod]
+                    rate = -(u[rod] + half * swing[rod])
                     e1, e2 = tangent_basis(d)
                     a_d = A * d
                     a1 = A * e1
                     a2 = A * e2
                     c = real(0.5) * length
                     damping, friction = damped(rope, n, u, k * L, i)
-                    tension = wp.max(wp.dot(wrench.pull_w[row], n[at]), real(0.0))
+                    tension = wp.max(wp.dot(wrench.pull_w[row], n[rod]), real(0.0))
                     J = (
                         m * length * length / real(3.0)
                         + half * friction
@@ -191,18 +191,18 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                     g2 = wp.dot(e2, push)
                     b1 = (c * m) * e1 + length * a1
                     b2 = (c * m) * e2 + length * a2
-                    c1[at] = det * (s22 * b1 - s12 * b2)
-                    c2[at] = det * (s11 * b2 - s12 * b1)
-                    h1[at] = det * (s22 * g1 - s12 * g2)
-                    h2[at] = det * (s11 * g2 - s12 * g1)
+                    c1[rod] = det * (s22 * b1 - s12 * b2)
+                    c2[rod] = det * (s11 * b2 - s12 * b1)
+                    h1[rod] = det * (s22 * g1 - s12 * g2)
+                    h2[rod] = det * (s11 * g2 - s12 * g1)
                     b = (
                         b
                         - m * g
                         - square * ((c * m) * d + length * a_d)
-                        + h1[at] * b1
-                        + h2[at] * b2
+                        + h1[rod] * b1
+                        + h2[rod] * b2
                     )
-                    A = A + diagonal(m) - wp.outer(b1, c1[at]) - wp.outer(b2, c2[at])
+                    A = A + diagonal(m) - wp.outer(b1, c1[rod]) - wp.outer(b2, c2[rod])
                 A_all += A
                 b_all += b
             acc = -(wp.inverse(A_all) * b_all)
@@ -216,13 +216,13 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 rope = ropes[row % ropes.shape[0]]
                 a = acc
                 for j in range(L):
-                    at = k * L + (L - 1 - j)
-                    d = -n[at]
-                    rate = u[at] + half * swing[at]
+                    rod = k * L + (L - 1 - j)
+                    d = -n[rod]
+                    rate = u[rod] + half * swing[rod]
                     e1, e2 = tangent_basis(d)
-                    beta = e1 * (h1[at] - wp.dot(c1[at], a)) + e2 * (h2[at] - wp.dot(c2[at], a))
+                    beta = e1 * (h1[rod] - wp.dot(c1[rod], a)) + e2 * (h2[rod] - wp.dot(c2[rod], a))
                     outward = beta - wp.dot(rate, rate) * d
-                    swing[at] = -outward
+                    swing[rod] = -outward
                     a += rope.segment_length * outward
                 w = bodies.rate_b[row]
                 q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], w) * half)
@@ -248,9 +248,9 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
             out_pos = pos
             out_vel = vel
             for i in range(L):
-                at = k * L + i
-                rate = u[at] + h * swing[at]
-                direction = wp.normalize(bodies.cable_dir_w[i, row] + half * (u[at] + rate))
+                rod = k * L + i
+                rate = u[rod] + h * swing[rod]
+                direction = wp.normalize(bodies.cable_dir_w[i, row] + half * (u[rod] + rate))
                 rate = rate - direction * wp.dot(direction, rate)
                 bodies.cable_dir_w[i, row] = direction
                 bodies.cable_vel_w[i, row] = rate

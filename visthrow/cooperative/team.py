@@ -11,12 +11,12 @@ from sim.params import VehicleParams
 from visthrow import config
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 from visthrow.onboard import observations as ob
-from visthrow.task import Experiment, contract_of
+from visthrow.task import Experiment, Share, contract_of
 from visthrow.task.measurement import pilots_hover
 
 Range = tuple[NotNegative, NotNegative]
 
-OTHER = 9
+MESSAGE = 9
 """Width of what an actor sees of another vehicle: position from its own 3, rotation 6."""
 
 
@@ -34,6 +34,10 @@ class TeamParams(Bounded):
     margin: Positive = 0.1  # gap below which a step costs [m]
     margin_cost: NotNegative = 50.0  # for each metre less, a step
     contact_cost: NotNegative = 50.0  # of a contact, besides that of any negative end
+    # control step before which no latch trips at the beginning of a training: else the load is
+    # dropped at once; and the shares of the training between which it comes down to 0
+    first_release: Annotated[int, Bound(0)] = 20
+    free: tuple[Share, Share] = (0.1, 0.3)
     # vehicle 0 of the worlds: thrust against the controller's map, delay of its latch
     weak: Range = (1.0, 1.0)  # [-]
     late: Range = (0.0, 0.0)  # [s]
@@ -53,12 +57,12 @@ LEVELS = 20
 
 def layout_of(experiment: TeamExperiment) -> ob.Layout:
     """Layout of a member's observation: as of a single vehicle, then the others and their age."""
-    told = OTHER * (experiment.team.vehicles - 1) + 1
-    return dataclasses.replace(ob.layout_of(experiment.task.observation), setup=told)
+    messages = MESSAGE * (experiment.team.vehicles - 1) + 1
+    return dataclasses.replace(ob.layout_of(experiment.task.observation), setup=messages)
 
 
 def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
-    """Vehicles, releases and ropes of the rows, for :class:`visthrow.cooperative.plant.TeamSim`.
+    """Vehicles, releases and ropes of the rows, for :class:`visthrow.cooperative.team_sim.TeamSim`.
 
     A share ``faulty`` of :data:`LEVELS` worlds has a weak vehicle, as many a late latch, evenly
     over their ranges; they repeat.
@@ -69,8 +73,8 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
     for world in range(LEVELS):
         weak, late = world < faults, world >= LEVELS - faults
         part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
-        gain = _within(team.weak, part) if weak else 1.0
-        delay = _within(team.late, part) if late else 0.0
+        gain = _between(team.weak, part) if weak else 1.0
+        delay = _between(team.late, part) if late else 0.0
         for v in range(team.vehicles):
             vehicles.append(_weakened(vehicle, gain if v == 0 else 1.0))
             lag = release.lag + (delay if v == 0 else 0.0)
@@ -79,7 +83,7 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
     return {"vehicles": vehicles, "releases": releases, "ropes": ropes}
 
 
-def _within(interval: tuple[float, float], part: float) -> float:
+def _between(interval: tuple[float, float], part: float) -> float:
     low, high = interval
     return low + (high - low) * part
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
 
-from visthrow.cooperative.env import TeamEnv
-from visthrow.cooperative.task import TeamExperiment, as_flown, team_contract
+from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
+from visthrow.cooperative.team_env import TeamEnv
 from visthrow.onboard.policy import Policy
 from visthrow.training.device import rounded_products
 from visthrow.training.ppo.algorithm import PPOTraining, rsl_rl_config
@@ -44,6 +44,13 @@ class TeamTraining(PPOTraining):
             self._rollout()
         else:
             super().rollout()
+
+    def collect(self, done: float) -> None:
+        team = self.experiment.team
+        begin, end = team.free
+        left = min(max((end - done) / (end - begin), 0.0), 1.0)
+        self.env.earliest.fill_(round(left * team.first_release))
+        super().collect(done)
 
     def policy(self, made_by: dict[str, Any] | None = None) -> Policy:
         """The policy as it stands."""
@@ -87,7 +94,7 @@ def throw(
     flight counts as a contact.
 
     Args:
-        experiment, fault: conditions, see :func:`visthrow.cooperative.task.as_flown`.
+        experiment, fault: conditions, see :func:`visthrow.cooperative.team.as_flown`.
         act: of observations (E, D) -> actions (E, 5).
         build: another solver of the bodies.
         record: called with the environment before the first step and after each.
@@ -99,7 +106,7 @@ def throw(
         env = TeamEnv(flown, device, seed, count * experiment.team.vehicles, build)
         env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
         observations = env.reset()
-        kept: dict[str, torch.Tensor] = {}
+        results: dict[str, torch.Tensor] = {}
         waiting = torch.ones(count, dtype=torch.bool, device=device)
         for _ in range(env.max_episode_length + 1):
             if record is not None:
@@ -108,11 +115,11 @@ def throw(
             ended = waiting & (env.last["released"] | env.last["negative"])
             for name, value in env.last.items():
                 mask = ended.view(-1, *(1,) * (value.dim() - 1))
-                kept[name] = torch.where(mask, value, kept.get(name, torch.zeros_like(value)))
+                results[name] = torch.where(mask, value, results.get(name, torch.zeros_like(value)))
             waiting &= ~ended
             if not bool(waiting.any()):
                 break
-    values = {name: value.cpu().numpy() for name, value in kept.items()}
+    values = {name: value.cpu().numpy() for name, value in results.items()}
     radii = flown.rope.payload_radius + flown.vehicle.collision_radius
     return {"fault": fault, "target": target, "seed": seed} | _summary(values, target, radii)
 

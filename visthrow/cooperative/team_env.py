@@ -16,8 +16,8 @@ from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from camera.noise import StepDraw, apply_noise
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
-from visthrow.cooperative.plant import TeamSim
-from visthrow.cooperative.task import TeamExperiment, layout_of, members
+from visthrow.cooperative.team import TeamExperiment, layout_of, members
+from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.task import plant_of
@@ -35,6 +35,7 @@ class TeamEnv(VecEnv):
     time, every latch, mass and voltage, and how old the others' poses are.
 
     Attributes:
+        earliest: control step of an episode before which no request counts, shape ().
         last: what the last step ended, each over the worlds: ``released``, ``negative``,
             ``contact`` (bool), ``landing_error`` [m], ``duration`` [s], ``landing_w`` [m],
             ``clearance`` [m], ``gap`` [m] and ``apart`` [s], between first and last separation.
@@ -86,6 +87,7 @@ class TeamEnv(VecEnv):
         self._change_weights = torch.tensor(task.reward.command_change, **make)
         self.episode_length_buf = torch.zeros(self.num_envs, device=device, dtype=torch.long)
         self._memory = self._remembered()
+        self.earliest = torch.zeros((), device=device, dtype=torch.long)
         self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
         self.reset()
@@ -105,7 +107,7 @@ class TeamEnv(VecEnv):
             "pose_age": (rows,),
             "age": (worlds,),
             "poses": (rows, steps, ob.VEHICLE + 3),
-            "asked": (worlds, steps),
+            "requests": (worlds, steps),
             "first": (worlds,),
         }
         memory = {name: torch.zeros(shape, **make) for name, shape in shapes.items()}
@@ -121,7 +123,7 @@ class TeamEnv(VecEnv):
         """Values of rows as (W, V, ...)."""
         return of_rows.unflatten(0, (self.worlds, self.team))
 
-    def _other(self, of_rows: Tensor, k: int) -> Tensor:
+    def _neighbour(self, of_rows: Tensor, k: int) -> Tensor:
         """Values of the k-th vehicle after each row's own in its world."""
         return self._worlds(of_rows).roll(-k, 1).flatten(0, 1)
 
@@ -179,11 +181,12 @@ class TeamEnv(VecEnv):
         noisy = action[:, : act.COMMANDS] + noise + memory["command_bias"]
         command = act.command_from_action(noisy, task.action.max_thrust, self._max_rate)
         self.views.command.copy_(command)
-        asked = self._worlds(act.release_asked(actions, self.cfg.release.threshold)).all(1)
-        fresh = torch.zeros_like(asked)
-        memory["asked"].copy_(hist.push(memory["asked"], asked.float(), fresh))
+        requests = self._worlds(act.release_asked(actions, self.cfg.release.threshold)).all(1)
+        requests &= self.episode_length_buf[:: self.team] >= self.earliest
+        fresh = torch.zeros_like(requests)
+        memory["requests"].copy_(hist.push(memory["requests"], requests.float(), fresh))
         steps = (memory["age"] / self.cfg.sim.control_period - 1e-3).ceil().long()
-        agreed = memory["asked"].gather(1, steps[:, None])[:, 0] > 0.5
+        agreed = memory["requests"].gather(1, steps[:, None])[:, 0] > 0.5
         self.views.release.copy_(self._rows(agreed))
         with on_torch_stream(self.device):
             self.sim.step()
@@ -197,7 +200,7 @@ class TeamEnv(VecEnv):
         judge (``ROPE_IN_ROTOR``), cables meet at the load.
         """
         state, reach = self.views.state, self.cfg.team.rotor_reach
-        pos, held = state["pos_w"], state["attached"] != 0
+        pos, attached = state["pos_w"], state["attached"] != 0
         steps = state["cable_dir_w"].cumsum(0) * self._segment[:, None]
         arm = ob.rotation_from_quat(state["quat_wb"]) @ self._mount
         joints = (pos + arm + steps).transpose(0, 1)
@@ -205,16 +208,16 @@ class TeamEnv(VecEnv):
         radius = self.cfg.rope.payload_radius + self.cfg.vehicle.collision_radius
         gaps = [load.square().sum(-1).sqrt() - radius]
         for k in range(1, self.team):
-            gaps.append((self._other(pos, k) - pos).square().sum(-1).sqrt() - 2.0 * reach)
-            cable = (self._other(joints, k) - pos[:, None]).square().sum(-1).amin(-1).sqrt()
-            gaps.append(torch.where(self._other(held, k), cable - reach, 10.0))
+            gaps.append((self._neighbour(pos, k) - pos).square().sum(-1).sqrt() - 2.0 * reach)
+            cable = (self._neighbour(joints, k) - pos[:, None]).square().sum(-1).amin(-1).sqrt()
+            gaps.append(torch.where(self._neighbour(attached, k), cable - reach, 10.0))
         return self._worlds(torch.stack(gaps).amin(0)).amin(1)
 
     def _landed(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Worlds whose last vehicle has let go in this step, and what follows from it."""
         out, memory = self.views.out, self._memory
         separated = self._worlds(out["separated"]) != 0
-        held = self._worlds(self.views.state["attached"] != 0).any(1)
+        attached = self._worlds(self.views.state["attached"] != 0).any(1)
         when = torch.where(separated, self._worlds(out["separation_time"]), -1.0)
         last = when.argmax(1)
         begin = time - self.cfg.sim.control_period
@@ -225,19 +228,19 @@ class TeamEnv(VecEnv):
             values = self._worlds(out[name])
             index = last.view(-1, 1, *(1,) * (values.dim() - 2))
             chosen[name] = values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]
-        at = begin + when.amax(1)
-        chosen["duration"] = at + chosen["time_to_impact"]
-        chosen["apart"] = at - memory["first"]
+        end = begin + when.amax(1)
+        chosen["duration"] = end + chosen["time_to_impact"]
+        chosen["apart"] = end - memory["first"]
         chosen["clearance"] = self._clearance(chosen["time_to_impact"])
-        return separated.any(1) & ~held, chosen
+        return separated.any(1) & ~attached, chosen
 
     def _clearance(self, flight: Tensor) -> Tensor:
         """Least distance of the load's flight to any vehicle [m], shape (W,); vehicles stand."""
         time = (flight[:, None] * self._fractions)[:, :, None]
         path = self.load_w[:, None] + self.load_vel_w[:, None] * time
         path = path + self._half_gravity * time.square()
-        away = path[:, :, None] - self._worlds(self.views.state["pos_w"])[:, None]
-        return away.square().sum(-1).sqrt().flatten(1).amin(1)
+        offsets = path[:, :, None] - self._worlds(self.views.state["pos_w"])[:, None]
+        return offsets.square().sum(-1).sqrt().flatten(1).amin(1)
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Rewards of the rows and ends of the worlds of the step just made."""
@@ -290,7 +293,7 @@ class TeamEnv(VecEnv):
         self.episode_length_buf.masked_fill_(rows, 0)
         previous = memory["previous"]
         torch.where(rows[:, None], self._start_action, previous, out=previous)
-        memory["asked"].masked_fill_(fresh[:, None], 0.0)
+        memory["requests"].masked_fill_(fresh[:, None], 0.0)
         memory["first"].masked_fill_(fresh, 1e6)
         spreads = {
             "frame_bias": noise.observation_bias,
@@ -306,8 +309,8 @@ class TeamEnv(VecEnv):
         torch.where(rows, low + (high - low) * torch.rand_like(age), age, out=age)
         low, high = self.cfg.team.age
         age = memory["age"]
-        more = (2.0 * torch.rand_like(age) - 1.0).clamp(min=0.0)
-        torch.where(fresh, low + (high - low) * more, age, out=age)
+        part = (2.0 * torch.rand_like(age) - 1.0).clamp(min=0.0)
+        torch.where(fresh, low + (high - low) * part, age, out=age)
 
     def _form(self, fresh: Tensor) -> None:
         """Move the vehicles that were drawn into a formation around the load, and draw a goal."""
@@ -316,11 +319,11 @@ class TeamEnv(VecEnv):
         heading = 2.0 * math.pi * draw[:, 0]
         low, high = team.goal
         distance = low + (high - low) * draw[:, 1]
-        drawn = torch.stack([distance * heading.cos(), distance * heading.sin()], -1)
+        goals = torch.stack([distance * heading.cos(), distance * heading.sin()], -1)
         if self._goal is not None:
-            drawn = self._goal[:2].expand_as(drawn)
-            heading = torch.atan2(drawn[:, 1], drawn[:, 0])
-        drawn = torch.cat([drawn, torch.zeros_like(drawn[:, :1])], -1)
+            goals = self._goal[:2].expand_as(goals)
+            heading = torch.atan2(goals[:, 1], goals[:, 0])
+        goals = torch.cat([goals, torch.zeros_like(goals[:, :1])], -1)
         spread = math.radians(team.across_deg) * (2.0 * draw[:, 2] - 1.0)
         low, high = (math.radians(degree) for degree in team.tilt_deg)
         tilt = self._rows(low + (high - low) * draw[:, 3])
@@ -341,7 +344,7 @@ class TeamEnv(VecEnv):
         vel = vel - (spin @ turning[..., None])[..., 0]
         pos = load - length[:, None] * down - arm
         where = self._rows(fresh)[:, None]
-        goal.copy_(torch.where(where, self._rows(drawn), goal))
+        goal.copy_(torch.where(where, self._rows(goals), goal))
         state["vel_w"].copy_(torch.where(where, vel, state["vel_w"]))
         state["pos_w"].copy_(torch.where(where, pos, state["pos_w"]))
         for name, value in (("cable_dir_w", down), ("cable_vel_w", torch.zeros_like(down))):
@@ -358,41 +361,41 @@ class TeamEnv(VecEnv):
         memory["poses"].copy_(poses)
         period = self.cfg.sim.control_period
         pose = hist.at_latency(poses, memory["pose_age"] / period)
-        seen = pose[:, : ob.VEHICLE]
+        vehicle_seen = pose[:, : ob.VEHICLE]
         offset = ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])
-        frame = torch.cat([seen, offset], -1)
+        frame = torch.cat([vehicle_seen, offset], -1)
         frame = frame + torch.randn_like(frame) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":
             points, valid = self._see(pose, goal)
             frame = torch.cat([frame[:, : ob.VEHICLE], points.flatten(1)], -1)
-        told = self._told(poses, frame[:, :3])
-        held = state["attached"].float()
+        messages = self._messages(poses, frame[:, :3])
+        attached = state["attached"].float()
         actor, history = ob.observe(
             self.layout,
             frame,
             valid,
             memory["previous"],
-            held,
+            attached,
             memory["history"],
             fresh,
-            setup=told,
+            setup=messages,
         )
         memory["history"].copy_(history)
-        critic = self._privileged(vehicle, load, held, fresh)
+        critic = self._privileged(vehicle, load, attached, fresh)
         observed = {"actor": actor, "critic": critic}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
-    def _told(self, poses: Tensor, pos_w: Tensor) -> Tensor:
-        """What the others told of their poses, as old as it is, and that age in control periods."""
+    def _messages(self, poses: Tensor, pos_w: Tensor) -> Tensor:
+        """Poses of the other vehicles, as old as they are, and their age in control periods."""
         noise = self.cfg.task.noise.observation_step
         age = self._rows(self._memory["age"]) / self.cfg.sim.control_period
         late = hist.at_latency(poses, age)
         parts = []
         for k in range(1, self.team):
-            other = self._other(late, k)
-            place = other[:, :3] + torch.randn_like(pos_w) * noise - pos_w
-            parts += [place, other[:, 9 : ob.VEHICLE]]
+            neighbour = self._neighbour(late, k)
+            place = neighbour[:, :3] + torch.randn_like(pos_w) * noise - pos_w
+            parts += [place, neighbour[:, 9 : ob.VEHICLE]]
         return torch.cat([*parts, age[:, None]], -1)
 
     def _see(self, pose: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
@@ -403,13 +406,13 @@ class TeamEnv(VecEnv):
         bias = self._memory["keypoint_bias"]
         return apply_noise(self.cfg.camera.noise, points, valid, bias, draw)
 
-    def _privileged(self, vehicle: Tensor, load: Tensor, held: Tensor, fresh: Tensor) -> Tensor:
+    def _privileged(self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor) -> Tensor:
         """Critic's view."""
         state, memory = self.views.state, self._memory
         offset = ob.state_part(state["pos_w"], self.views.goal_w, load)
         history = hist.push(memory["true_history"], offset[:, 2:], fresh)
         memory["true_history"].copy_(history)
-        own = torch.cat(
+        view = torch.cat(
             [
                 vehicle,
                 memory["previous"],
@@ -417,11 +420,11 @@ class TeamEnv(VecEnv):
                 state["release_timer"][:, None],
                 state["mass_scale"][:, None],
                 state["voltage"][:, None],
-                held[:, None],
+                attached[:, None],
             ],
             -1,
         )
-        parts = [own] + [self._other(own, k) for k in range(1, self.team)]
+        parts = [view] + [self._neighbour(view, k) for k in range(1, self.team)]
         time = self.episode_length_buf[:, None] * self.cfg.sim.control_period
         parts += [offset[:, :2], history.flatten(1), self._rows(self.load_vel_w), time]
         return torch.cat([*parts, self._rows(memory["age"])[:, None]], -1)

@@ -1,0 +1,83 @@
+"""A team's environment: one goal a world, releases that all agree on, ends that all share."""
+
+import pytest
+import torch
+
+from visthrow import config
+from visthrow.cooperative.team import TeamExperiment, as_flown, members
+from visthrow.cooperative.team_env import TeamEnv
+
+
+def experiment(name: str = "pair", *changes: str) -> TeamExperiment:
+    return config.load(TeamExperiment, config.find("cooperative", name), changes)
+
+
+@pytest.fixture
+def env() -> TeamEnv:
+    torch.manual_seed(3)
+    return TeamEnv(as_flown(experiment(), "none"), seed=3, count=8)
+
+
+def hover(env: TeamEnv, rho: torch.Tensor) -> torch.Tensor:
+    actions = env._start_action.expand(env.num_envs, -1).clone()
+    actions[:, 4] = rho
+    return actions
+
+
+def test_vehicles_of_a_world_start_around_one_load_with_one_goal(env):
+    state, load = env.views.state, env._rows(env.load_w)
+    length = env._segment * env.cfg.rope.segments
+    mounts = state["pos_w"] + (state["quat_wb"][:, :3] * 0.0)
+    distance = (mounts - load).norm(dim=-1)
+    assert torch.allclose(distance, length, atol=0.03)
+    goals = env._worlds(env.views.goal_w)
+    assert torch.equal(goals[:, 0], goals[:, 1])
+    assert len(goals[:, 0].unique(dim=0)) == env.worlds
+    separation = env._worlds(state["pos_w"]).diff(dim=1).norm(dim=-1)
+    assert (separation > 0.4).all()
+
+
+def test_a_latch_trips_only_where_both_asked_a_message_ago(env):
+    one = torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
+    timer = env.views.state["release_timer"]
+    env.step(hover(env, one))
+    assert (timer < 0.0).all()  # nobody knows of the other yet
+    env.step(hover(env, -torch.ones(8)))
+    tripped = env._worlds(timer >= 0.0)
+    assert tripped.tolist() == [[False] * 2, [True] * 2, [False] * 2, [False] * 2]
+
+
+def test_a_world_ends_for_both_and_the_landing_is_the_last_ones(env):
+    actions = hover(env, torch.ones(8))
+    for _ in range(9):
+        _, reward, done, _ = env.step(actions)
+        if done.any():
+            break
+    assert torch.equal(done, torch.ones(8))
+    assert env.last["released"].all()
+    assert (env.last["apart"] == 0.0).all()
+    assert torch.equal(reward[::2] != 0.0, torch.ones(4, dtype=torch.bool))
+    assert (env.last["landing_w"][:, :2].norm(dim=-1) < 0.5).all()
+
+
+def test_faults_are_those_of_vehicle_zero():
+    parts = members(as_flown(experiment(), "weak"))
+    assert parts["vehicles"][0].thrust.gain == (0.9,) * 4
+    assert parts["vehicles"][1].thrust.gain == (1.0,) * 4
+    lags = [r.lag for r in members(as_flown(experiment(), "late"))["releases"][:2]]
+    assert lags[0] - lags[1] == pytest.approx(0.03)
+    trained = members(experiment())
+    assert {r.lag for r in trained["releases"][1::2]} == {experiment().release.lag}
+    assert min(v.thrust.gain[0] for v in trained["vehicles"]) == pytest.approx(0.88)
+
+
+def test_a_camera_sees_keypoints_in_place_of_load_and_goal():
+    env = TeamEnv(experiment("pair_vision"), count=4)
+    observed = env.get_observations()["actor"]
+    assert observed.shape == (4, env.layout.dimension)
+    assert torch.isfinite(observed).all()
+
+
+def test_rows_that_are_no_whole_worlds_are_refused():
+    with pytest.raises(ValueError, match="7 rows; expected a multiple of 2"):
+        TeamEnv(experiment(), count=7)
