@@ -1,0 +1,35 @@
+"""The reference prints itself: every key of the shipped configurations, every command."""
+
+import pytest
+
+from docs import hooks
+from tests.pages.blocks import ROOT, pages
+from visthrow import cli, config
+from visthrow.config import kinds
+
+SHOWN = [
+    found for page in pages() for found in hooks.KEYS.findall(page.read_text(encoding="utf-8"))
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "only"), SHOWN)
+def test_every_key_has_a_row(kind, name, only):
+    path = config.find(kind, name)
+    values = config.to_dict(config.load(kinds.schema_of(kind, path.stem), path))
+    text = hooks.keys_of(kind, name, only)
+    keys = values[only] if only else values
+    assert keys
+    assert all(f"| `{key}` |" in text for key in keys)
+
+
+def test_a_row_has_unit_value_and_source():
+    row = "| `length` | m | a number | `0.33` | of the rope, without the payload | Sec. III-A |"
+    assert row in hooks.keys_of("rope", "paper")
+    assert "### `[action]`" in hooks.keys_of("task", "state")
+    assert "| above 0 |" in hooks.keys_of("task", "state")
+
+
+def test_every_command_is_shown():
+    text = hooks.on_page_markdown((ROOT / "docs/reference/commands.md").read_text("utf-8"))
+    assert all(f"usage: visthrow {command}" in text for command in cli.COMMANDS)
+    assert "## hil check" in text
