@@ -397,6 +397,25 @@ def test_status_and_mistakes_on_the_command_line(path, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("outcome", "status"),
+    [
+        (pool.Outcome(), 0),
+        (pool.Outcome(stopped=True), 0),
+        (pool.Outcome({"state-1": "out of memory"}), 1),
+        (pool.Outcome(stopped=True, interrupted=True), 130),
+    ],
+)
+def test_the_status_of_a_sweep_says_how_it_ended(
+    outcome, status, path, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(pool.ProcessPool, "run", lambda *_: outcome)
+    assert cli.main(["sweep", "run", path, "--out", str(tmp_path), "--devices", "cpu"]) == status
+    said = capsys.readouterr().err
+    assert ("state-1 failed: out of memory" in said) == bool(outcome.failed)
+    assert ("the same command goes on" in said) == outcome.stopped
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         ('runs.trained.throws=["onw"]', "did you mean 'own'"),
