@@ -1,7 +1,7 @@
-"""Train three seeds of the state policy and one of the vision policy of a pair, a card each, and
-throw them under every condition of :data:`visthrow.cooperative.team.FAULTS`.
+"""Train state and vision policies of a pair, a seed of each on every card, side by side, and throw
+them under every condition of :data:`visthrow.cooperative.team.FAULTS`.
 
-Writes a policy and a JSON file with curve and figures for each into a folder."""
+Writes a policy for each and ``results.json``, with curves and figures, into a folder."""
 
 import argparse
 import json
@@ -9,6 +9,7 @@ import math
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -33,30 +34,31 @@ def train_and_throw(args: argparse.Namespace) -> None:
     path = config.find("cooperative", args.config)
     experiment = config.load(TeamExperiment, path, args.overrides)
     training = TeamTraining(experiment, args.device, args.seed, args.eager)
-    file = args.out / f"{args.config}-{args.seed}"
+    name = f"{args.config}-{args.seed}"
+    policy, report = args.out / f"{name}.npz", args.reports / f"{name}.json"
     made_by = {"seed": args.seed, "config": config.to_dict(experiment, defaults=False)}
     result = {"config": args.config, "seed": args.seed, "built_s": time.time() - begin}
     result |= {"provenance": provenance.collect(), "curve": [], "throws": []}
 
     def keep() -> None:
-        training.policy(made_by | provenance.collect()).save(file.with_suffix(".npz"))
-        write_json(file.with_suffix(".json"), result)
+        training.policy(made_by | provenance.collect()).save(policy)
+        write_json(report, result)
 
     throwing = min(THROWING, 0.3 * args.seconds)
     seconds = args.until - time.time() - throwing
-    print(f"{file.name}: trains for {seconds:.0f} s", flush=True)
+    print(f"{name}: trains for {seconds:.0f} s", flush=True)
     spoke = kept = time.time()
     for figures in training.run(seconds):
         now = time.time()
         if not math.isfinite(figures["value"] + figures["surrogate"]):
-            print(f"{file.name}: a loss is not finite: {figures}", flush=True)
+            print(f"{name}: a loss is not finite: {figures}", flush=True)
             break
         if now - spoke > TALKING or figures["iteration"] < 3:
             spoke = now
             figures["samples"] = figures["iteration"] * training.samples
             result["curve"].append(figures)
-            row = {name: round(value, 4) for name, value in figures.items()}
-            print(f"{file.name}: {json.dumps(row)}", flush=True)
+            row = {key: round(value, 4) for key, value in figures.items()}
+            print(f"{name}: {json.dumps(row)}", flush=True)
         if now - kept > KEEPING:
             kept = now
             keep()
@@ -64,16 +66,16 @@ def train_and_throw(args: argparse.Namespace) -> None:
         keep()
     from visthrow.onboard.policy import Policy
 
-    act = Policy.load(file.with_suffix(".npz")).to(args.device).act
+    act = Policy.load(policy).to(args.device).act
     for fault in FAULTS:
         if time.time() > args.until - 10.0:
-            print(f"{file.name}: no time left for {fault}", flush=True)
+            print(f"{name}: no time left for {fault}", flush=True)
             break
         options = {"fault": fault, "count": args.throws, "device": args.device, "seed": SEED}
         row = throw(experiment, act, **options)
         result["throws"].append(row)
-        print(f"{file.name}: {json.dumps(row)}", flush=True)
-        write_json(file.with_suffix(".json"), result)
+        print(f"{name}: {json.dumps(row)}", flush=True)
+        write_json(report, result)
 
 
 def job(args: argparse.Namespace, card: int, config: str, seed: int, until: float) -> None:
@@ -83,7 +85,7 @@ def job(args: argparse.Namespace, card: int, config: str, seed: int, until: floa
     for extra in ([], ["--eager"]):
         words = [str(args.out), "--config", config, "--seed", str(seed), "--until", str(until)]
         words += ["--seconds", str(args.seconds), "--device", args.device, *extra]
-        words += ["--throws", str(args.throws)]
+        words += ["--throws", str(args.throws), "--reports", str(args.reports)]
         words += [word for change in args.overrides for word in ("--set", change)]
         command = [sys.executable, "-m", "bench.cooperative.cards", *words]
         process = subprocess.Popen(command, env=env)
@@ -98,21 +100,18 @@ def job(args: argparse.Namespace, card: int, config: str, seed: int, until: floa
             return
 
 
-def drawn_seeds() -> list[int]:
-    """Four seeds that nobody chose."""
-    return [int.from_bytes(os.urandom(3), "big") % 800_000 for _ in range(4)]
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--seconds", type=float, default=700.0, help="for all of it")
+    parser.add_argument("--seconds", type=float, default=540.0, help="for all of it")
+    parser.add_argument("--cards", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--throws", type=int, default=THROWS)
     parser.add_argument("--set", dest="overrides", action="append", default=[])
-    parser.add_argument("--config", help="of configs/cooperative: one card's work")
+    parser.add_argument("--config", help="of configs/cooperative: one job's work")
     parser.add_argument("--seed", type=int)
-    parser.add_argument("--until", type=float, help="end of one card's work [s since 1970]")
+    parser.add_argument("--reports", type=Path, help="folder of the job's report")
+    parser.add_argument("--until", type=float, help="end of the job's work [s since 1970]")
     parser.add_argument("--eager", action="store_true", help="without CUDA graphs")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -120,15 +119,19 @@ def main() -> int:
         train_and_throw(args)
         return 0
     until = time.time() + args.seconds
-    configs = ["pair", "pair", "pair", "pair_vision"]
-    jobs = [
-        threading.Thread(target=job, args=(args, card, config, seed, until))
-        for card, (config, seed) in enumerate(zip(configs, drawn_seeds(), strict=True))
-    ]
-    for one in jobs:
-        one.start()
-    for one in jobs:
-        one.join()
+    with tempfile.TemporaryDirectory() as folder:
+        args.reports = Path(folder)
+        jobs = []
+        for card in args.cards:
+            for config in ("pair", "pair_vision"):
+                seed = int.from_bytes(os.urandom(3), "big") % SEED
+                jobs.append(threading.Thread(target=job, args=(args, card, config, seed, until)))
+        for one in jobs:
+            one.start()
+        for one in jobs:
+            one.join()
+        reports = [json.loads(path.read_text()) for path in sorted(Path(folder).glob("*.json"))]
+    (args.out / "results.json").write_text(json.dumps(reports, indent=1))
     return 0
 
 

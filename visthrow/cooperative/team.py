@@ -36,7 +36,7 @@ class TeamParams(Bounded):
     contact_cost: NotNegative = 50.0  # of a contact, besides that of any negative end
     # control step before which no latch trips at the beginning of a training: else the load is
     # dropped at once; and the shares of the training between which it comes down to 0
-    first_release: Annotated[int, Bound(0)] = 20
+    first_release: Annotated[int, Bound(0)] = 15
     free: tuple[Share, Share] = (0.1, 0.3)
     # vehicle 0 of the worlds: thrust against the controller's map, delay of its latch
     weak: Range = (1.0, 1.0)  # [-]

@@ -12,10 +12,15 @@ from rsl_rl.algorithms import PPO
 
 from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
 from visthrow.cooperative.team_env import TeamEnv
+from visthrow.onboard import actions as act
 from visthrow.onboard.policy import Policy
 from visthrow.training.device import rounded_products
 from visthrow.training.ppo.algorithm import PPOTraining, rsl_rl_config
 from visthrow.training.ranks import Ranks
+
+
+ASKING = 1.0
+"""Mean of the untrained policy's request: the odds that all ask in one step are small otherwise."""
 
 
 class TeamTraining(PPOTraining):
@@ -35,6 +40,8 @@ class TeamTraining(PPOTraining):
                 self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
             )
         self.alg.train_mode()
+        with torch.no_grad():
+            self.alg.actor.mlp[-1].bias[act.COMMANDS] += ASKING
         self._obs = self.env.get_observations()
         self._graph: torch.cuda.CUDAGraph | None = None
         self._rollouts, self._eager = 0, eager
@@ -76,7 +83,7 @@ class TeamTraining(PPOTraining):
 @torch.inference_mode()
 def throw(
     experiment: TeamExperiment,
-    act: Callable[[torch.Tensor], torch.Tensor],
+    policy: Callable[[torch.Tensor], torch.Tensor],
     *,
     fault: str = "none",
     target: float = 2.0,
@@ -95,7 +102,7 @@ def throw(
 
     Args:
         experiment, fault: conditions, see :func:`visthrow.cooperative.team.as_flown`.
-        act: of observations (E, D) -> actions (E, 5).
+        policy: of observations (E, D) -> actions (E, 5).
         build: another solver of the bodies.
         record: called with the environment before the first step and after each.
     """
@@ -111,7 +118,7 @@ def throw(
         for _ in range(env.max_episode_length + 1):
             if record is not None:
                 record(env)
-            observations, _, _, _ = env.step(act(observations["actor"]))
+            observations, _, _, _ = env.step(policy(observations["actor"]))
             ended = waiting & (env.last["released"] | env.last["negative"])
             for name, value in env.last.items():
                 mask = ended.view(-1, *(1,) * (value.dim() - 1))
