@@ -18,7 +18,6 @@ from visthrow.training.device import rounded_products
 from visthrow.training.ppo.algorithm import PPOTraining, rsl_rl_config
 from visthrow.training.ranks import Ranks
 
-
 ASKING = 1.0
 """Mean of the untrained policy's request: the odds that all ask in one step are small otherwise."""
 
