@@ -40,7 +40,7 @@ VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """Variant -> configuration of ``configs/train`` and what it changes."""
 
-SEED, THROWS, CALIBRATED = 7, 1600, 400
+SEED, THROWS = 7, 1600
 LIMIT = 230.0
 """Longest that a training may take [s]; a schedule that would take longer is shortened."""
 LEAST, RESERVE = 45.0, 15.0
@@ -67,21 +67,15 @@ def trained(trainer: Any, seconds: float) -> dict[str, Any]:
 
 
 def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
-    """Throws at all targets, and at one with each fault; fewer behind a hover's calibration."""
-    from visthrow.throws.calibrated import calibrated_start
+    """Throws at all targets, and at one with each fault."""
     from visthrow.throws.loading import trained_in
     from visthrow.training import protocol
-    from visthrow.training.env import ThrowEnv
 
     policy, rows = policy.to(device), {}
     layout = policy.contract["observation"]["layout"]
-    for name, (target, change) in conditions(layout, layout == "vision").items():
+    for name, (target, change) in conditions(layout).items():
         flown = trained_in(policy, "policy", change)
-        calibrated = "calibrated" in name
-        number = min(count, CALIBRATED) if calibrated else count
-        begin = calibrated_start(flown) if calibrated else ThrowEnv.reset
-        actor = policy.actor(number)
-        throws = protocol.throw(flown, actor, target, number, device, SEED, begin=begin)
+        throws = protocol.throw(flown, policy.actor(count), target, count, device, SEED)
         rows[name] = throws.summary()
     return rows
 
