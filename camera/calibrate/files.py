@@ -18,6 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from camera.calibrate.foreign import (
     ANGULAR,
     DENOMINATORS,
@@ -27,7 +29,8 @@ from camera.calibrate.foreign import (
     fit_fisheye,
     image_fov_deg,
 )
-from camera.params import FisheyeParams, monotonic_limit
+from camera.mount import DOWNWARD_ROT_CB
+from camera.params import FisheyeParams, MountParams, monotonic_limit
 
 Node = dict[str, Any]
 Values = dict[str, float]
@@ -45,6 +48,9 @@ LABELS = {
     "none": "none",
 }
 """Distortion -> what tools call it, in small letters without signs."""
+
+
+NOT_A_ROTATION = 1e-3  # largest entry of R R^T - 1
 
 
 class _Missing(ValueError):
@@ -89,6 +95,34 @@ def read(
             remarks=(f"camera {name} of {len(cameras)} in the file ({names})", *report.remarks),
         )
     return box, lens, report
+
+
+def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
+    """Return the mount of Kalibr's ``T_cam_imu`` (OpenVINS: ``T_imu_cam``), or None where a file
+    states neither.
+
+    Convention: the IMU sits at the centre of mass, its axes are the body's (x forward, y left, z
+    up). Raises ValueError: no 4 x 4 matrix with a rotation."""
+    _, node, _ = _chosen(_cameras(_tree(path)), camera)
+    key = next((key for key in ("T_cam_imu", "T_imu_cam") if key in node), None)
+    if key is None:
+        return None
+    try:
+        matrix = np.array(node[key], dtype=float).reshape(4, 4)
+    except (TypeError, ValueError):
+        raise ValueError(f"{path}: {key} is {node[key]!r}; expected a 4 x 4 matrix") from None
+    if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > NOT_A_ROTATION:
+        raise ValueError(f"{path}: {key} has no rotation in its first three rows and columns")
+    rot_cb, place_c = matrix[:3, :3], matrix[:3, 3]
+    position_b = -rot_cb.T @ place_c
+    if key == "T_imu_cam":
+        rot_cb, position_b = matrix[:3, :3].T, place_c
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(rot_cb.T @ np.array(DOWNWARD_ROT_CB))
+    yaw, pitch, roll = turn.as_euler("ZYX", degrees=True).tolist()
+    x, y, z = position_b.tolist()
+    return MountParams((x, y, z), (roll, pitch, yaw))
 
 
 def _chosen(found: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:

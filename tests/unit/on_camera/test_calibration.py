@@ -11,8 +11,8 @@ import torch
 from camera.calibrate import boards, files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
 from camera.fisheye import Fisheye
-from camera.mount import rotate, rotation_from_vector
-from camera.params import FisheyeParams
+from camera.mount import nominal_rot_cb, rotate, rotation_from_vector
+from camera.params import FisheyeParams, MountParams
 from tests import lens_files
 from tests.drawn import pixel_rays
 
@@ -103,6 +103,25 @@ def test_field_of_view_without_the_key(tmp_path):
     expected = 2.0 * math.degrees(math.hypot(320.5, 240.5) / 200.0)
     assert files.read(path)[1].fov_deg == pytest.approx(expected, abs=1e-9)
     assert files.read(path, fov_deg=150.0)[1].fov_deg == 150.0
+
+
+@pytest.mark.parametrize("key", ["T_cam_imu", "T_imu_cam"])
+def test_the_place_of_the_imu_is_the_mount(tmp_path, key):
+    path, there = tmp_path / "kalibr.yaml", MountParams((0.03, 0.01, -0.02), (3.0, -20.0, 40.0))
+    lens_files.write_kalibr(path, FisheyeParams(641, 481, 200.0, 200.0, 320.0, 240.0))
+    assert files.read_mount(path) is None
+    matrix = np.eye(4)
+    matrix[:3, :3] = nominal_rot_cb(there).numpy()
+    matrix[:3, 3] = -matrix[:3, :3] @ there.position_b
+    matrix = matrix if key == "T_cam_imu" else np.linalg.inv(matrix)
+    text = path.read_text()
+    path.write_text(f"{text}  {key}: {matrix.tolist()}\n")
+    mount = files.read_mount(path)
+    assert mount.position_b == pytest.approx(there.position_b)
+    assert mount.rpy_deg == pytest.approx(there.rpy_deg)
+    path.write_text(f"{text}  {key}: {(2.0 * matrix).tolist()}\n")
+    with pytest.raises(ValueError, match="no rotation"):
+        files.read_mount(path)
 
 
 @pytest.mark.parametrize("camera", [0, 1])

@@ -17,7 +17,7 @@ from camera.calibrate.boards import (
     find_board,
     reprojected,
 )
-from camera.calibrate.files import read
+from camera.calibrate.files import read, read_mount
 from camera.calibrate.foreign import HOLDS_PX
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
@@ -93,7 +93,7 @@ def calibrate(args: argparse.Namespace) -> int:
             f"--out {out}; expected a file that ends in .toml, as every configuration"
         )
     like = config.load(CameraParams, config.find("camera", args.like))
-    first = Path(args.source[0])
+    first, mount = Path(args.source[0]), None
     if args.board or first.is_dir() or first.suffix.lower() in PICTURES:
         board = board_of(args.board)
         paths, images = pictures_of(args.source)
@@ -110,6 +110,7 @@ def calibrate(args: argparse.Namespace) -> int:
                 " --board)"
             )
         name, lens, fit = read(first, args.camera, args.fov_deg, args.model)
+        mount = read_mount(first, args.camera)
         notes = f"from {first.name} ({name})"
         if fit.points:
             notes += (
@@ -120,9 +121,13 @@ def calibrate(args: argparse.Namespace) -> int:
         else:
             notes += ", the same model: nothing was fitted"
         notes = "; ".join([notes, *fit.remarks])
-    text = (
-        f"# Camera {notes}.\n# Mount, noise and sizes are those of '{args.like}'; set your own.\n\n"
-    )
+    kept = "Mount, noise and sizes are"
+    if mount is not None:
+        place = {"position_b": mount.position_b, "rpy_deg": mount.rpy_deg}
+        like = dataclasses.replace(like, mount=dataclasses.replace(like.mount, **place))
+        notes += "; mount from the IMU's, taken to sit at the centre of mass, x forward, z up"
+        kept = "Noise and sizes are"
+    text = f"# Camera {notes}.\n# {kept} those of '{args.like}'; set your own.\n\n"
     params = dataclasses.replace(like, fisheye=lens)
     atomic_write(out, (text + config.dumps(params)).encode())
     print(
