@@ -9,7 +9,9 @@ from hil.check import AutopilotCheck
 from hil.control.loop import Loop
 from hil.control.states import OperatorInput
 from hil.links import msp
+from hil.links.backends.ardupilot import BRAKE
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
+from hil.links.pymav import mav
 from tests.fakes.fake_px4 import LAND as PX4_LAND
 from tests.fakes.fake_px4 import OFFBOARD, POSCTL, custom
 from tests.hil_flight import AutoOperator, simple_policy
@@ -101,6 +103,18 @@ def test_what_the_fakes_make_of_a_positive_rate_stands_in_their_own_axes():
         -95,
     )
     assert throttle == round(1050 + 0.1906 * 950)
+
+
+def test_a_vehicle_that_the_runner_is_to_arm_is_not_taken_before_its_checks_pass():
+    desk = Desk("ardupilot", "ardupilot.arm=true", "ardupilot.take=true")
+    desk.fake.armed, desk.fake.mode = False, BRAKE
+    desk.turn(0.5)
+    assert desk.status.connected
+    check = mav.MAV_SYS_STATUS_PREARM_CHECK
+    for health, connected in ((0, False), (check, True)):
+        desk.fake.link.send(mav.MAVLink_sys_status_message(check, check, health, *[0] * 10))
+        desk.turn(0.1)
+        assert desk.status.connected == connected, desk.status.note
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -25,9 +25,11 @@ STREAM = (
     (mav.MAVLINK_MSG_ID_ATTITUDE_TARGET, 50_000),
     (mav.MAVLINK_MSG_ID_HEARTBEAT, 100_000),
     (mav.MAVLINK_MSG_ID_ATTITUDE, 20_000),
+    (mav.MAVLINK_MSG_ID_SYS_STATUS, 500_000),
 )
 """Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust
-in hover, the mode, which a heartbeat of 1 Hz tells up to a second late, and body rates.
+in hover, the mode, which a heartbeat of 1 Hz tells up to a second late, body rates, and whether it
+may be armed.
 """
 
 COMMAND_VALUES = 7  # of COMMAND_LONG
@@ -94,6 +96,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         self._ours = False  # whether it has ever followed
         self._was_armed = False  # since the runner took the vehicle
         self._arm_refused = ""
+        self._may_arm = True  # by its own checks, where it tells them
         self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         self._servo = (  # one string for good: Python's cache of attributes keeps each new one
@@ -182,8 +185,14 @@ class MavlinkAutopilot(Autopilot, ABC):
             self.share, self._exact = message.thrust, True
         elif kind == "VFR_HUD" and not self._exact:  # in whole percent
             self.share = 0.01 * message.throttle
-        elif kind == "SYS_STATUS" and 0 < message.voltage_battery < 65535:
-            self.voltage = 1e-3 * message.voltage_battery
+        elif kind == "SYS_STATUS":
+            if 0 < message.voltage_battery < 65535:
+                self.voltage = 1e-3 * message.voltage_battery
+            checks = mav.MAV_SYS_STATUS_PREARM_CHECK
+            failed = (
+                message.onboard_control_sensors_present & ~message.onboard_control_sensors_health
+            )
+            self._may_arm = not failed & checks
 
     def _judge_mode(self) -> None:
         """Judge whether the mode is still one of ours."""
@@ -210,9 +219,10 @@ class MavlinkAutopilot(Autopilot, ABC):
             message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM
             and result != mav.MAV_RESULT_ACCEPTED
         ):
-            self._arm_refused = f"arming refused with result {result}" + (
-                f": {self.texts[-1]}" if self.texts else ""
-            )
+            self._arm_refused = f"arming refused with result {result}: {self._last_text()}"
+
+    def _last_text(self) -> str:
+        return self.texts[-1] if self.texts else "no text"
 
     def _note(self, now: float) -> tuple[str, str]:
         p, beat = self.params, self._heartbeat
@@ -226,6 +236,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         if self._wanted is None:
             if not armed and not p.arm:
                 return "disarmed", WAIT
+            if not armed and not self._may_arm:
+                return f"its checks before arming fail: {self._last_text()}", WAIT
             ready = role == FOLLOW or (p.take and role == HOLD)
             return (
                 ("", role)
@@ -247,7 +259,8 @@ class MavlinkAutopilot(Autopilot, ABC):
                 WAIT,
             )
         if armed or self._wanted == LAND:  # on the ground it disarms itself
-            return "", role or WAIT
+            spools_up = p.arm and self._exact and not self.share
+            return "", WAIT if spools_up and role == FOLLOW else role or WAIT
         if self._was_armed or self._arm_refused or not p.arm:
             return self._arm_refused or "disarmed", WAIT
         return "", WAIT
