@@ -31,7 +31,7 @@ def full() -> list[dict[str, Any]]:
 
 def _by_target(throws: int) -> Iterator[dict[str, Any]]:
     for target in TARGETS:
-        yield from thrower.units(thrower.OWN, "none", target, throws)
+        yield from thrower.units(thrower.IDEAL, "none", target, throws)
     for compensation in reversed(thrower.MADE_UP):
         for target in TARGETS:
             yield from thrower.units("hybrid", compensation, target, throws)
@@ -48,7 +48,7 @@ def _front() -> Iterator[dict[str, Any]]:
     for bounds in BOUNDS[::-1]:
         for how in _settings():
             yield from thrower.units(
-                thrower.OWN, "none", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how
+                thrower.IDEAL, "none", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how
             )
             yield from thrower.units(
                 "hybrid", "both", FRONT_TARGET, FRONT_THROWS, bounds=bounds, **how

@@ -18,7 +18,7 @@ from sim.reference.extras import ReferenceExtras
 from visthrow import config
 from visthrow.common.workers import Workers
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import STILL, SWAY, Hovered, Spreads, solved, sway
+from visthrow.onboard.calibration import HOVER, SWAY, Hovered, Spreads, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.calibrated import calibrated_start
@@ -69,12 +69,12 @@ def on_reference(
     scale = flown.camera.noise.scale_std * rng.standard_normal(count)
     mounts = camera.extrinsics(torch.from_numpy(turn).float(), torch.zeros(count, 3))
     controller, rows = HoverController(HoverParams(), plant.period, count), []
-    for k in range(round((HOVER_TIME + STILL + SWAY) / plant.period)):
+    for k in range(round((HOVER_TIME + HOVER + SWAY) / plant.period)):
         seen, now = plant.measured(), plant.exposed
         command = controller.step(
             seen.pos_w, seen.quat_wb, seen.vel_w, home, plant_of(flown).total_mass
         )
-        since = k * plant.period - HOVER_TIME - STILL
+        since = k * plant.period - HOVER_TIME - HOVER
         if since >= -1e-9:
             command[:, 1:3] += sway(since)
         pos, quat, payload = (
@@ -84,7 +84,7 @@ def on_reference(
         points = points.numpy() * (1.0 + scale[:, None, None]) + PIXEL * rng.standard_normal(
             (count, 8, 2)
         )
-        if since >= -STILL - 1e-9:
+        if since >= -HOVER - 1e-9:
             poses = seen.pos_w, seen.quat_wb, seen.vel_w, seen.rate_b
             rows.append((np.full(count, plant.time), *poses, command[:, 0], points, valid.numpy()))
         plant.step(command, np.zeros(count, bool))

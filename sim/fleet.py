@@ -86,18 +86,19 @@ class FleetParams:
         return Units(plant.rope.length / self.rope_length, plant.total_mass / self.total_mass)
 
 
-def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
+def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
     """Vehicle of that number with its rope and release, SI units; numerics and air are those of the
     known plant.
     """
     low, high = np.log(list(fleet.ranges.values())).T
     factors = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
     x = dict(zip(fleet.ranges, factors.tolist()))
-    ratio = known.vehicle.body.mass / x["mass"]
+    ratio = nominal.vehicle.body.mass / x["mass"]
     alike = Units(
         ratio ** (1 / 3), ratio
     )  # in these units the known vehicle has the mass that was drawn
-    usual, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
+    usual = in_units(nominal.vehicle, alike)
+    rope = in_units(nominal.rope, alike)
     vehicle = _vehicle(usual, x)
     if fleet.yaw_loop is not None:
         vehicle = _calm(vehicle, fleet.yaw_loop * yaw_rate(usual) / yaw_rate(vehicle))
@@ -105,7 +106,10 @@ def draw(fleet: FleetParams, known: PlantParams, number: int) -> PlantParams:
     margin = 4.0 * vehicle.controller.max_thrust / (fleet.least_thrust * GRAVITY) - bare_mass
     x["payload"] = min(x["payload"], margin / rope.payload_mass)
     return replace(
-        known, vehicle=vehicle, rope=_rope(rope, x), release=replace(known.release, lag=x["lag"])
+        nominal,
+        vehicle=vehicle,
+        rope=_rope(rope, x),
+        release=replace(nominal.release, lag=x["lag"]),
     )
 
 
@@ -124,7 +128,8 @@ def yaw_rate(v: VehicleParams) -> float:
 
 def _calm(v: VehicleParams, share: float) -> VehicleParams:
     """The vehicle with its yaw gains turned down to a share of them, if that is below 1."""
-    c, share = v.controller, min(share, 1.0)
+    c = v.controller
+    share = min(share, 1.0)
     names = ("p_gain", "i_gain", "feedforward_gain")
     gains = {name: (*getattr(c, name)[:2], share * getattr(c, name)[2]) for name in names}
     return replace(v, controller=replace(c, **gains))
@@ -132,14 +137,17 @@ def _calm(v: VehicleParams, share: float) -> VehicleParams:
 
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
     """A vehicle with the factors drawn."""
-    arm, blade, lag = x["arm"], x["arm"] * x["propeller"], x["motor_lag"]
+    arm = x["arm"]
+    blade = x["arm"] * x["propeller"]
+    lag = x["motor_lag"]
     stiff = x["inertia"] * arm**2
     turn = np.array([stiff, stiff, stiff * x["yaw_inertia"]])
 
     def scaled(gains: tuple[float, ...], factor: float) -> tuple[float, ...]:
         return tuple((np.array(gains) * turn * factor).tolist())
 
-    c, aero = v.controller, v.aero
+    c = v.controller
+    aero = v.aero
     fast = x["p_gain"] / lag  # a rate loop is tuned to what its motors follow
     controller = replace(
         c,
@@ -188,7 +196,9 @@ def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
 
 def _rope(r: RopeParams, x: dict[str, float]) -> RopeParams:
     """A rope and its payload with the factors drawn."""
-    length, size, mass = r.length * x["rope"], x["payload_size"], x["payload"]
+    length = r.length * x["rope"]
+    size = x["payload_size"]
+    mass = x["payload"]
     return replace(
         r,
         length=length,

@@ -72,11 +72,10 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
     """
     if z.tether_variants < 1:
         raise ValueError(f"tether_variants {z.tether_variants}; expected 1 or more")
-    factors = (
-        [1.0]
-        if z.tether_variants == 1
-        else np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants)
-    )
+    if z.tether_variants == 1:
+        factors = [1.0]
+    else:
+        factors = list(np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants))
     return [
         dataclasses.replace(
             rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)
@@ -187,17 +186,18 @@ class HybridSim:
             gravity: acceleration of free fall, along -z [m/s^2].
             threads: at most, of a CPU; default all its cores. The bits do not depend on it.
         """
-        vehicles, ropes = vehicles or [params.vehicle], ropes or [params.rope]
-        airs, releases = airs or [params.air], releases or [params.release]
+        vehicles = vehicles or [params.vehicle]
+        ropes = ropes or [params.rope]
+        airs = airs or [params.air]
+        releases = releases or [params.release]
         _check(params, count, ropes)
-        self.params, self.count, self.device, self.seed, self.vehicles = (
-            params,
-            count,
-            device,
-            seed,
-            vehicles,
-        )
-        self.gravity, self.threads = gravity, threads or cores()
+        self.params = params
+        self.count = count
+        self.device = device
+        self.seed = seed
+        self.vehicles = vehicles
+        self.gravity = gravity
+        self.threads = threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, motors, self.extensions)
         t = self.types
@@ -248,7 +248,10 @@ class HybridSim:
 
     def _allocate(self, depth: int) -> None:
         """Make the arrays of state and output, with a command queue so deep."""
-        t, count, device, segments = self.types, self.count, self.device, self.params.rope.segments
+        t = self.types
+        count = self.count
+        device = self.device
+        segments = self.params.rope.segments
         rows = {
             "cable_dir_w": segments,
             "cable_vel_w": segments,
@@ -273,7 +276,8 @@ class HybridSim:
         """Advance every plant by one control period under ``command`` and ``release``; with a
         ``mask``, shape (E,), where it is not 0.
         """
-        s, parts = self.params.sim, [self._vehicles, self._ropes, self._release, self._airs]
+        s = self.params.sim
+        parts = [self._vehicles, self._ropes, self._release, self._airs]
         mask = self._all if mask is None else mask
         if self._exchange is not None:
             self._exchange.step(self._launch, self, parts, mask)
@@ -347,7 +351,8 @@ class HybridSim:
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3).
             battery_used: fraction of charge used.
         """
-        zero, rows = np.zeros(3), np.zeros((self.params.rope.segments, 3))
+        zero = np.zeros(3)
+        rows = np.zeros((self.params.rope.segments, 3))
         values = {
             "pos_w": (pos_w, zero),
             "quat_wb": (quat_wb, st.LEVEL),
@@ -376,12 +381,12 @@ class HybridSim:
         self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0
     ) -> None:
         """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
-        count, device = self.count, self.device
-        pieces = (
-            min(PIECES * self.threads, int(count * work) // FEWEST)
-            if device == "cpu" and self.threads > 1
-            else 1
-        )
+        count = self.count
+        device = self.device
+        if device == "cpu" and self.threads > 1:
+            pieces = min(PIECES * self.threads, int(count * work) // FEWEST)
+        else:
+            pieces = 1
         if pieces <= 1:
             wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
             return
@@ -396,7 +401,8 @@ class HybridSim:
         """Parameters of vehicle and rope of every environment as the kernels read them: structured
         arrays, shape (E,).
         """
-        vehicles, ropes = self._vehicles.numpy(), self._ropes.numpy()
+        vehicles = self._vehicles.numpy()
+        ropes = self._ropes.numpy()
         rows = np.arange(self.count)
         return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
@@ -429,7 +435,8 @@ class HybridSim:
         """
         ropes = self._ropes.numpy()
         rows = np.arange(self.count) % len(ropes)
-        q, r = self.get("quat_wb").astype(float), ropes["mount"][rows].astype(float)
+        q = self.get("quat_wb").astype(float)
+        r = ropes["mount"][rows].astype(float)
         mount = self.get("pos_w") + r + 2 * np.cross(q[:, :3], np.cross(q[:, :3], r) + q[:, 3:] * r)
         steps = ropes["segment_length"][rows][:, None, None] * self.get("cable_dir_w")
         below = np.concatenate([np.zeros((self.count, 1, 3)), np.cumsum(steps, axis=1)], axis=1)

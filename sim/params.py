@@ -16,7 +16,7 @@ GRAVITY = 9.81
 
 
 def require(
-    owner: str, of: Any, *, positive: str = "", not_negative: str = "", finite: str = ""
+    owner: str, instance: Any, *, positive: str = "", not_negative: str = "", finite: str = ""
 ) -> None:
     """Raise ValueError for the first of an owner's fields, by their names, that is not so; of a
     tuple every number counts, None passes.
@@ -28,7 +28,7 @@ def require(
     )
     for names, expected, lowest in kinds:
         for name in names.split():
-            value = getattr(of, name)
+            value = getattr(instance, name)
             for number in value if isinstance(value, tuple) else (value,):
                 if number is not None and not lowest <= number < math.inf:  # true for NaN
                     raise ValueError(f"{owner}.{name} is {number}; expected {expected}")
@@ -249,7 +249,10 @@ class VehicleParams:
 
     def __post_init__(self) -> None:
         """Raise ValueError for a vehicle that the equations do not describe."""
-        body, rotors, c, cell = self.body, self.rotors, self.controller, self.battery
+        body = self.body
+        rotors = self.rotors
+        c = self.controller
+        cell = self.battery
         require("vehicle.body", body, positive="mass inertia")
         require(
             "vehicle.thrust",

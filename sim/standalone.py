@@ -31,14 +31,12 @@ def build_quad_step(t: Types, flow, rate, motor_advance, integrator: str):
 
     Source: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, II.1 (the
     classical method of order 4)."""
-    Vehicle, Air, QuadState, vec3, vec4, real = (
-        t.Vehicle,
-        t.Air,
-        t.QuadState,
-        t.vec3,
-        t.vec4,
-        t.real,
-    )
+    Vehicle = t.Vehicle
+    Air = t.Air
+    QuadState = t.QuadState
+    vec3 = t.vec3
+    vec4 = t.vec4
+    real = t.real
 
     @wp.func
     def slope(
@@ -103,7 +101,11 @@ def build_kernels(t: Types, vehicle: VehicleParams, integrator: str, extensions:
     """Step and reset kernels for one choice of blocks, and their structs of state and
     start arrays.
     """
-    real, vec3, vec4, Vehicle, Air = t.real, t.vec3, t.vec4, t.Vehicle, t.Air
+    real = t.real
+    vec3 = t.vec3
+    vec4 = t.vec4
+    Vehicle = t.Vehicle
+    Air = t.Air
     State = st.array_struct(t, "QuadArrays", FIELDS)
     Start = st.array_struct(t, "QuadStart", START_FIELDS)
     load, store = st.build_access(t, State)
@@ -185,6 +187,17 @@ def _built(
     return _BUILDS[key]
 
 
+def _check(count: int, integrator: str, times: dict[str, float]) -> None:
+    """Refuse a batch that cannot be simulated."""
+    if count < 1:
+        raise ValueError(f"QuadSim of {count} environments; expected 1 or more")
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"integrator {integrator!r}; expected one of {INTEGRATORS}")
+    for name, value in times.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} {value} s; expected a finite, positive time")
+
+
 class QuadSim:
     """Batched quadrotor: command queue, rate controller, motors, battery, aerodynamics, external
     wrench.
@@ -237,18 +250,17 @@ class QuadSim:
             air: wind and ground effect, for all.
             gravity: acceleration of free fall, along -z [m/s^2].
         """
-        if count < 1:
-            raise ValueError(f"QuadSim of {count} environments; expected 1 or more")
-        if integrator not in INTEGRATORS:
-            raise ValueError(f"integrator {integrator!r}; expected one of {INTEGRATORS}")
-        for name, value in (("step", step), ("control_period", control_period)):
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} {value} s; expected a finite, positive time")
+        _check(count, integrator, {"step": step, "control_period": control_period})
         vehicles = vehicles or [vehicle]
         t = types(precision)
         rows = pack_vehicle(t, vehicles, kinds_of(vehicle))
-        self.vehicle, self.count, self.device, self.types = vehicle, count, device, t
-        self.integration_step, self.control_period, self.gravity = step, control_period, gravity
+        self.vehicle = vehicle
+        self.count = count
+        self.device = device
+        self.types = t
+        self.integration_step = step
+        self.control_period = control_period
+        self.gravity = gravity
         extensions = extensions_of(vehicles, airs=[air])
         self._step, self._reset, State, Start = _built(precision, vehicle, integrator, extensions)
         self._vehicles = wp.array(rows, dtype=t.Vehicle, device=device)

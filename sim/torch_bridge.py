@@ -82,7 +82,10 @@ class Replayed:
     EAGER = 3
 
     def __init__(self, work: Callable[[], None]):
-        self._work, self._done, self._graph, self._stream = work, 0, None, torch.cuda.Stream()
+        self._work = work
+        self._done = 0
+        self._graph = None
+        self._stream = torch.cuda.Stream()
 
     def __call__(self) -> None:
         """Do the work."""

@@ -16,9 +16,20 @@ Value = TypeVar("Value")
 Dimension = tuple[int, int, int]
 """Exponents of length, mass and time."""
 
-NONE, LENGTH, MASS, TIME, RATE = (0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)
-SPEED, FORCE, TORQUE, INERTIA, POWER = (1, 0, -1), (1, 1, -2), (2, 1, -2), (2, 1, 0), (2, 1, -3)
-ANGULAR_DAMPING, DAMPING, AREA_DRAG, PER_SPEED = (2, 1, -1), (0, 1, -1), (-1, 1, 0), (-1, 0, 1)
+NONE = (0, 0, 0)
+LENGTH = (1, 0, 0)
+MASS = (0, 1, 0)
+TIME = (0, 0, 1)
+RATE = (0, 0, -1)
+SPEED = (1, 0, -1)
+FORCE = (1, 1, -2)
+TORQUE = (2, 1, -2)
+INERTIA = (2, 1, 0)
+POWER = (2, 1, -3)
+ANGULAR_DAMPING = (2, 1, -1)
+DAMPING = (0, 1, -1)
+AREA_DRAG = (-1, 1, 0)
+PER_SPEED = (-1, 0, 1)
 
 PLANT: dict[str, dict[Dimension, str]] = {
     "BodyParams": {MASS: "mass", INERTIA: "inertia", LENGTH: "com"},

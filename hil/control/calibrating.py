@@ -23,7 +23,7 @@ from visthrow.onboard.calibration import Calibration, Hovered, Spreads
 class CalibrationParams(Bounded):
     """Parameters of the calibration, and limits of its results before a throw."""
 
-    still: Positive = calibration.STILL  # of hover before the sway [s]
+    still: Positive = calibration.HOVER  # of hover before the sway [s]
     sway: Positive = calibration.SWAY  # [s]
     rate: Positive = calibration.SWAY_RATE  # amplitude of the sway's body rates [rad/s]
     frequency: Positive = calibration.SWAY_FREQUENCY  # of the sway [Hz]

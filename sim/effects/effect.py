@@ -104,9 +104,11 @@ class SettingEffect(Effect):
     lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
 
     def __post_init__(self) -> None:
-        for name, known in ((self.needs, CONDITIONS), (self.switch, {"": None, **SWITCHES})):
-            if name not in known:
-                raise ValueError(f"got '{name}'; expected one of: {', '.join(filter(None, known))}")
+        for name, choices in ((self.needs, CONDITIONS), (self.switch, {"": None, **SWITCHES})):
+            if name not in choices:
+                raise ValueError(
+                    f"got '{name}'; expected one of: {', '.join(filter(None, choices))}"
+                )
         if bool(self.changes) == bool(self.switch):
             raise ValueError("got both changes and a switch, or neither; expected one of them")
 

@@ -49,11 +49,10 @@ def left_out(settings: Mapping[str, str]) -> list[str]:
     for name, does in NOT_SAID.items():
         values = numbers(settings, name)
         plain = numbers(settings, "rollPID")[2:] + numbers(settings, "pitchPID")[2:]
-        filters = (
-            values[:2] != plain
-            if name == "d_max" and any(values)
-            else name != "d_max" and values[0] > 0.0
-        )
+        if name == "d_max" and any(values):
+            filters = values[:2] != plain
+        else:
+            filters = name != "d_max" and values[0] > 0.0
         features += [f"{name} {settings[name]}: {does}"] if filters else []
     return features
 
@@ -99,7 +98,8 @@ def controller_of(
             f"settings without {', '.join(missing)}; expected those of a blackbox's header, such as"
             " rollPID:45,80,40"
         )
-    c, rotors = vehicle.controller, vehicle.rotors
+    c = vehicle.controller
+    rotors = vehicle.rotors
     full = c.max_thrust * (voltage / vehicle.battery.reference_voltage) ** 2
     idle = numbers(settings, "motor_idle")[0] * 1e-4
     thrust = (
@@ -111,7 +111,7 @@ def controller_of(
     ]  # for an output of 1 a degree [N m]
     axes = [numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")]
     forward = numbers(settings, "ff_weight")
-    most = [
+    extremes = [
         numbers(settings, name, settings["pidsum_limit"])[0]
         for name in ("pidsum_limit", "pidsum_limit", "pidsum_limit_yaw")
     ]
@@ -130,9 +130,10 @@ def controller_of(
     gyro = lag("gyro_lpf1_static_hz", "gyro_lpf2_static_hz")
     whole = gyro + lag("dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
     share, yaw_share = (
-        (gyro + more) / whole if whole > 0.0 else 1.0 for more in (0.0, lag("yaw_lowpass_hz"))
+        (gyro + filtering) / whole if whole > 0.0 else 1.0
+        for filtering in (0.0, lag("yaw_lowpass_hz"))
     )
-    x, y, z = (windup * limit * torque for limit, torque in zip(most, torques, strict=True))
+    x, y, z = (windup * limit * torque for limit, torque in zip(extremes, torques, strict=True))
     return dataclasses.replace(
         c,
         kind="motor_mixing",

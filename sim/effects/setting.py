@@ -59,7 +59,8 @@ def specialised(plant: PlantParams, before: PlantParams) -> PlantParams:
     say the same.
     """
     vehicle: VehicleParams = plant.vehicle
-    motor, aero = vehicle.motor, vehicle.aero
+    motor = vehicle.motor
+    aero = vehicle.aero
     if (
         before.vehicle.motor.kind != "asymmetric"
         and motor.time_constant == motor.time_constant_down

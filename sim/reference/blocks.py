@@ -31,17 +31,17 @@ _QUARTER_TURN = np.array(
 TIME_TOLERANCE = 1e-10
 
 
-def command_queue(times: np.ndarray, commands: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Return the command that acts at ``now``: the latest whose time has come.
+def command_queue(times: np.ndarray, commands: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return the command that acts at ``time``: the latest whose time has come.
 
     Args:
         times: when each command starts to act [s], shape (K, E), ascending along K; the first long
-            before ``now``.
+            before ``time``.
         commands: collective thrust [N] and body rates [rad/s], shape (K, E, 4).
-        now: [s], shape (E,).
+        time: [s], shape (E,).
     """
-    index = np.sum(times <= now + TIME_TOLERANCE, axis=0) - 1
-    return commands[index, np.arange(len(now))]
+    index = np.sum(times <= time + TIME_TOLERANCE, axis=0) - 1
+    return commands[index, np.arange(len(time))]
 
 
 @lru_cache(maxsize=8)
@@ -49,7 +49,9 @@ def _layout(rotors: RotorParams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4); spins; motors that
     turn clockwise, and the others.
     """
-    x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
+    x = np.array(rotors.x)
+    y = np.array(rotors.y)
+    spin = np.array(rotors.spin)
     return (
         np.stack((y / np.sum(y**2), -x / np.sum(x**2))),
         spin,
@@ -99,7 +101,8 @@ def mixer(
     tilt = tilt * scale[:, None]
     # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between
     # the two kinds only.
-    rising, falling = tilt.take(clockwise, 1), tilt.take(layout_order, 1)
+    rising = tilt.take(clockwise, 1)
+    falling = tilt.take(layout_order, 1)
     highest = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
     lowest = -(room - (falling.max(axis=1) - rising.min(axis=1))) / 2.0
     amount = torque[:, 2] / (4.0 * torque_ratio)

@@ -42,7 +42,8 @@ def _rod_inertial(
     """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included
     on the loaded one.
     """
-    mass, length = rope.segment_mass, rope.segment_length
+    mass = rope.segment_mass
+    length = rope.segment_length
     about_centre = mass * length**2 / 12.0
     if not loaded:
         return mass, -length / 2, (about_centre, about_centre, AXIAL_INERTIA)
@@ -161,7 +162,8 @@ def add_chain(
             rod.add_freejoint(name="root")
         else:
             _add_joints(rod, i, joints, rope.joint_damping, armature)
-        parent, anchor = rod, [0.0, 0.0, -rope.segment_length]
+        parent = rod
+        anchor = [0.0, 0.0, -rope.segment_length]
     if stretch is None and load:
         parent.add_site(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
     if stretch is not None:

@@ -96,7 +96,10 @@ class ReferencePlant:
         if not step > 0.0:
             raise ValueError(f"plant: step is {step} s, expected more than 0")
         _refuse_unknown(params)
-        self.params, self.extras, self.count, self.step_size = params, extras, count, step
+        self.params = params
+        self.extras = extras
+        self.count = count
+        self.step_size = step
         self._rng = np.random.default_rng(seed)
         self._ropes = None
         height = 1.5
@@ -131,9 +134,10 @@ class ReferencePlant:
                 None for hanging.
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3); None for zero.
         """
-        count, segments = self.count, self.params.rope.segments
+        count = self.count
+        segments = self.params.rope.segments
         hanging = np.tile([0.0, 0.0, -1.0], (count, segments, 1))
-        given = {
+        inputs = {
             "pos_w": (pos_w, (count, 3)),
             "quat_wb": (quat_wb, (count, 4)),
             "vel_w": (vel_w, (count, 3)),
@@ -144,7 +148,7 @@ class ReferencePlant:
                 (count, segments, 3),
             ),
         }
-        values = {name: _array(name, value, shape) for name, (value, shape) in given.items()}
+        values = {name: _array(name, value, shape) for name, (value, shape) in inputs.items()}
         self._draw()
         rotation = rotation_from_quat(values["quat_wb"])
         offset_w = turned(rotation, self._errors.com_offset)
@@ -175,26 +179,24 @@ class ReferencePlant:
             self._state[:, -2] = self._payload_mass * GRAVITY / self.extras.stretch_stiffness
         hover = np.zeros((count, 4))
         hover[:, 0] = weight
-        self._queue_times, self._queue_commands = [np.full(count, -np.inf)], [hover]
+        self._queue_times = [np.full(count, -np.inf)]
+        self._queue_commands = [hover]
         self.time = 0.0
-        self._attached, self._latched, self._landed = (
-            np.ones(count, bool),
-            np.zeros(count, bool),
-            np.zeros(count, bool),
-        )
-        self._separation, self._landing_time = np.full(count, np.nan), np.full(count, np.nan)
+        self._attached = np.ones(count, bool)
+        self._latched = np.zeros(count, bool)
+        self._landed = np.zeros(count, bool)
+        self._separation = np.full(count, np.nan)
+        self._landing_time = np.full(count, np.nan)
         self._landing_point = np.full((count, 3), np.nan)
         self._samples = [(-np.inf, self.state)]
 
     def _draw(self) -> None:
         """Draw the errors of this episode and build the ropes."""
-        extras, rope, vehicle, count, rng = (
-            self.extras,
-            self.params.rope,
-            self.params.vehicle,
-            self.count,
-            self._rng,
-        )
+        extras = self.extras
+        rope = self.params.rope
+        vehicle = self.params.vehicle
+        count = self.count
+        rng = self._rng
         gain = (
             1.0
             + extras.thrust_gain_error
@@ -233,11 +235,10 @@ class ReferencePlant:
             )
             for i, mass in enumerate(self._payload_mass)
         ]
-        stretch = (
-            (extras.stretch_stiffness, extras.stretch_damping)
-            if extras.stretch_stiffness > 0.0
-            else None
-        )
+        if extras.stretch_stiffness > 0.0:
+            stretch = (extras.stretch_stiffness, extras.stretch_damping)
+        else:
+            stretch = None
         self._ropes = RopeDynamics(vehicle.body, ropes, stretch, rope.mount_damping)
         # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d /
         # (m l^2).
@@ -246,9 +247,10 @@ class ReferencePlant:
             * (damping + rope.mount_damping)
             / (rope.segment_mass * float(np.min(length) / rope.segments) ** 2)
         )
-        self._step = (
-            min(self.step_size, LARGEST_DECAY / fastest) if fastest > 0.0 else self.step_size
-        )
+        if fastest > 0.0:
+            self._step = min(self.step_size, LARGEST_DECAY / fastest)
+        else:
+            self._step = self.step_size
 
     @property
     def _mean_wind(self) -> np.ndarray:
@@ -261,7 +263,8 @@ class ReferencePlant:
 
     @property
     def _rope_columns(self) -> tuple[slice, slice]:
-        start, size = BODY + BLOCKS + 6, 3 * self._ropes.segments
+        start = BODY + BLOCKS + 6
+        size = 3 * self._ropes.segments
         return slice(start, start + size), slice(start + size, start + 2 * size)
 
     def _upper_end(
@@ -285,9 +288,11 @@ class ReferencePlant:
         """Time derivative of the whole state; ropes that have landed and environments not
         ``moving`` stand still.
         """
-        vehicle, rates = self.params.vehicle, np.zeros_like(state)
+        vehicle = self.params.vehicle
+        rates = np.zeros_like(state)
         rotation = rotation_from_quat(state[:, 3:7])
-        body, rate_b = state[:, :BODY], state[:, 10:13]
+        body = state[:, :BODY]
+        rate_b = state[:, 10:13]
         air_b = turned_back(rotation, body[:, 7:10] - wind_w)
         near_ground = blocks.near_ground(
             self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2]
@@ -315,14 +320,39 @@ class ReferencePlant:
             lift_w,
             self._attached,
         )
+        second, stretch_dot = self._rope_rates(
+            rates, body, rotation, (force_w, torque_b), rope, root, drag_w, moving
+        )
+        airborne = (~self._landed)[:, None]
+        direction, velocity = self._rope_columns
+        rates[:, direction] = (rope[1] * airborne[..., None]).reshape(self.count, -1)
+        rates[:, velocity] = second.reshape(self.count, -1)
+        rates[:, -2] = rope[3] * airborne[:, 0]
+        rates[:, -1] = stretch_dot
+        return rates
+
+    def _rope_rates(
+        self,
+        rates: np.ndarray,
+        body: np.ndarray,
+        rotation: np.ndarray,
+        wrench: tuple[np.ndarray, np.ndarray],
+        rope: tuple,
+        root: tuple,
+        drag_w: np.ndarray,
+        moving: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Write the rates of bodies that ropes pull or that fall with one into ``rates``; return
+        the second derivatives of the ropes' directions and of their stretch.
+        """
         second = np.zeros_like(rope[0])
         stretch_dot = np.zeros(self.count)
         ids = np.flatnonzero(self._attached & moving)
         if len(ids):
             picked = tuple(part[ids] for part in rope)
-            wrench = (force_w[ids], torque_b[ids])
+            pulled = (wrench[0][ids], wrench[1][ids])
             rates[ids, 7:10], rates[ids, 10:13], second[ids], stretch_dot[ids] = (
-                self._ropes.attached(ids, body[ids], rotation[ids], wrench, picked, drag_w[ids])
+                self._ropes.attached(ids, body[ids], rotation[ids], pulled, picked, drag_w[ids])
             )
         flying = np.flatnonzero(~self._attached & ~self._landed & moving)
         free = slice(BODY + BLOCKS, BODY + BLOCKS + 6)
@@ -332,12 +362,7 @@ class ReferencePlant:
                 flying, (root[0][flying], root[1][flying]), picked, drag_w[flying]
             )
             rates[flying, free] = np.hstack((root[1][flying], acceleration))
-        airborne = (~self._landed)[:, None]
-        direction, velocity = self._rope_columns
-        rates[:, direction] = (rope[1] * airborne[..., None]).reshape(self.count, -1)
-        rates[:, velocity] = second.reshape(self.count, -1)
-        rates[:, -2], rates[:, -1] = rope[3] * airborne[:, 0], stretch_dot
-        return rates
+        return second, stretch_dot
 
     def _pull(self) -> np.ndarray:
         """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles'
@@ -363,8 +388,11 @@ class ReferencePlant:
                 delay of the queue.
             release: latch the release now, shape (E,), bool; a latch does not untrip.
         """
-        extras, rng, period = self.extras, self._rng, self.params.sim.control_period
-        start, end = self.time, self.time + period
+        extras = self.extras
+        rng = self._rng
+        period = self.params.sim.control_period
+        start = self.time
+        end = self.time + period
         delay = self.params.vehicle.queue.delay + extras.delay_jitter * rng.uniform(
             -1.0, 1.0, self.count
         )
@@ -380,20 +408,23 @@ class ReferencePlant:
         self._separation = np.where(tripped, start + np.maximum(lag, 0.0), self._separation)
         self._latched = self._latched | tripped
         decay = np.exp(-period / extras.wind_time_constant)
-        mean, sigma = self._mean_wind, np.array(extras.wind_sigma_w)
+        mean = self._mean_wind
+        sigma = np.array(extras.wind_sigma_w)
         self._next_wind = (
             mean
             + decay * (self._wind - mean)
             + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
         )
         self._advance(start, end)
-        self._wind, self.time = self._next_wind, end
+        self._wind = self._next_wind
+        self.time = end
         self._prune(end)
 
     def _advance(self, start: float, end: float) -> None:
         """Integrate one period, from event to event in each environment."""
         sample = end - self.extras.mocap_latency % (end - start)
-        times, commands = np.array(self._queue_times), np.array(self._queue_commands)
+        times = np.array(self._queue_times)
+        commands = np.array(self._queue_commands)
         edges = [
             [
                 start,
@@ -460,7 +491,8 @@ class ReferencePlant:
                 ends[0][0][e], ends[0][1][e], ends[1][0][e], ends[1][1][e], step[e], height
             )
             self._landed[e] = True
-            self._landing_time[e], self._landing_point[e] = clock[e] + share * step[e], point
+            self._landing_time[e] = clock[e] + share * step[e]
+            self._landing_point[e] = point
 
     def _keep_sample(self, time: float, reached: np.ndarray) -> None:
         """Keep the state for the motion capture; environments reach the same instant in different
@@ -479,17 +511,18 @@ class ReferencePlant:
                 "payload_vel_w",
                 "cable_points_w",
             ):
-                new, old = getattr(state, name), getattr(older, name)
+                new = getattr(state, name)
+                old = getattr(older, name)
                 keep[name] = np.where(reached.reshape(-1, *[1] * (new.ndim - 1)), new, old)
             state = replace(older, **keep)
         self._samples.append((time, replace(state, time=time)))
 
-    def _prune(self, now: float) -> None:
-        while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= now):
+    def _prune(self, time: float) -> None:
+        while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= time):
             del self._queue_times[0], self._queue_commands[0]
         while (
             len(self._samples) > 1
-            and self._samples[1][0] <= now - self.extras.mocap_latency + blocks.TIME_TOLERANCE
+            and self._samples[1][0] <= time - self.extras.mocap_latency + blocks.TIME_TOLERANCE
         ):
             del self._samples[0]
 
@@ -534,7 +567,8 @@ class ReferencePlant:
 
         ``time`` is when the sample was taken. ``cable_points_w`` and the flags are not measured:
         points come without noise for drawing, the flags as the vehicle knows them now."""
-        extras, rng = self.extras, self._rng
+        extras = self.extras
+        rng = self._rng
         time, sample = self._samples[0]
         rotation_noise = 0.5 * extras.mocap_angle_sigma * rng.standard_normal((self.count, 3))
         quat = sample.quat_wb + quat_dot(sample.quat_wb, 2.0 * rotation_noise)

@@ -51,7 +51,9 @@ def initial_blocks(
         weight: to be carried [N], shape (E,).
         used: fraction of the battery used, shape (E,).
     """
-    count, cell, thrust = len(weight), vehicle.battery, vehicle.thrust
+    count = len(weight)
+    cell = vehicle.battery
+    thrust = vehicle.thrust
     state = np.zeros((count, BLOCKS))
     state[:, 0:3] = rate_b
     state[:, 3:6] = rate_b
@@ -98,7 +100,8 @@ def vehicle_rates(
         Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's
         time derivative, and the rotors' thrust [N], shape (E, 4).
     """
-    used, voltage = state[:, 13], state[:, 14]
+    used = state[:, 13]
+    voltage = state[:, 14]
     rates = np.zeros_like(state)
     if vehicle.controller.kind == "geometric":
         setpoint = blocks.geometric(vehicle, command, rate_b)

@@ -49,7 +49,8 @@ class RopeDynamics:
                 f"ropes have {sorted({rope.segments for rope in ropes})} segments, expected one"
                 " number"
             )
-        self.count, self.stretch = len(ropes), stretch
+        self.count = len(ropes)
+        self.stretch = stretch
         self.length = np.array([rope.segment_length for rope in ropes])
         self.offset = np.array([rope.payload_offset for rope in ropes])
         self.mount = np.array([rope.mount for rope in ropes])
@@ -220,7 +221,8 @@ class RopeDynamics:
         applied: np.ndarray,
     ) -> np.ndarray:
         if self.stretch is not None:
-            qpos, qvel = [*qpos, rope[2][:, None]], [*qvel, rope[3][:, None]]
+            qpos = [*qpos, rope[2][:, None]]
+            qvel = [*qvel, rope[3][:, None]]
         positions, velocities, wrenches, accelerations = self._bound[batch]
         positions[ids], velocities[ids], wrenches[ids] = (
             np.concatenate(qpos, 1),

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_SUCCESSOR = np.array([1, 2, 0])
+_LAST = np.array([2, 0, 1])
 
 
 def _from_products() -> np.ndarray:
@@ -14,7 +15,8 @@ def _from_products() -> np.ndarray:
     for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
         out[j, j, i, i] = out[k, k, i, i] = -2.0
         out[i, j, i, j] = out[i, j, j, i] = 2.0
-        out[k, w, i, j], out[k, w, j, i] = -2.0, 2.0
+        out[k, w, i, j] = -2.0
+        out[k, w, j, i] = 2.0
     return out.reshape(16, 9)
 
 
@@ -28,7 +30,10 @@ def _half_of_products() -> np.ndarray:
     x, y, z, w = range(4)
     out = np.zeros((4, 3, 4))
     for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
-        out[w, i, i], out[j, k, i], out[k, j, i], out[i, i, w] = 0.5, 0.5, -0.5, -0.5
+        out[w, i, i] = 0.5
+        out[j, k, i] = 0.5
+        out[k, j, i] = -0.5
+        out[i, i, w] = -0.5
     return out.reshape(12, 4)
 
 
@@ -39,7 +44,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
     vectors.
     """
-    return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
+    return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
 def length(vectors: np.ndarray) -> np.ndarray:
@@ -91,12 +96,12 @@ def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
     a = -1.0 / (sign + z[..., 2])
     b = z[..., 0] * z[..., 1] * a
     out = np.empty((*z.shape, 3))
-    out[..., 0, 0], out[..., 1, 0], out[..., 2, 0] = (
-        1.0 + sign * z[..., 0] ** 2 * a,
-        sign * b,
-        -sign * z[..., 0],
-    )
-    out[..., 0, 1], out[..., 1, 1], out[..., 2, 1] = b, sign + z[..., 1] ** 2 * a, -z[..., 1]
+    out[..., 0, 0] = 1.0 + sign * z[..., 0] ** 2 * a
+    out[..., 1, 0] = sign * b
+    out[..., 2, 0] = -sign * z[..., 0]
+    out[..., 0, 1] = b
+    out[..., 1, 1] = sign + z[..., 1] ** 2 * a
+    out[..., 2, 1] = -z[..., 1]
     out[..., 2] = z
     return out
 
@@ -105,17 +110,15 @@ def _products(m: np.ndarray) -> np.ndarray:
     """Four times the products of the components wxyz of the quaternions of rotation matrices, shape
     (..., 4, 4).
     """
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    wx, wy, wz = (
-        m[..., 2, 1] - m[..., 1, 2],
-        m[..., 0, 2] - m[..., 2, 0],
-        m[..., 1, 0] - m[..., 0, 1],
-    )
-    xy, xz, yz = (
-        m[..., 0, 1] + m[..., 1, 0],
-        m[..., 0, 2] + m[..., 2, 0],
-        m[..., 1, 2] + m[..., 2, 1],
-    )
+    xx = m[..., 0, 0]
+    yy = m[..., 1, 1]
+    zz = m[..., 2, 2]
+    wx = m[..., 2, 1] - m[..., 1, 2]
+    wy = m[..., 0, 2] - m[..., 2, 0]
+    wz = m[..., 1, 0] - m[..., 0, 1]
+    xy = m[..., 0, 1] + m[..., 1, 0]
+    xz = m[..., 0, 2] + m[..., 2, 0]
+    yz = m[..., 1, 2] + m[..., 2, 1]
     rows = (
         (1 + xx + yy + zz, wx, wy, wz),
         (wx, 1 + xx - yy - zz, xy, xz),

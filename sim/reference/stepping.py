@@ -49,9 +49,9 @@ def halving_rk4(
     after = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     # k2 and k3 belong to one time and to states 0.5 h (k2 - k1) apart: their ratio is the square of
     # a frequency.
-    apart = 0.5 * step * length(k2[:, direction] - k1[:, direction])[:, 0]
+    difference = 0.5 * step * length(k2[:, direction] - k1[:, direction])[:, 0]
     pull = length(k3[:, velocity] - k2[:, velocity])[:, 0]
-    phase = step * np.sqrt(pull / np.maximum(apart, 1e-12))
+    phase = step * np.sqrt(pull / np.maximum(difference, 1e-12))
     turn = step * np.sqrt(
         np.max(np.square(after[:, velocity]).reshape(len(state), -1, 3).sum(-1), axis=1)
     )

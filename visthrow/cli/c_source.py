@@ -116,7 +116,9 @@ def _estimator(estimator: Estimator) -> str:
         _array(names.get(name, name), value.cpu().numpy())
         for name, value in estimator.parts().items()
     ]
-    lines, source, width = [], "scaled", estimator.obs_dim
+    lines = []
+    source = "scaled"
+    width = estimator.obs_dim
     layers = [("encoder", estimator.encoder_bias)]
     layers += [(f"inner{i}", bias) for i, (_, bias) in enumerate(estimator.inner)]
     for name, bias in layers:
@@ -126,7 +128,8 @@ def _estimator(estimator: Estimator) -> str:
             f"    for (int i = 0; i < {len(bias)}; i++)",
             f"        {name}[i] = {name}[i] > 0.0f ? {name}[i] : expm1f({name}[i]);",
         ]
-        source, width = name, len(bias)
+        source = name
+        width = len(bias)
     function = ESTIMATOR.format(
         obs=estimator.obs_dim,
         encoder="\n".join(lines) + "\n",

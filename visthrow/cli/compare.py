@@ -120,11 +120,12 @@ def run(args: argparse.Namespace) -> int:
         entries += rival.throw_baseline(args)
     departures = {item.name: item.departures for item in loaded if item.departures}
     notes = [
-        f"; {name} flown with {', '.join(f'{key} = {value!r}' for key, value in of.items())},"
+        f"; {name} flown with {', '.join(f'{key} = {value!r}' for key, value in departed.items())},"
         " trained otherwise"
-        for name, of in departures.items()
+        for name, departed in departures.items()
     ]
-    title, rows = title_of(args.plant, args.seed) + "".join(notes), rows_of(entries)
+    title = title_of(args.plant, args.seed) + "".join(notes)
+    rows = rows_of(entries)
     figures = {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures}
     return _tell(args, entries, rows, figures, title)
 
@@ -133,20 +134,20 @@ def _tell(
     args: argparse.Namespace,
     entries: Sequence[Entry],
     rows: Sequence[dict],
-    told: dict,
+    notes: dict,
     title: str,
-    *more: str | None,
+    *lines: str | None,
 ) -> int:
-    """Print and write a table; ``told`` is its JSON, ``more`` subtitle and note of
+    """Print and write a table; ``notes`` is its JSON, ``lines`` subtitle and note of
     :func:`write`.
     """
     from visthrow.common.storage import write_json
 
-    print(report(title, rows, *more[1:]))
-    for path in write(Path(args.out), entries, rows, told["plant"], title, *more):
+    print(report(title, rows, *lines[1:]))
+    for path in write(Path(args.out), entries, rows, notes["plant"], title, *lines):
         print(path)
     if args.json:
-        write_json(args.json, told)
+        write_json(args.json, notes)
     return 0
 
 
@@ -212,7 +213,8 @@ def throw_hybrid(
 
     rows: list[list] = []
     for item in loaded:
-        policy, row = item.policy.to(device), []
+        policy = item.policy.to(device)
+        row = []
         rows.append(row)
         for target in targets:
             status(
@@ -247,9 +249,9 @@ def rows_of(entries: Sequence[Entry]) -> list[dict]:
     """Summaries, target after target, throwers side by side."""
     columns = zip(*(entry.throws for entry in entries))
     return [
-        {"policy": entry.name, "layout": entry.layout, **of.summary()}
+        {"policy": entry.name, "layout": entry.layout, **row.summary()}
         for column in columns
-        for entry, of in zip(entries, column)
+        for entry, row in zip(entries, column)
     ]
 
 

@@ -50,12 +50,13 @@ def run(args: argparse.Namespace) -> int:
 
     if args.throws < 1:
         raise ConfigError(f"--throws {args.throws}; expected 1 or more")
-    begin, count = time.perf_counter(), min(args.throws, REFERENCE_THROWS)
+    begin = time.perf_counter()
+    count = min(args.throws, REFERENCE_THROWS)
     loaded = [load_policy(name) for name in compare.DEFAULT_POLICIES]
     folder = Path(args.out)
     writable(folder)
     if importlib.util.find_spec("mujoco") is None:
-        paths = _here(loaded, folder, args.throws)
+        paths = _throw_here(loaded, folder, args.throws)
         print(
             "The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n"
         )
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         # The reference plant flies in a process of its own meanwhile.
         throws = (loaded, REFERENCE_TARGETS, count, "reference-realistic", SEED, 1)
         with Throwing(*throws, together=True) as throwing:
-            paths = _here(loaded, folder, args.throws)
+            paths = _throw_here(loaded, folder, args.throws)
             print(
                 f"{count} throws a policy on the reference plant, which stands in for a real"
                 " vehicle ...",
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _here(loaded: list, folder: Path, throws: int) -> list[Path]:
+def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
     """One recorded throw, and many in the training simulator."""
     from visthrow.throws.recorded import fly as throw_once
 
@@ -105,6 +106,7 @@ def _tabled(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     from visthrow.view.tables import markdown
 
     entries = compare.entries_of(loaded, compare.DEFAULT_POLICIES, throws)
-    title, rows = compare.title_of(plant, SEED), compare.rows_of(entries)
+    title = compare.title_of(plant, SEED)
+    rows = compare.rows_of(entries)
     print(markdown(rows, title), flush=True)
     return compare.write(folder, entries, rows, plant, title)

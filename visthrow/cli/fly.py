@@ -95,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
         loaded.policy.save(args.save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
-    eyes, rope = None, loaded.experiment.rope
+    eyes = None
+    rope = loaded.experiment.rope
     if args.pixels is not None:
         rendered = load_extra(
             "visthrow.detector_training.eyes", "detector", "--pixels", ConfigError
@@ -162,7 +163,9 @@ def export(path: str, log, experiment) -> None:
 
 def summary_text(log) -> str:
     """Return a summary of the throw in a few lines."""
-    times, result, goal = log.meta["times"], log.meta["result"], log.meta["goal_w"]
+    times = log.meta["times"]
+    result = log.meta["result"]
+    goal = log.meta["goal_w"]
     start = times["policy_start"]
     plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"
     lines = [

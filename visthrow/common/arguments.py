@@ -144,18 +144,18 @@ class _Lazy(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         if self._module is not None:
-            module, self._module = self._module, None
+            module = self._module
+            self._module = None
             importlib.import_module(module).add_arguments(self)
         namespace_out, unknown = super().parse_known_args(args, namespace)
         if (
             unknown and self._subparsers is None
         ):  # else the command's own parser would say it, without its options
             options = [option for option in self._option_string_actions if option.startswith("--")]
-            hint = (
-                f"; {suggest(unknown[0].split('=')[0], options)}"
-                if unknown[0].startswith("-")
-                else ""
-            )
+            if unknown[0].startswith("-"):
+                hint = f"; {suggest(unknown[0].split('=')[0], options)}"
+            else:
+                hint = ""
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return namespace_out, unknown
 
@@ -167,9 +167,10 @@ class StopRequest:
     An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and
     goes on. Threads beside the main one hear no signals."""
 
-    def __init__(self, signals: Sequence[int], said: str = "") -> None:
-        """Begin; ``said``: what the first one is answered on the terminal."""
-        self.asked, self._said = False, said
+    def __init__(self, signals: Sequence[int], message: str = "") -> None:
+        """Begin; ``message``: what the first one is answered on the terminal."""
+        self.asked = False
+        self._said = message
         self._signals = signals if threading.current_thread() is threading.main_thread() else ()
 
     def __enter__(self) -> "StopRequest":

@@ -59,36 +59,36 @@ class StorageError(VisthrowError):
     """A result could not be written: full disk, no permission, missing folder."""
 
 
-MANY = 30
+LONG_LIST = 30
 """Names beyond which those near to a misspelt one are listed in place of all."""
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
+def suggest(name: str, existing: Iterable[str]) -> str:
     """Say what exists, and which of it is closest to a name that does not:
 
     ``"did you mean 'mass'? Known: inertia, mass"``.
     """
-    names = sorted(known)
+    names = sorted(existing)
     if not names:
         return "nothing is known here"
     close = get_close_matches(name, names, n=1)
-    listed, known = ", ".join(names), "known"
-    if len(names) > MANY:
+    listed = ", ".join(names)
+    label = "known"
+    if len(names) > LONG_LIST:
         similar = get_close_matches(name, names, n=5, cutoff=0.0)
-        listed, known = f"{', '.join(similar)}; {len(names) - len(similar)} more exist", "near it"
-    return (
-        f"did you mean '{close[0]}'? {known.capitalize()}: {listed}"
-        if close
-        else f"{known}: {listed}"
-    )
+        listed = f"{', '.join(similar)}; {len(names) - len(similar)} more exist"
+        label = "near it"
+    if close:
+        return f"did you mean '{close[0]}'? {label.capitalize()}: {listed}"
+    return f"{label}: {listed}"
 
 
 def expect_known(
-    names: Iterable[str], known: Collection[str], said: str, error: type[VisthrowError]
+    names: Iterable[str], existing: Collection[str], subject: str, error: type[VisthrowError]
 ) -> None:
-    """Raise ``error`` for the first name that is not known; its message is ``said`` with the name
-    in braces, and what exists.
+    """Raise ``error`` for the first unknown name; its message is ``subject``, with the name in
+    braces, and what exists.
     """
     for name in names:
-        if name not in known:
-            raise error(f"{said.format(name)}; {suggest(name, known)}")
+        if name not in existing:
+            raise error(f"{subject.format(name)}; {suggest(name, existing)}")

@@ -49,9 +49,9 @@ def commit() -> str:
         return variable
     try:
         head = _git(root, "rev-parse", "HEAD")
-        return (
-            f"{head}-dirty" if _git(root, "status", "--porcelain", "--untracked-files=no") else head
-        )
+        if _git(root, "status", "--porcelain", "--untracked-files=no"):
+            return f"{head}-dirty"
+        return head
     except (OSError, subprocess.SubprocessError):
         return variable
 

@@ -13,14 +13,15 @@ import numpy as np
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_SUCCESSOR = np.array([1, 2, 0])
+_LAST = np.array([2, 0, 1])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
     vectors.
     """
-    return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
+    return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
 def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
@@ -48,7 +49,8 @@ def rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
     ``v + 2 w q x v + q x (2 q x v)``.
     """
-    axis, w = quat[..., :3], quat[..., 3:]
+    axis = quat[..., :3]
+    w = quat[..., 3:]
     twice = 2.0 * cross(axis, vector)
     return vector + w * twice + cross(axis, twice)
 
@@ -70,7 +72,9 @@ def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape
     (N, 3).
     """
-    x, w, half = quat[:, :3], quat[:, 3:], 0.5 * angle
+    x = quat[:, :3]
+    w = quat[:, 3:]
+    half = 0.5 * angle
     product = np.hstack(
         (x + w * half + np.cross(x, half), w - np.sum(x * half, axis=1, keepdims=True))
     )
@@ -99,7 +103,9 @@ def rotate_one(quat: Quaternion, vector: Vector) -> Vector:
     """Turn a single vector by a unit quaternion: ``v + 2 q x (q x v + w v)``."""
     x, y, z, w = quat
     vx, vy, vz = vector
-    tx, ty, tz = y * vz - z * vy + w * vx, z * vx - x * vz + w * vy, x * vy - y * vx + w * vz
+    tx = y * vz - z * vy + w * vx
+    ty = z * vx - x * vz + w * vy
+    tz = x * vy - y * vx + w * vz
     return (
         vx + 2.0 * (y * tz - z * ty),
         vy + 2.0 * (z * tx - x * tz),
@@ -116,7 +122,10 @@ def rotation_vector(quat: Quaternion) -> Vector:
     """Axis times angle of a single unit quaternion, below half a turn [rad]."""
     x, y, z, w = quat
     if w < 0.0:
-        x, y, z, w = -x, -y, -z, -w
+        x = -x
+        y = -y
+        z = -z
+        w = -w
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
     return (scale * x, scale * y, scale * z)
@@ -131,9 +140,12 @@ def tilt_and_heading(quat: Quaternion) -> tuple[float, float]:
 
 def quat_of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Quaternion of angles [rad], yaw first, then pitch, then roll."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    cr = math.cos(roll / 2)
+    sr = math.sin(roll / 2)
+    cp = math.cos(pitch / 2)
+    sp = math.sin(pitch / 2)
+    cy = math.cos(yaw / 2)
+    sy = math.sin(yaw / 2)
     return (
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,

@@ -54,9 +54,10 @@ def _resampled(groups: list[np.ndarray], rng: np.random.Generator, draws: int) -
         columns = group.reshape(len(group), -1).T
         means = np.stack([column[index].mean(1) for column in columns], axis=-1)
         by_run.append(means.reshape(draws, count, *group.shape[1:]))
-    chosen = (
-        rng.integers(count, size=(draws, count)) if count > 1 else np.zeros((draws, 1), dtype=int)
-    )
+    if count > 1:
+        chosen = rng.integers(count, size=(draws, count))
+    else:
+        chosen = np.zeros((draws, 1), dtype=int)
     stacked = np.stack(by_run, axis=1)  # (draws, run, copy, ...)
     index = np.arange(draws)[:, None]
     return stacked[index, chosen, np.arange(count)[None]].mean(1)
@@ -104,7 +105,8 @@ def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAW
 def _of_both(
     function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int
 ) -> Interval:
-    first, second = _checked(a), _checked(b)
+    first = _checked(a)
+    second = _checked(b)
     rng = np.random.default_rng(0)
     samples = function(_resampled(first, rng, draws), _resampled(second, rng, draws))
     return _interval(function(_mean(first), _mean(second)), samples, max(len(first), len(second)))
@@ -132,7 +134,8 @@ def correlation(x: np.ndarray, y: np.ndarray) -> Interval:
 
     Raises ValueError: fewer than three pairs, or one side that never varies.
     """
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    x = np.asarray(x, dtype=float)
+    y = np.asarray(y, dtype=float)
     if len(x) != len(y) or len(x) < 3 or not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
         raise ValueError(
             f"{len(x)} and {len(y)} numbers; expected three or more pairs, not all alike"
@@ -144,7 +147,8 @@ def correlation(x: np.ndarray, y: np.ndarray) -> Interval:
 
 def _pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Row by row; NaN where a row of one side is constant."""
-    x, y = x - x.mean(1, keepdims=True), y - y.mean(1, keepdims=True)
+    x = x - x.mean(1, keepdims=True)
+    y = y - y.mean(1, keepdims=True)
     norm = np.sqrt((x**2).sum(1) * (y**2).sum(1))
     return (x * y).sum(1) / np.where(norm > 0.0, norm, np.nan)
 
@@ -195,7 +199,8 @@ def pareto(points: np.ndarray) -> np.ndarray:
     """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the
     first coordinate.
     """
-    front, best = [], np.inf
+    front = []
+    best = np.inf
     for i in np.lexsort((points[:, 1], points[:, 0])):
         if points[i, 1] < best:
             front.append(int(i))

@@ -109,11 +109,11 @@ def require_room(path: str | Path, unpacked: int, error: type[Exception]) -> Non
     for its size.
     """
     size = Path(path).stat().st_size
-    most = max(MOST_UNPACKED, MOST_TIMES * size)
-    if unpacked > most:
+    limit = max(MOST_UNPACKED, MOST_TIMES * size)
+    if unpacked > limit:
         raise error(
             f"{path}: {size / 1e6:.1f} MB that unpack to at least {unpacked / 1e6:.0f} MB; expected"
-            f" {most / 1e6:.0f} MB at most. Where it is right, unpack it first"
+            f" {limit / 1e6:.0f} MB at most. Where it is right, unpack it first"
         )
 
 
@@ -132,7 +132,8 @@ def unpack(path: str | Path, open_: Callable[..., IO[bytes]], error: type[Except
 
 def counted(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
     """Yield lines of a text of a length, and say on standard error how far that is."""
-    begin, done = time.monotonic(), 0
+    begin = time.monotonic()
+    done = 0
     for line in lines:
         yield line
         done += len(line)
@@ -148,11 +149,10 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.n
     or more of it than its size lets expect."""
     path = Path(path)
     if not path.is_file():
-        hint = (
-            sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}"))
-            if path.parent.is_dir()
-            else []
-        )
+        if path.parent.is_dir():
+            hint = sorted(p.name for p in path.parent.glob(f"*{path.suffix or '.npz'}"))
+        else:
+            hint = []
         raise error(
             f"{path}: no such file; expected {what}. In that folder:"
             f" {', '.join(hint) or 'nothing of the kind'}"

@@ -43,8 +43,11 @@ class Workers:
                 with.
             processes, label: of a line of progress on the terminal; empty for none.
         """
-        tasks, context = list(tasks), mp.get_context("spawn")
-        self.label, self._running, self._taken = label, {}, context.Value("i", 0)
+        tasks = list(tasks)
+        context = mp.get_context("spawn")
+        self.label = label
+        self._running = {}
+        self._taken = context.Value("i", 0)
         self._shares = context.Array("d", len(tasks), lock=False)
         work = pickle.dumps(
             (function, tasks)
@@ -68,14 +71,14 @@ class Workers:
             process.join()
 
     def __iter__(self) -> Iterator[tuple[int, Any]]:
-        busy, begin = list(self._running), time.monotonic()
+        busy = list(self._running)
+        begin = time.monotonic()
         while busy:
             share = sum(self._shares) / len(self._shares)
-            remaining = (
-                f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left"
-                if share > 0.02
-                else ""
-            )
+            if share > 0.02:
+                remaining = f", about {(time.monotonic() - begin) * (1 / share - 1):.0f} s left"
+            else:
+                remaining = ""
             if self.label:
                 status(f"{self.label}: {100 * share:3.0f} %{remaining}")
             for end in wait(busy, LOOK):
@@ -132,7 +135,8 @@ def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
         function, tasks = pickle.loads(work)
         while True:
             with taken.get_lock():
-                _index, taken.value = taken.value, taken.value + 1
+                _index = taken.value
+                taken.value = taken.value + 1
             if _index >= len(tasks):
                 end.send((None, None))
                 return

@@ -149,16 +149,18 @@ def without_none(value: Any) -> Any:
     return [without_none(item) for item in value] if isinstance(value, list) else value
 
 
-def _shown(path: Path) -> str:
+def _display_path(path: Path) -> str:
     """Name a file as the user would: relative to where the command runs, if below it."""
-    resolved, cwd = path.resolve(), Path.cwd()
+    resolved = path.resolve()
+    cwd = Path.cwd()
     return str(resolved.relative_to(cwd)) if resolved.is_relative_to(cwd) else str(path)
 
 
 def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> Table:
-    name, resolved = _shown(path), path.resolve()
+    name = _display_path(path)
+    resolved = path.resolve()
     if resolved in stack:
-        chain = " -> ".join(_shown(step) for step in (*stack, resolved))
+        chain = " -> ".join(_display_path(step) for step in (*stack, resolved))
         raise ConfigError(f"{name}: files that include or build on each other in a circle: {chain}")
     try:
         text = path.read_text(encoding="utf-8")
@@ -189,20 +191,22 @@ def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, 
 def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], path: str) -> None:
     """Replace each string that stands where the schema wants a table by the file that it names."""
     for key, annotation in _schema.hints(schema).items():
-        wanted, node = dataclass_of(annotation), tree.items.get(key)
-        if wanted is None or node is None:
+        table_type = dataclass_of(annotation)
+        node = tree.items.get(key)
+        if table_type is None or node is None:
             continue
         place = f"{path}.{key}" if path else key
         if isinstance(node, Table):
-            _include(wanted, node, folder, stack, place)
+            _include(table_type, node, folder, stack, place)
         elif _names_file(node, annotation):
             tree.items[key] = _read(
-                wanted, _lookup(wanted, node.value, folder, node.source, place), stack
+                table_type, _lookup(table_type, node.value, folder, node.source, place), stack
             )
 
 
 def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Path:
-    root, kinds = configs_root(), kinds_of(schema)
+    root = configs_root()
+    kinds = kinds_of(schema)
     for candidate in dict.fromkeys(
         (folder / name, root / name, *(root / kind / name for kind in kinds))
     ):
@@ -214,11 +218,13 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
         for path in root.glob(f"{kind}/*.toml")
     }
     short = [
-        other for other in sorted(shipped) if Path(other).stem == name
+        path_ for path_ in sorted(shipped) if Path(path_).stem == name
     ]  # a name as the command line takes it
     meant = f"did you mean '{short[0]}'?" if short else suggest(name, shipped)
     _schema.fail(
-        source, key, f"no file '{name}', neither in {_shown(folder)} nor under configs; {meant}"
+        source,
+        key,
+        f"no file '{name}', neither in {_display_path(folder)} nor under configs; {meant}",
     )
 
 
@@ -231,9 +237,9 @@ def _override(schema: type, tree: Table, override: str) -> None:
     current: Any = schema
     for depth, key in enumerate(keys):
         place = ".".join(keys[:depth])
-        wanted = dataclass_of(current)
-        if wanted is not None:
-            fields = _schema.hints(wanted)
+        table_type = dataclass_of(current)
+        if table_type is not None:
+            fields = _schema.hints(table_type)
             if key not in fields:
                 _schema.fail(source, place, f"unknown key '{key}'; {suggest(key, fields)}")
             current = fields[key]
@@ -252,9 +258,9 @@ def _override(schema: type, tree: Table, override: str) -> None:
             tree = child
     node = _schema.as_node(_toml_value(text.strip()), source)
     tree.items[keys[-1]] = node
-    if (wanted := dataclass_of(current)) is not None and _names_file(node, current):
+    if (table_type := dataclass_of(current)) is not None and _names_file(node, current):
         tree.items[keys[-1]] = _read(
-            wanted, _lookup(wanted, node.value, Path.cwd(), source, ".".join(keys)), ()
+            table_type, _lookup(table_type, node.value, Path.cwd(), source, ".".join(keys)), ()
         )
 
 

@@ -67,7 +67,8 @@ def describe(annotation: Any) -> str:
         return f'"{NONE_WORD}"'
     if is_union(annotation):
         return " or ".join(describe(option) for option in typing.get_args(annotation))
-    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    args = typing.get_args(annotation)
     if origin is Literal:
         return "one of " + ", ".join(repr(arg) for arg in args)
     if origin is tuple:
@@ -103,7 +104,8 @@ def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
     schema = dataclass_of(annotation)
     if schema is not None:
         return _build_dataclass(schema, node, path)
-    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    origin = typing.get_origin(annotation)
+    args = typing.get_args(annotation)
     if origin is dict:
         if not isinstance(node, Table):
             _wrong_type(annotation, node, path)
@@ -141,7 +143,8 @@ def _build_union(annotation: Any, node: Leaf | Table, path: str) -> Any:
 def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
     if not isinstance(node, Table):
         _wrong_type(schema, node, path)
-    types_of, unset = hints(schema), dataclasses.MISSING
+    types_of = hints(schema)
+    unset = dataclasses.MISSING
     for key, item in node.items.items():
         if key not in types_of:
             fail(item.source, _join(path, key), f"unknown key; {suggest(key, types_of)}")
@@ -182,7 +185,7 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
                 fail(
                     item.source,
                     _join(_join(path, key), "name"),
-                    f"got {_shown(base_name)}; expected the heading, {key!r}",
+                    f"got {_described(base_name)}; expected the heading, {key!r}",
                 )
             table.items["name"] = Leaf(key, item.source)
         base = item.items.get(BASE_KEY)
@@ -190,27 +193,27 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
             return table
         siblings = {k for k, v in node.items.items() if isinstance(v, Table)} - {key, *above}
         if not isinstance(base, Leaf) or base.value not in siblings:
-            problem = (
-                f"got {_shown(base)}; expected another table; {suggest(_shown(base), siblings)}"
-            )
+            value = _described(base)
+            problem = f"got {value}; expected another table; {suggest(value, siblings)}"
             fail(item.source, _join(_join(path, key), BASE_KEY), problem)
         return merged(row(base.value, (key, *above)), table)
 
     return {key: row(key, ()) for key in node.items}
 
 
-def _shown(node: Leaf | Table) -> str:
+def _described(node: Leaf | Table) -> str:
     return repr(node.value) if isinstance(node, Leaf) else "a table"
 
 
-def merged(under: Table, over: Table) -> Table:
+def merged(base: Table, override: Table) -> Table:
     """Return one table with another's values on top of its own, table by table."""
-    combined = Table(over.source, dict(under.items))
-    for key, item in over.items.items():
+    combined = Table(override.source, dict(base.items))
+    for key, item in override.items.items():
         below = combined.items.get(key)
-        combined.items[key] = (
-            merged(below, item) if isinstance(item, Table) and isinstance(below, Table) else item
-        )
+        if isinstance(item, Table) and isinstance(below, Table):
+            combined.items[key] = merged(below, item)
+        else:
+            combined.items[key] = item
     return combined
 
 
@@ -253,11 +256,10 @@ def as_table(values: dict[str, Any], source: str) -> Table:
 
 def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:
     table = isinstance(node, Table)
-    actual = (
-        f"a table with the keys {', '.join(node.items) or '(none)'}"
-        if table
-        else f"{node.value!r} ({type(node.value).__name__})"
-    )
+    if table:
+        actual = f"a table with the keys {', '.join(node.items) or '(none)'}"
+    else:
+        actual = f"{node.value!r} ({type(node.value).__name__})"
     fail(node.source, path, f"got {actual}; expected {describe(annotation)}")
 
 

@@ -47,7 +47,7 @@ BENT = {"fx": 232.0, "fy": 232.0, "k1": 0.05, "k2": -0.006, "fov_deg": 145.0}
 
 HIT = 4.0  # a detection whose points are off by more than this on average is of something else [px]
 
-KNOWN = ("nothing", "pose", "track")
+PRIORS = ("nothing", "pose", "track")
 """What detectors are told besides the picture: nothing; attitude and height; also where the ball
 was a frame ago, and how far it can be while it hangs. The runner tells all of it.
 """
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check.add_argument(
         "--known",
         default="pose",
-        choices=KNOWN,
+        choices=PRIORS,
         help="what the detectors are told; track: as in flight (default: pose)",
     )
     check.add_argument(
@@ -231,11 +231,9 @@ def _thrown(
     from visthrow.throws.reference_protocol import fly_batch
 
     bad = Nuisances(*(looks["nuisances"],) * len(fields(Nuisances)))
-    camera, rope, halls = (
-        loaded.experiment.camera,
-        loaded.experiment.rope,
-        1000 * job.seed + job.batch,
-    )
+    camera = loaded.experiment.camera
+    rope = loaded.experiment.rope
+    halls = 1000 * job.seed + job.batch
     eyes = RenderedEyes(
         camera,
         rope.mount,
@@ -259,11 +257,10 @@ def train(args: argparse.Namespace) -> int:
     folder = Path(args.out)
     saved = folder / CHECKPOINT
     if saved.exists() != args.resume:
-        present = (
-            "holds a training; go on with --resume, or name another folder"
-            if saved.exists()
-            else "no checkpoint to resume from"
-        )
+        if saved.exists():
+            present = "holds a training; go on with --resume, or name another folder"
+        else:
+            present = "no checkpoint to resume from"
         raise VisthrowError(f"{folder}: {present}")
     files = None if args.textures is None else photographs(args.textures)
     fit = Fit(
@@ -275,7 +272,8 @@ def train(args: argparse.Namespace) -> int:
     if args.resume:
         fit.load(saved)
     folder.mkdir(parents=True, exist_ok=True)
-    begin, first = time.monotonic(), fit.step
+    begin = time.monotonic()
+    first = fit.step
 
     def tell(step: int, losses: dict[str, float]) -> None:
         spent = time.monotonic() - begin
@@ -320,17 +318,19 @@ def check(args: argparse.Namespace) -> int:
         )
     camera = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
     renderer = Renderer(camera.fisheye, resolve(args.device), photographs(args.textures, HELD_OUT))
-    networks, table, rows = Networks.load(args.weights or SHIPPED), {}, []
+    networks = Networks.load(args.weights or SHIPPED)
+    table = {}
+    rows = []
 
-    def both(camera: CameraParams) -> dict[str, Detector]:
+    def detectors_of(camera: CameraParams) -> dict[str, Detector]:
         parts = Fisheye(camera.fisheye), camera.payload_radius, camera.goal_side
         return {"learnt": LearntDetector(*parts, networks=networks), "opencv": Detector(*parts)}
 
-    detectors = both(camera)
+    detectors = detectors_of(camera)
     for level, nuisances in LEVELS.items():
         if level == OTHER_LENS:
             camera = replace(camera, fisheye=replace(camera.fisheye, **BENT))
-            detectors = both(camera)
+            detectors = detectors_of(camera)
         table[level], pictures = counted(
             camera, renderer, detectors, nuisances, args.frames, args.seed, args.known
         )
@@ -371,12 +371,11 @@ def mistaken(detectors: dict) -> dict[str, Any]:
     counts: dict[str, Any] = {"looks": 0} | {name: {"ball": 0, "goal": 0} for name in detectors}
     for path in photographs(names=TRAINING + HELD_OUT):
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        height, width = picture.shape[0] * 2 // 3, picture.shape[1] * 2 // 3
+        height = picture.shape[0] * 2 // 3
+        width = picture.shape[1] * 2 // 3
         for k in range(9):
-            top, left = (
-                (picture.shape[0] - height) * (k // 3) // 2,
-                (picture.shape[1] - width) * (k % 3) // 2,
-            )
+            top = (picture.shape[0] - height) * (k // 3) // 2
+            left = (picture.shape[1] - width) * (k % 3) // 2
             cut = cv2.resize(
                 picture[top : top + height, left : left + width],
                 (640, 640),
@@ -402,33 +401,37 @@ def figures_of(
         spent: times of the frames [s].
     """
     figures: dict[str, float] = {}
-    hits = np.array([there and reported and off < HIT for _, there, reported, off, _ in rows])
+    hits = np.array([visible and reported and off < HIT for _, visible, reported, off, _ in rows])
     _, was_there, reports, errors, probabilities = map(np.array, zip(*rows))
     for kind in ("ball", "goal"):
         of_kind = np.array([row[0] == kind for row in rows])
         off = errors[of_kind & hits] if np.any(of_kind & hits) else np.array([math.nan])
-        there, reported, hit = (int(np.sum(of_kind & of)) for of in (was_there, reports, hits))
+        visible, reported, hit = (
+            int(np.sum(of_kind & selected)) for selected in (was_there, reports, hits)
+        )
         figures |= {
-            f"{kind}_there": there,
-            f"{kind}_recall": hit / max(there, 1),
+            f"{kind}_there": visible,
+            f"{kind}_recall": hit / max(visible, 1),
             f"{kind}_precision": hit / max(reported, 1),
             f"{kind}_median_px": float(np.median(off)),
             f"{kind}_p95_px": float(np.percentile(off, 95)),
         }
-    ratio = (
-        float(probabilities[reports].mean() - hits[reports].mean()) if np.any(reports) else math.nan
-    )
+    if np.any(reports):
+        ratio = float(probabilities[reports].mean() - hits[reports].mean())
+    else:
+        ratio = math.nan
     return figures | {"seconds": float(np.median(spent)), "overconfidence": ratio}
 
 
-def known_of(known: str, truth, height: float, e: int, rng: np.random.Generator):
+def known_of(prior: str, truth, height: float, e: int, rng: np.random.Generator):
     """Return a detector's prior knowledge of scene e; see :data:`KNOWN`."""
     from camera.detectors.contours import Known
     from visthrow.detector_training.eyes import HANGING
 
-    rot_wc, distance = truth.rot_wc[e].numpy(), float(truth.ball_c[e].norm())
-    pose = {"up_c": rot_wc[2], "height": height, "north_c": rot_wc[0]} if known != "nothing" else {}
-    if known != "track":
+    rot_wc = truth.rot_wc[e].numpy()
+    distance = float(truth.ball_c[e].norm())
+    pose = {"up_c": rot_wc[2], "height": height, "north_c": rot_wc[0]} if prior != "nothing" else {}
+    if prior != "track":
         return Known(**pose)
     ray = truth.ball_ray[e].numpy() + TRACK_ERROR / math.sqrt(2.0) * rng.standard_normal(3)
     return Known(
@@ -445,7 +448,7 @@ def counted(
     nuisances: dict[str, float],
     frames: int,
     seed: int,
-    known: str,
+    prior: str,
 ) -> tuple[dict[str, dict[str, float]], list]:
     """Figures of each detector in random frames, and pictures of the first four with what the first
     detector found.
@@ -457,25 +460,26 @@ def counted(
     from camera.overlay import draw_overlay
     from visthrow.detector_training.scenes.scene import Nuisances, random_scenes, truth_of
 
-    lens, eyes = (
-        Fisheye(camera.fisheye),
-        KeypointCamera(replace(camera, noise=replace(camera.noise, invalid_reads="edge"))),
-    )
+    lens = Fisheye(camera.fisheye)
+    eyes = KeypointCamera(replace(camera, noise=replace(camera.noise, invalid_reads="edge")))
     none = dict.fromkeys(Nuisances.__dataclass_fields__, 0.0)
-    rows, spent, pictures = {name: [] for name in detectors}, {name: [] for name in detectors}, []
+    rows = {name: [] for name in detectors}
+    spent = {name: [] for name in detectors}
+    pictures = []
     for first in range(0, frames, 8):
         number = 7_000_000 + 1000 * seed + first
         scenes = random_scenes(
             camera, renderer.textures, min(8, frames - first), number, Nuisances(**none | nuisances)
         )
-        truth, images = truth_of(scenes, lens), renderer.render(scenes, seed).cpu().numpy()
+        truth = truth_of(scenes, lens)
+        images = renderer.render(scenes, seed).cpu().numpy()
         corners, _ = lens.project(truth.corners_c)
         box, _ = payload_keypoints(eyes, truth.ball_c.float())
         true = np.concatenate([corners.numpy(), lens.denormalize(box).numpy()], 1)
         for e, image in enumerate(images[..., ::-1]):
             rot_wc = truth.rot_wc[e].numpy()
             knows = known_of(
-                known, truth, float(scenes.pose[e, 2]), e, np.random.default_rng([number, e])
+                prior, truth, float(scenes.pose[e, 2]), e, np.random.default_rng([number, e])
             )
             for name, detector in detectors.items():
                 begin = time.perf_counter()
@@ -489,11 +493,12 @@ def counted(
                     ("ball", slice(GOAL_KEYPOINTS, None)),
                     ("goal", slice(0, GOAL_KEYPOINTS)),
                 ):
-                    thing, there = getattr(detection, kind), bool(getattr(truth, f"{kind}_seen")[e])
+                    thing = getattr(detection, kind)
+                    visible = bool(getattr(truth, f"{kind}_seen")[e])
                     rows[name].append(
                         (
                             kind,
-                            there,
+                            visible,
                             thing is not None,
                             float(off[part].mean()),
                             getattr(thing, "score", 0.0),

@@ -26,7 +26,7 @@ HANGING = (0.2, 0.6)  # distance of a hanging ball from the lens [m]
 
 SURE = 0.5  # share of the looks in a hover in which ball and goal must be found
 
-BY = ("learnt", "contours")  # detectors
+METHODS = ("learnt", "contours")  # detectors
 
 THINGS = ("ball", "goal")  # what they look for
 
@@ -88,12 +88,16 @@ class RenderedEyes:
             nuisances: left out, all. weights: of the learnt detector; left out, those that are
                 shipped. keep: whether frames are kept.
         """
-        if by not in BY:
-            raise ValueError(f"detector '{by}'; expected one of {', '.join(BY)}")
-        self.params, self.count, self._keep = params, count, keep
-        self._mount_b, self._below = np.array(mount_b, float), below
+        if by not in METHODS:
+            raise ValueError(f"detector '{by}'; expected one of {', '.join(METHODS)}")
+        self.params = params
+        self.count = count
+        self._keep = keep
+        self._mount_b = np.array(mount_b, float)
+        self._below = below
         self.renderer = Renderer(params.fisheye, device, photographs(names=HELD_OUT), samples)
-        self._draw, self._nuisances = (count, seed), nuisances or Nuisances()
+        self._draw = (count, seed)
+        self._nuisances = nuisances or Nuisances()
         lens = Fisheye(params.fisheye)
         if by == "learnt":
             networks = Networks.load(weights) if weights else Networks.load()
@@ -102,7 +106,8 @@ class RenderedEyes:
             )
         else:
             self.detector = Detector(lens, params.payload_radius, params.goal_side)
-        self.camera, self._looks = KeypointCamera(params), 0
+        self.camera = KeypointCamera(params)
+        self._looks = 0
         self._hall: Scenes | None = None
         self._followed: list[Following] = []
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
@@ -113,35 +118,33 @@ class RenderedEyes:
         }  # looks of each vehicle in which it was found
 
     def look(
-        self, now: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray
+        self, snapshot: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Take and look at a picture of each vehicle: normalised keypoints, float32, shape (E, 8,
         2), and validity, shape (E, 8).
 
         Args:
-            now: truth, a `visthrow.throws.plants.Snapshot`. measured: likewise, what poses tell:
-                attitude and height help the detector.
+            snapshot: truth, a `visthrow.throws.plants.Snapshot`.
+            measured: likewise, as poses report it; attitude and height help the detector.
             goal_w: [m], shape (E, 3). carried: which payloads hang, shape (E,).
         """
         pictures = (
-            self.renderer.render(self._scenes(now, goal_w, np.asarray(carried)), self._looks)
+            self.renderer.render(self._scenes(snapshot, goal_w, np.asarray(carried)), self._looks)
             .cpu()
             .numpy()
         )
         self._looks += 1
-        points, valid = (
-            np.zeros((self.count, KEYPOINTS, 2), np.float32),
-            np.zeros((self.count, KEYPOINTS), bool),
-        )
+        points = np.zeros((self.count, KEYPOINTS, 2), np.float32)
+        valid = np.zeros((self.count, KEYPOINTS), bool)
         rots = rotation_from_quat(torch.from_numpy(np.array(measured.quat_wb, float))).numpy()
         if not self._followed:
             self._followed = [self._hanging(rot) for rot in rots]
         for e in range(self.count):
             picture = np.ascontiguousarray(pictures[e, ..., ::-1])
-            seen = self._looked(
+            detections = self._looked(
                 picture, e, measured.pos_w[e], rots[e], bool(carried[e]), float(measured.time)
             )
-            one, ok = detected_keypoints(self.camera, seen, rots[e])
+            one, ok = detected_keypoints(self.camera, detections, rots[e])
             points[e], valid[e] = one.numpy(), ok.numpy()
             if e == 0 and self._keep:
                 self.frames.append((picture, one, ok))
@@ -181,7 +184,7 @@ class RenderedEyes:
         """
         rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
         eye_w = pos_w + rot_wb @ np.array(self.params.mount.position_b)
-        seen = self.detector.detect(
+        detections = self.detector.detect(
             picture,
             self._followed[e].known(
                 rot_wc, rot_wb[:, 2], eye_w, HANGING if carried else None, stamp
@@ -189,9 +192,9 @@ class RenderedEyes:
         )
         self.found["frames"] += 1
         for name in THINGS:
-            self._hits[name][e] += getattr(seen, name) is not None
-            self.found[name] += getattr(seen, name) is not None
-        return self._followed[e].take(seen, rot_wc, stamp)
+            self._hits[name][e] += getattr(detections, name) is not None
+            self.found[name] += getattr(detections, name) is not None
+        return self._followed[e].take(detections, rot_wc, stamp)
 
     def sheet(self, path: Path) -> Path:
         """Draw six of the kept frames, spread over the throw, with what was found; returns the
@@ -204,30 +207,30 @@ class RenderedEyes:
         chosen = [
             self.frames[i] for i in np.linspace(0, len(self.frames) - 1, 6).round().astype(int)
         ]
-        drawn = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]
-        sheet = np.vstack([np.hstack(drawn[:3]), np.hstack(drawn[3:])])
+        tiles = [draw_overlay(self.camera, points, ok, image) for image, points, ok in chosen]
+        sheet = np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
         atomic_write(path, cv2.imencode(".png", sheet)[1].tobytes())
         return path
 
-    def _scenes(self, now: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
+    def _scenes(self, snapshot: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
         """The halls with vehicles, balls and squares where they are."""
         tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
-        rot = rotation_from_quat(tensor(now.quat_wb))
+        rot = rotation_from_quat(tensor(snapshot.quat_wb))
         plain = posed_scenes(
             self.params,
-            tensor(now.pos_w),
+            tensor(snapshot.pos_w),
             rot,
-            tensor(now.payload_pos_w),
+            tensor(snapshot.payload_pos_w),
             tensor(goal_w),
             torch.from_numpy(carried),
         )
         hall = self._hall = self._hall or dressed(
             plain, Draw(*self._draw), self.renderer.textures, self._nuisances
         )
-        rate = tensor(now.rate_b)
+        rate = tensor(snapshot.rate_b)
         turned = rate @ self.camera.rot_cb.T
         lens = torch.linalg.cross(rate, self.camera.position_b.expand(self.count, 3))
-        vel = tensor(now.vel_w) + torch.einsum("eij,ej->ei", rot, lens)
+        vel = tensor(snapshot.vel_w) + torch.einsum("eij,ej->ei", rot, lens)
         rope = torch.cat(
             [
                 plain.rope[:, :3],
@@ -236,7 +239,7 @@ class RenderedEyes:
             ],
             -1,
         )
-        ball = torch.cat([plain.ball[:, :4], tensor(now.payload_vel_w), hall.ball[:, 7:]], -1)
+        ball = torch.cat([plain.ball[:, :4], tensor(snapshot.payload_vel_w), hall.ball[:, 7:]], -1)
         return replace(
             hall,
             pose=torch.cat([plain.pose[:, :7], vel, turned], -1),

@@ -36,7 +36,7 @@ from camera.params import CameraParams
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Truth, lens_row, random_scenes, truth_of
 
-NEAR = 0.5  # a finding within this many sizes of the thing is of it
+MATCH_RADIUS = 0.5  # a finding within this many sizes of the thing is of it
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,8 @@ def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Lab
 
 def other_lens(lens, generator: torch.Generator):
     """A lens like this one with another scale and a bend, its picture of the same size."""
-    scale, bend = (
-        (1.0 + 0.35 * torch.rand(1, generator=generator)).item(),
-        (0.06 * torch.rand(1, generator=generator) - 0.04).item(),
-    )
+    scale = (1.0 + 0.35 * torch.rand(1, generator=generator)).item()
+    bend = (0.06 * torch.rand(1, generator=generator) - 0.04).item()
     reach = 0.98 * min(lens.width, lens.height) / 2.0 / (lens.fx * scale)
     half = min(lens.half_fov, 1.75)
     while half * (1.0 + bend * half * half) > reach:
@@ -136,7 +134,9 @@ class FramePool:
 
     def __init__(self, params: FitParams, camera: CameraParams, renderer: Renderer) -> None:
         """Start empty."""
-        self.params, self.camera, self.renderer = params, camera, renderer
+        self.params = params
+        self.camera = camera
+        self.renderer = renderer
         self.blocks: list[tuple[Tensor, Labels, Fisheye]] = []
 
     def refill(self, step: int) -> None:
@@ -181,7 +181,8 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
     """Loss of places, after Zhou et al., "Objects as Points", 2019: focal about a soft peak; place
     and size at the peak's cell.
     """
-    total, (height, width) = grids.new_zeros(()), grids.shape[-2:]
+    total = grids.new_zeros(())
+    (height, width) = grids.shape[-2:]
     cells = torch.stack(
         torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy"), -1
     ).to(grids)
@@ -285,16 +286,17 @@ def look_loss(
     loss = (loss * judged).sum() / judged.sum().clamp(min=1)
     off = offsets(kind, views, outputs, labels, index)
     where = off.abs().mean(1)
-    error = (
-        off[:, :2].norm(dim=-1) if kind == "ball" else off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
-    )
+    if kind == "ball":
+        error = off[:, :2].norm(dim=-1)
+    else:
+        error = off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
     spread = outputs[:, 1].clamp(-8.0, 3.0)
     accuracy = (error.detach() / spread.exp()).clamp(max=50.0) + spread  # of a Laplace distribution
     present = present.float()
     return loss + ((8.0 * where + 0.2 * accuracy) * present).sum() / present.sum().clamp(min=1)
 
 
-def offsets(kind: str, views: Views, found: Tensor, labels: Labels, index: Tensor) -> Tensor:
+def offsets(kind: str, views: Views, detections: Tensor, labels: Labels, index: Tensor) -> Tensor:
     """Return the error of detections in half sides; of a ball the last column is of its
     log size.
     """
@@ -302,8 +304,8 @@ def offsets(kind: str, views: Views, found: Tensor, labels: Labels, index: Tenso
         size = (labels.sizes["ball"][index] * REACH["ball"] / views.reach).log()
         return torch.cat(
             [
-                found[:, 2:4] - views.points(labels.rays["ball"][index, None])[:, 0],
-                0.5 * (found[:, 4] - size)[:, None],
+                detections[:, 2:4] - views.points(labels.rays["ball"][index, None])[:, 0],
+                0.5 * (detections[:, 4] - size)[:, None],
             ],
             -1,
         )
@@ -315,7 +317,7 @@ def offsets(kind: str, views: Views, found: Tensor, labels: Labels, index: Tenso
     match = torch.stack([(off.roll(-k, 1) * quadrants).sum((1, 2)) for k in range(4)], 1).argmax(1)
     order = (torch.arange(4, device=corners.device)[None] + match[:, None]) % 4
     corners = torch.gather(corners, 1, order[..., None].expand(-1, -1, 2))
-    return found[:, 2:] - corners.clamp(-3.0, 3.0).flatten(1)
+    return detections[:, 2:] - corners.clamp(-3.0, 3.0).flatten(1)
 
 
 class Fit:
@@ -341,7 +343,9 @@ class Fit:
         import kornia.augmentation as augmentations
 
         torch.manual_seed(params.seed)
-        self.params, self.camera, self.device = params, camera, device
+        self.params = params
+        self.camera = camera
+        self.device = device
         self.networks = Networks().to(device)
         self.renderer = Renderer(camera.fisheye, device, files, params.samples)
         self.pool = FramePool(params, camera, self.renderer)
@@ -373,7 +377,8 @@ class Fit:
             self.pool.refill(self.step)
         frames, labels, lens = self.pool.take(host)
         chosen = torch.randperm(len(frames), generator=host)[: p.batch].to(self.device)
-        frames, labels = frames[chosen], _chosen(labels, chosen)
+        frames = frames[chosen]
+        labels = _chosen(labels, chosen)
         grids = self.networks.search(self.augment(halved(frames)))
         losses = {"search": search_loss(grids, labels, lens)}
         for k, kind in enumerate(KINDS):
@@ -476,22 +481,23 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
     """Score the places of one frame: logit, whether it is of the thing, error [rad], told
     accuracy [rad]; a row each.
     """
-    places, scores = places_of(networks.search(halved(frame)), lens), {}
+    places = places_of(networks.search(halved(frame)), lens)
+    scores = {}
     for kind in KINDS:
         rays, sizes = places[kind]
         views, out, rays, sizes = looked(networks, kind, frame, rays, sizes, lens, labels.north)
-        error = _apart(rays, labels.rays[kind])
+        error = _angle_between(rays, labels.rays[kind])
         hit = (
             labels.seen[kind]
-            & (error < NEAR * labels.sizes[kind])
+            & (error < MATCH_RADIUS * labels.sizes[kind])
             & ((sizes / labels.sizes[kind]).log().abs() < 0.5)
         )
         if kind == "goal":
-            error = _apart(
+            error = _angle_between(
                 views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1], labels.corners
             ).amin(-1)
         clear = labels.seen[kind] | (
-            _apart(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
+            _angle_between(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
         )  # else half in view
         rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
         scores[kind] = rows[clear.expand(len(rows))]
@@ -503,10 +509,8 @@ def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
 
     Source: Platt, "Probabilistic outputs for support vector machines", 1999; Newton's steps with a
     weak prior at 1 and 0."""
-    weights, x = (
-        torch.tensor([1.0, 0.0], dtype=torch.float64),
-        torch.stack([logits, torch.ones_like(logits)], -1),
-    )
+    weights = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    x = torch.stack([logits, torch.ones_like(logits)], -1)
     prior = torch.tensor([1.0, 0.0], dtype=torch.float64)
     for _ in range(50):
         p = (x @ weights).sigmoid()
@@ -516,11 +520,11 @@ def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
     return float(weights[0]), float(weights[1])
 
 
-def _apart(rays: Tensor, others: Tensor) -> Tensor:
+def _angle_between(rays: Tensor, references: Tensor) -> Tensor:
     """Angles between unit rays [rad], exact for small ones."""
-    return torch.linalg.cross(*torch.broadcast_tensors(rays, others)).norm(dim=-1).clamp(
+    return torch.linalg.cross(*torch.broadcast_tensors(rays, references)).norm(dim=-1).clamp(
         max=1.0
-    ).asin() + (((rays * others).sum(-1) < 0.0) * math.pi / 2)
+    ).asin() + (((rays * references).sum(-1) < 0.0) * math.pi / 2)
 
 
 def _chosen(labels: Labels, rows: Tensor) -> Labels:
@@ -539,8 +543,10 @@ def _peaks(grids: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:
     logits = grids[:, 0].flatten(1)
     best = logits.topk(3, dim=1).indices
     best = best.gather(1, torch.randint(3, (len(best), 1), device=best.device))[:, 0]
-    width, rows = grids.shape[-1], torch.arange(len(grids), device=grids.device)
-    j, i = best // width, best % width
+    width = grids.shape[-1]
+    rows = torch.arange(len(grids), device=grids.device)
+    j = best // width
+    i = best % width
     place = torch.stack([i, j], -1) + 0.5 + grids[rows, 1:3, j, i].clamp(-1, 1)
     rays, _ = lens.unproject(place * CELL - 0.5)
     return F.normalize(rays, dim=-1), grids[rows, 3, j, i].clamp(-6.0, 3.0).exp() * (

@@ -75,17 +75,17 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
     colon.
     """
     file, _, pattern = str(path).rpartition(":")
-    first, *others = str(path).split("+")
-    if others and Path(first).exists():
+    first, *further = str(path).split("+")
+    if further and Path(first).exists():
         from visthrow.logs.joining import join
 
-        found = [read(of, mapping) for of in (first, *others)]
-        for of, logs in zip((first, *others), found):
+        groups = [read(part, mapping) for part in (first, *further)]
+        for part, logs in zip((first, *further), groups):
             if len(logs) != 1:
                 raise LogError(
-                    f"{of}: {len(logs)} logs in it; joining needs one of each, named as FILE:PART"
+                    f"{part}: {len(logs)} logs in it; joining needs one of each, named as FILE:PART"
                 )
-        return [join([log for logs in found for log in logs])]
+        return [join([log for logs in groups for log in logs])]
     if Path(file).is_file():
         logs = read(file, mapping)
         names = [str(log.meta.get("part", "")) for log in logs]
@@ -100,9 +100,9 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
 
 def _missing(path: Path) -> LogError:
     folder = path if path.is_dir() else path.parent
-    near = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    came = "a folder, expected a file" if path.is_dir() else "no such file"
-    return LogError(f"{path}: {came}; in that folder: {', '.join(near[:20]) or 'nothing'}")
+    siblings = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+    actual = "a folder, expected a file" if path.is_dir() else "no such file"
+    return LogError(f"{path}: {actual}; in that folder: {', '.join(siblings[:20]) or 'nothing'}")
 
 
 def _of_folder(path: Path) -> list[FlightLog]:

@@ -43,7 +43,9 @@ def turn_of(axes: str) -> np.ndarray:
     if is_mirror(axes):
         signs = [np.where(np.arange(3) == row, -1.0, 1.0)[:, None] * matrix for row in range(3)]
         hint = " ".join(
-            next(name for name, known in zip(EVERY, MATRICES) if np.array_equal(known, one))
+            next(
+                name for name, exchange in zip(EXCHANGES, MATRICES) if np.array_equal(exchange, one)
+            )
             for one in signs
         )
         raise ValueError(
@@ -58,13 +60,13 @@ def is_mirror(axes: str) -> bool:
     return bool(np.linalg.det(matrix_of(axes)) < 0.0)
 
 
-EVERY = tuple(
+EXCHANGES = tuple(
     ",".join(sign + letter for sign, letter in zip(signs, order))
     for order in permutations("xyz")
     for signs in product(("", "-"), repeat=3)
 )
 """All 48 sets."""
-TURNS = tuple(axes for axes in EVERY if not is_mirror(axes))  # the 24 that are turns
+TURNS = tuple(axes for axes in EXCHANGES if not is_mirror(axes))  # the 24 that are turns
 MATRICES = np.array(
-    [matrix_of(axes) for axes in EVERY]
-)  # matrix of each of :data:`EVERY`, shape (48, 3, 3)
+    [matrix_of(axes) for axes in EXCHANGES]
+)  # matrix of each of :data:`EXCHANGES`, shape (48, 3, 3)

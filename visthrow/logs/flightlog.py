@@ -78,11 +78,10 @@ class Channel:
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
         values = np.asarray(self.values)
-        valid = (
-            np.ones(len(time), dtype=bool)
-            if self.valid is None
-            else np.asarray(self.valid, dtype=bool)
-        )
+        if self.valid is None:
+            valid = np.ones(len(time), dtype=bool)
+        else:
+            valid = np.asarray(self.valid, dtype=bool)
         if (
             time.ndim != 1
             or values.ndim < 1
@@ -169,7 +168,8 @@ class FlightLog:
             spec = STANDARD_CHANNELS.get(name)
             if spec is None:
                 continue
-            actual, expected = (channel.unit, channel.frame), (spec.unit, spec.frame)
+            actual = (channel.unit, channel.frame)
+            expected = (spec.unit, spec.frame)
             if actual != expected:
                 raise LogError(
                     f"channel '{name}' is in unit and frame {actual}; its name stands for"
@@ -243,7 +243,9 @@ class FlightLog:
         arrays = loadz(path, LogError, "a flight log")
         try:
             header = from_json_array(arrays["header"])
-            version, units, meta = header["format_version"], header["channels"], header["meta"]
+            version = header["format_version"]
+            units = header["channels"]
+            meta = header["meta"]
             if version != FORMAT_VERSION:
                 raise LogError(
                     f"format version {version}; this program reads version {FORMAT_VERSION}"

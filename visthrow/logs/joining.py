@@ -17,7 +17,7 @@ from visthrow.logs.check import relations
 from visthrow.logs.flightlog import FlightLog
 
 RATE = 50.0  # rate of the grid on which logs are first laid over one another [Hz]
-LEAST = (
+THRESHOLD = (
     0.6  # correlation of what was measured twice, below which two logs are not taken for one flight
 )
 _FINE = 0.1  # around the coarse answer [s]
@@ -38,11 +38,9 @@ def join(logs: Sequence[FlightLog]) -> FlightLog:
     Raises LogError: nothing was measured in both, or it does not go together.
     """
     whole, *other_logs = logs
-    channels, meta, estimated = (
-        dict(whole.channels),
-        dict(whole.meta),
-        set(whole.meta.get("estimated", ())),
-    )
+    channels = dict(whole.channels)
+    meta = dict(whole.meta)
+    estimated = set(whole.meta.get("estimated", ()))
     meta["joined"] = []
     for log in other_logs:
         offset, correlation, signal = offset_of(FlightLog(channels, {"estimated": estimated}), log)
@@ -73,23 +71,24 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
     Raises LogError: nothing was measured in both, or it does not go together.
     """
     tried = []
-    for by, signal in (("body rates", _turning), ("speed", _velocity), ("force", _force)):
-        a, b = signal(first.measured()), signal(second.measured())
+    for method, signal in (("body rates", _turning), ("speed", _velocity), ("force", _force)):
+        a = signal(first.measured())
+        b = signal(second.measured())
         if a is not None and b is not None and min(len(a[0]), len(b[0])) > RATE:
-            tried.append((by, *_lag(a, b)))
+            tried.append((method, *_lag(a, b)))
     if not tried:
         raise LogError(
             f"{second.meta.get('source', 'a log')}: nothing in it that the others measured too;"
             " joining needs body rates or attitude, positions, or accelerations in both; it has"
             f" {', '.join(second.channels)}"
         )
-    by, offset, correlation = max(tried, key=lambda of: of[2])
-    if correlation < LEAST:
+    method, offset, correlation = max(tried, key=lambda trial: trial[2])
+    if correlation < THRESHOLD:
         raise LogError(
-            f"{second.meta.get('source', 'a log')}: its {by} go with the others' by"
+            f"{second.meta.get('source', 'a log')}: its {method} go with the others' by"
             f" {correlation:.2f} at best: not one flight"
         )
-    return offset, correlation, by
+    return offset, correlation, method
 
 
 def _turning(log: FlightLog) -> Signal | None:
@@ -97,11 +96,10 @@ def _turning(log: FlightLog) -> Signal | None:
     if "rate_b" not in log:
         return relations.rates_of(*log["quat_wb"].samples(), _SPAN) if "quat_wb" in log else None
     time, rate = log["rate_b"].samples()
-    overlap = (
-        time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
-        if len(time)
-        else time
-    )
+    if len(time):
+        overlap = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
+    else:
+        overlap = time
     return (overlap, relations.mean_over(time, rate, overlap, _SPAN)) if len(overlap) else None
 
 
@@ -138,15 +136,15 @@ def _lag(a: Signal, b: Signal) -> tuple[float, float]:
     )
     lags = correlation_lags(len(x), len(y))
     coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(correlate(x, y, method="fft"))]) / RATE
-    near = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
-    scores = np.array([_alignment(*_both(a, b, offset)) for offset in near])
+    candidates = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
+    scores = np.array([_alignment(*_on_common_grid(a, b, offset)) for offset in candidates])
     best = int(np.argmax(scores))
-    offset = float(near[best] + _STEP * relations.peak(scores, best)[0])
-    pairs = _both(*sizes, offset)
+    offset = float(candidates[best] + _STEP * relations.peak(scores, best)[0])
+    pairs = _on_common_grid(*sizes, offset)
     return offset, float(np.corrcoef(np.hstack(pairs).T)[0, 1]) if len(pairs[0]) >= RATE else -1.0
 
 
-def _both(a: Signal, b: Signal, offset: float) -> tuple[np.ndarray, np.ndarray]:
+def _on_common_grid(a: Signal, b: Signal, offset: float) -> tuple[np.ndarray, np.ndarray]:
     """Values of both on a grid of the first's clock, the same for any offset, where
     there are both.
     """
@@ -161,7 +159,8 @@ def _alignment(x: np.ndarray, y: np.ndarray) -> float:
     """
     if len(x) < RATE:
         return -1.0
-    x, y = x - np.mean(x, axis=0), y - np.mean(y, axis=0)
+    x = x - np.mean(x, axis=0)
+    y = y - np.mean(y, axis=0)
     return float(
         np.sum(np.linalg.svd(x.T @ y, compute_uv=False))
         / max(np.sqrt(np.sum(x**2) * np.sum(y**2)), 1e-12)

@@ -179,9 +179,10 @@ class CalibrationError(VisthrowError):
 
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
 
-STILL, SWAY = 1.5, 1.5  # of a hover before the sway, and of the sway [s]
+HOVER, SWAY = 1.5, 1.5  # of a hover before the sway, and of the sway [s]
 
-SWAY_RATE, SWAY_FREQUENCY = 1.0, 4.0 / 3.0
+SWAY_RATE = 1.0
+SWAY_FREQUENCY = 4.0 / 3.0
 """Amplitude of roll and pitch rate, 7 deg of tilt about either axis [rad/s]; above the swing's
 frequency: the rope does not follow [Hz].
 """
@@ -221,10 +222,14 @@ class Problem:
                 f" them; expected {LEAST_STEPS} or more, and {100 * LEAST_SEEN:.0f} %"
             )
         tensor = lambda value: torch.tensor(np.asarray(value), dtype=torch.float64)  # noqa: E731
-        rope, body = contract["rope"], contract["vehicle"]["body"]
-        self.camera, self.spreads = camera, spreads
-        self.vehicle, self.load = body["mass"], rope["payload_mass"] + 0.5 * rope["rope_mass"]
-        self.length, self.mount = rope["length"] + rope["payload_offset"], tensor(rope["mount"])
+        rope = contract["rope"]
+        body = contract["vehicle"]["body"]
+        self.camera = camera
+        self.spreads = spreads
+        self.vehicle = body["mass"]
+        self.load = rope["payload_mass"] + 0.5 * rope["rope_mass"]
+        self.length = rope["length"] + rope["payload_offset"]
+        self.mount = tensor(rope["mount"])
         moment = rope["payload_mass"] * self.length + 0.5 * rope["rope_mass"] * rope["length"]
         inertia = (
             rope["payload_mass"] * self.length**2
@@ -232,7 +237,8 @@ class Problem:
             + rope["rope_mass"] * rope["length"] ** 2 / 3.0
         )
         self.swung = inertia / moment  # to the centre of oscillation [m]
-        self.time, self.goal = tensor(hovered.time), tensor(hovered.goal_w)
+        self.time = tensor(hovered.time)
+        self.goal = tensor(hovered.goal_w)
         self.dt = self.time.diff()
         self.age = tensor(np.zeros(count) if hovered.age is None else hovered.age)
         self.pos, self.vel, self.rate, self.thrust = (
@@ -240,10 +246,8 @@ class Problem:
         )
         self.base, self.mean_rate = rotation_from_quat(tensor(hovered.quat_wb)), _means(self.rate)
         points = tensor(hovered.keypoints)
-        self.ball, self.corners = (
-            _box(points[:, GOAL_KEYPOINTS:]),
-            points[:, :GOAL_KEYPOINTS].mean(1),
-        )
+        self.ball = _box(points[:, GOAL_KEYPOINTS:])
+        self.corners = points[:, :GOAL_KEYPOINTS].mean(1)
         self.ball_seen = torch.from_numpy(visible)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         s = spreads
@@ -289,7 +293,9 @@ class Problem:
         """Residuals of steps k to k + 1 and of what was measured at k, (B, N - 1, 20), of unknowns,
         (B, N, 13), and constants, (B, C).
         """
-        c, s, dt = self.split(constants), self.spreads, self.dt[:, None]
+        c = self.split(constants)
+        s = self.spreads
+        dt = self.dt[:, None]
         pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
         rot = self.base @ rotation_from_vector(turn)
         rate = self.rate - c["gyro"][:, None]
@@ -312,7 +318,8 @@ class Problem:
             + GRAVITY * up
             - pushed
         )
-        falling, direction = jump(swung) / dt + GRAVITY * up, mean(rope)
+        falling = jump(swung) / dt + GRAVITY * up
+        direction = mean(rope)
         perpendicular = falling - direction * (falling * direction).sum(-1, keepdim=True)
         coning = (
             torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
@@ -345,7 +352,8 @@ class Problem:
         zero where not seen. Arguments as of `steps`; j: steps that the sightings fall behind, shape
         (N,), held while differences are taken.
         """
-        c, s = self.split(constants), self.spreads
+        c = self.split(constants)
+        s = self.spreads
         dt = self.dt[j][:, None]
         u = ((self.time - self.age - self.time[j]) - c["latency"])[..., None] / dt
         pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
@@ -356,7 +364,8 @@ class Problem:
             u * (1 - u) * ((1 - u) * (rate[:, j] * dt - chord) - u * (rate[:, j + 1] * dt - chord))
         )
         attitude = rot[:, j] @ rotation_from_vector(u * chord + bend)
-        body_w, leaning = _cubic(pos, vel, j, u, dt), _cubic(swing, swing_rate, j, u, dt)
+        body_w = _cubic(pos, vel, j, u, dt)
+        leaning = _cubic(swing, swing_rate, j, u, dt)
         rope, _ = _rope(leaning, torch.zeros_like(leaning))
         length = self.length * (1.0 + c["length"][:, None])
         ball_w = body_w + _turned(attitude, self.mount.expand_as(body_w)) + length * rope
@@ -364,9 +373,9 @@ class Problem:
         corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)[:, None].expand(
             -1, body_w.shape[1], -1, -1
         )
-        seen = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
+        offsets = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
         lens = self.camera.position_b + c["lens"]
-        in_body = torch.einsum("bnji,bnkj->bnki", attitude, seen) - lens[:, None, None]
+        in_body = torch.einsum("bnji,bnkj->bnki", attitude, offsets) - lens[:, None, None]
         rot_bc = rotation_from_vector(c["camera"]) @ self.camera.rot_cb.T
         in_camera = torch.einsum("bji,bnkj->bnki", rot_bc, in_body)
         rays = ball_extremes_c(
@@ -397,8 +406,11 @@ def _box(points: Tensor) -> Tensor:
     """Middle and mean half side of boxes by their edges' midpoints, shape (N, 4, 2):
     shape (N, 3).
     """
-    left, top, right, bottom = points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]
-    return torch.cat([points.mean(1), 0.25 * (right - left + bottom - top)[:, None]], -1)
+    x = points[:, 0, 0]
+    top = points[:, 1, 1]
+    right = points[:, 2, 0]
+    bottom = points[:, 3, 1]
+    return torch.cat([points.mean(1), 0.25 * (right - x + bottom - top)[:, None]], -1)
 
 
 def _means(values: Tensor) -> Tensor:
@@ -487,10 +499,10 @@ def calibrate(
     covariance = np.column_stack([solve(column)[width:] for column in unit.T])
     sigma = problem.split(torch.from_numpy(np.sqrt(np.maximum(np.diag(covariance), 0.0)))[None])
     estimates = problem.split(c[None])
-    of = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
+    row = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
     return Calibration(
-        of(estimates, "camera"),
-        of(sigma, "camera"),
+        row(estimates, "camera"),
+        row(sigma, "camera"),
         estimates["latency"].item(),
         sigma["latency"].item(),
         1.0 + estimates["thrust"].item(),
@@ -523,20 +535,25 @@ def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
-    (count, width), h = x.shape, 1e-5
+    (count, width) = x.shape
+    h = 1e-5
     j, _ = problem.places(problem.split(c[None])["latency"][0, 0])
-    xs, cs = x.repeat(1 + 2 * width + len(c), 1, 1), c.repeat(1 + 2 * width + len(c), 1)
+    xs = x.repeat(1 + 2 * width + len(c), 1, 1)
+    cs = c.repeat(1 + 2 * width + len(c), 1)
     for i in range(width):
         for parity in (0, 1):
             xs[1 + 2 * i + parity, parity::2, i] += h
     cs[1 + 2 * width :] += h * torch.eye(len(c), dtype=c.dtype)
-    parts, rows, first = [], [], 0
+    parts = []
+    rows = []
+    first = 0
     residuals = []
     for values, step in (
         (problem.steps(xs, cs), torch.arange(count - 1)),
         (problem.sightings(xs, cs, j), j),
     ):
-        base, off = values[0], (values[1:] - values[:1]) / h
+        base = values[0]
+        off = (values[1:] - values[:1]) / h
         if step is j:
             misfit = float(base.square().sum().sqrt() / max(int((base != 0.0).sum()), 1) ** 0.5)
             parts_of = base.split((3, 2), -1)  # ball and goal
@@ -544,13 +561,14 @@ def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray
                 [one.norm(dim=-1, keepdim=True).expand_as(one) for one in parts_of], -1
             ).clamp(min=1e-9)
             weight = (OUTLIER / sizes).clamp(max=1.0).sqrt()
-            base, off = base * weight, off * weight
+            base = base * weight
+            off = off * weight
         n, m = base.shape
         row = first + torch.arange(n * m).reshape(n, m)
         for i in range(width):
             for parity in (0, 1):
-                at = step + (step % 2 != parity).long()
-                rows.append((row.flatten(), (at * width + i)[:, None].expand(n, m).flatten()))
+                sample = step + (step % 2 != parity).long()
+                rows.append((row.flatten(), (sample * width + i)[:, None].expand(n, m).flatten()))
                 parts.append(off[2 * i + parity].flatten())
         for i in range(len(c)):
             rows.append((row.flatten(), torch.full((n * m,), count * width + i)))

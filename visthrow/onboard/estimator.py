@@ -45,8 +45,10 @@ class Estimator:
     inner: tuple[tuple[Tensor, Tensor], ...] = ()
 
     def __post_init__(self) -> None:
-        width, hidden = self.encoder_weight.shape[1], len(self.encoder_bias)
-        memory, count = self.output_weight.shape[1], self.output_weight.shape[0]
+        width = self.encoder_weight.shape[1]
+        hidden = len(self.encoder_bias)
+        memory = self.output_weight.shape[1]
+        count = self.output_weight.shape[0]
         expected: dict[str, tuple[int, ...]] = {
             "mean": (width,),
             "std": (width,),
@@ -88,14 +90,14 @@ class Estimator:
     @classmethod
     def of_parts(cls, parts: Mapping[str, Tensor]) -> "Estimator":
         """Build from what :meth:`parts` gave. Raises PolicyError: one is missing."""
-        own = [field.name for field in fields(cls)[:-1]]
+        names = [field.name for field in fields(cls)[:-1]]
         count = sum(name.startswith("inner") and name.endswith("_weight") for name in parts)
         pairs = [(f"inner{i}_weight", f"inner{i}_bias") for i in range(count)]
-        for name in (*own, *chain.from_iterable(pairs)):
+        for name in (*names, *chain.from_iterable(pairs)):
             if name not in parts:
                 raise PolicyError(f"estimator: no part '{name}'; {suggest(name, parts)}")
         inner = tuple((parts[weight], parts[bias]) for weight, bias in pairs)
-        return cls(**{name: parts[name] for name in own}, inner=inner)
+        return cls(**{name: parts[name] for name in names}, inner=inner)
 
     @property
     def obs_dim(self) -> int:

@@ -61,17 +61,16 @@ def fit(
     Returns:
         The new sums and the velocity [m/s], shape (E, 2), world frame.
     """
-    t, w = time[:, None], weight[:, None]
+    t = time[:, None]
+    w = weight[:, None]
     wt = w * t
     new = torch.cat([w, wt, wt * t, w * goal_xy, wt * goal_xy], dim=-1)
     sums = torch.where(fresh[:, None], 0.0, sums) + new
-    total, first, second, place, moved = (
-        sums[:, :1],
-        sums[:, 1:2],
-        sums[:, 2:3],
-        sums[:, 3:5],
-        sums[:, 5:7],
-    )
+    total = sums[:, :1]
+    first = sums[:, 1:2]
+    second = sums[:, 2:3]
+    place = sums[:, 3:5]
+    moved = sums[:, 5:7]
     mean = first / total.clamp(min=1e-9)
     velocity = (moved - mean * place) / ((second - mean * first).clamp(min=0.0) + SPEED_SIGMA**-2)
     return sums, velocity
@@ -101,7 +100,8 @@ def measured_goal(
         Position [m], shape (E, 2), world frame, and its inverse variance [1/m^2], shape (E,).
     """
     if layout.name == "state":
-        offset, hanging = frame[:, VEHICLE : VEHICLE + 2], frame[:, VEHICLE + 2 : VEHICLE + 4]
+        offset = frame[:, VEHICLE : VEHICLE + 2]
+        hanging = frame[:, VEHICLE + 2 : VEHICLE + 4]
         goal_xy = frame[:, :2] + hanging + offset
         return goal_xy, torch.full_like(goal_xy[:, 0], POSITION_SIGMA**-2)
     rot_wb = rotation_in(frame)
@@ -143,7 +143,8 @@ def goal_by_corner(
         4); 0 where a corner is not seen.
     """
     lens_w = frame[:, :3] + rotate(rot_wb, camera.position_b.expand(1, -1))[:, 0]
-    height, down = lens_w[:, None, 2].clamp(min=0.1), -rays[..., 2]
+    height = lens_w[:, None, 2].clamp(min=0.1)
+    down = -rays[..., 2]
     reach = height / down.clamp(min=GRAZING)
     goals = lens_w[:, None, :2] + reach[..., None] * rays[..., :2] - camera.square_w[:, :2]
     followed = valid[:, :GOAL_KEYPOINTS] & (down > GRAZING)
@@ -193,10 +194,8 @@ def _located(
 
     The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the
     goal is known, 1; world frame. What is not known is 0."""
-    box, box_valid = (
-        frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2)),
-        valid[:, GOAL_KEYPOINTS:],
-    )
+    box = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2))
+    box_valid = valid[:, GOAL_KEYPOINTS:]
     rot_wb = rotation_in(frame)
     rays = rays_w(
         camera, rot_wb, torch.cat([_corners(layout, frame), middle(box, box_valid)[:, None]], dim=1)
@@ -205,14 +204,19 @@ def _located(
     one, two, three, four = weight.unbind(-1)
     sums, velocity = fit(sums, time, middle(goals, weight > 0.0), one + two + three + four, fresh)
     moves = velocity if layout.motion else None
-    goal_xy, known = place(sums, time, moves), sums[:, :1] > 0.0
+    goal_xy = place(sums, time, moves)
+    located = sums[:, :1] > 0.0
     hangs = box_valid.any(-1, keepdim=True)
     places = torch.cat(
-        [(goal_xy - frame[:, :2]) * known, rays[:, GOAL_KEYPOINTS] * hangs, known.to(frame.dtype)],
+        [
+            (goal_xy - frame[:, :2]) * located,
+            rays[:, GOAL_KEYPOINTS] * hangs,
+            located.to(frame.dtype),
+        ],
         dim=-1,
     )
     return Fitted(
-        sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, known)
+        sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, located)
     )
 
 
@@ -237,7 +241,8 @@ def predicted(
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
     points, visible = camera.fisheye.project_normalized(corners_c, clip=True)
-    measured_valid, end = valid[:, :GOAL_KEYPOINTS], VEHICLE + layout.goal
+    measured_valid = valid[:, :GOAL_KEYPOINTS]
+    end = VEHICLE + layout.goal
     filled = visible & known & ~measured_valid
     corners = torch.where(filled[..., None], points, _corners(layout, frame))
     frame = torch.cat([frame[:, :VEHICLE], corners.flatten(1), frame[:, end:]], dim=-1)
@@ -251,9 +256,11 @@ def middle(points: Tensor, valid: Tensor) -> Tensor:
     count = valid.sum(-1, keepdim=True)
     one, two = torch.where(valid.unsqueeze(-1), points, torch.inf).split(2, 1)
     small, large = torch.minimum(one, two), torch.maximum(one, two)  # of two pairs, each
-    first, inner = torch.minimum(small[:, 0], small[:, 1]), torch.maximum(small[:, 0], small[:, 1])
+    first = torch.minimum(small[:, 0], small[:, 1])
+    inner = torch.maximum(small[:, 0], small[:, 1])
     outer = torch.minimum(large[:, 0], large[:, 1])
-    second, third = torch.minimum(inner, outer), torch.maximum(inner, outer)
+    second = torch.minimum(inner, outer)
+    third = torch.maximum(inner, outer)
     lower = torch.where(count > 2, second, first)
     upper = torch.where(count > 3, third, torch.where(count > 1, second, first))
     return torch.where(count > 0, (lower + upper) * 0.5, 0.0)

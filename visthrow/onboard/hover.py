@@ -115,11 +115,11 @@ class HoverController:
         error_w = np.asarray(goal_w, dtype=float) - pos_w
         asked_w = params.position_gain * error_w
         speed = np.linalg.norm(asked_w, axis=1, keepdims=True)
-        far = speed > params.max_speed
-        asked_w *= np.where(far, params.max_speed / np.maximum(speed, 1e-9), 1.0)
+        fast = speed > params.max_speed
+        asked_w *= np.where(fast, params.max_speed / np.maximum(speed, 1e-9), 1.0)
         # On the way there from far off an integral would only wind up, and overshoot on arrival.
-        near = np.linalg.norm(error_w, axis=1, keepdims=True) < params.integral_radius
-        growth_w = np.where(near, params.integral_gain * self.period * error_w, 0.0)
+        close = np.linalg.norm(error_w, axis=1, keepdims=True) < params.integral_radius
+        growth_w = np.where(close, params.integral_gain * self.period * error_w, 0.0)
         self._integral_w = np.clip(
             self._integral_w + growth_w, -params.integral_limit, params.integral_limit
         )

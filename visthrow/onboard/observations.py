@@ -120,7 +120,8 @@ def layout_of(params: Any) -> Layout:
     motion = (
         2 if getattr(params, "goal_velocity", False) else 0
     )  # contracts hold what differs from the default
-    response, setup = getattr(params, "response", 0), SETUPS[getattr(params, "setup", "none")]
+    response = getattr(params, "response", 0)
+    setup = SETUPS[getattr(params, "setup", "none")]
     places = LOCATED.get(params.layout, 0) if getattr(params, "located", False) else 0
     if params.layout == "state":
         return Layout("state", 2, 3, params.history, 0, motion, places, response, setup)
@@ -145,11 +146,9 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
         Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than
         all that came is the oldest.
     """
-    knots, rows, out = (
-        [0.0, *ages[: history.shape[1]]],
-        torch.cat([newest[:, None], history], dim=1),
-        [],
-    )
+    knots = [0.0, *ages[: history.shape[1]]]
+    rows = torch.cat([newest[:, None], history], dim=1)
+    out = []
     for k in range(1, 1 + history.shape[1]):
         after = next((i for i, age in enumerate(knots) if age >= k * period), len(knots) - 1)
         gap = knots[after] - knots[after - 1]
@@ -202,7 +201,8 @@ def rotation_in(frame: Tensor) -> Tensor:
     """Measured attitude rot_wb, shape (E, 3, 3), of frames, shape (E, F): with noise its columns
     are not quite a rotation's.
     """
-    x_axis, y_axis = frame[:, 9:12], frame[:, 12:15]
+    x_axis = frame[:, 9:12]
+    y_axis = frame[:, 12:15]
     return torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
 
 

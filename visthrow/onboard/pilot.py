@@ -79,13 +79,13 @@ def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
 
 
 def _resampled(
-    history: np.ndarray, seen: np.ndarray, ages: list[float], period: float
+    history: np.ndarray, sample: np.ndarray, ages: list[float], period: float
 ) -> np.ndarray:
-    """`visthrow.onboard.observations.resampled`, of arrays; ``seen``: history with this
+    """`visthrow.onboard.observations.resampled`, of arrays; ``sample``: history with this
     step in it.
     """
     return ob.resampled(
-        torch.from_numpy(history), torch.from_numpy(seen)[:, 0], ages, period
+        torch.from_numpy(history), torch.from_numpy(sample)[:, 0], ages, period
     ).numpy()
 
 
@@ -141,14 +141,14 @@ class Pilot:
                 raise PolicyError("a vision policy needs a camera; got none")
             camera_params = by_own_rule(policy, camera_params)
             policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
-        self.policy, self.count = policy, count
+        self.policy = policy
+        self.count = count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
-        self._views, self._time = (
-            np.zeros((count, sum(VIEWS.values())), dtype=np.float32),
-            np.zeros(count, dtype=np.float32),
-        )
+        self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
+        self._time = np.zeros(count, dtype=np.float32)
         self._observe, self._observe_given = Compiled(self._observed), Compiled(self._observed)
-        self._decide, self._later = Compiled(self._decision), np.zeros(count, dtype=bool)
+        self._decide = Compiled(self._decision)
+        self._later = np.zeros(count, dtype=bool)
         self.spent = (0.0, 0.0)
         self._first = np.array(
             [act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=np.float32
@@ -166,7 +166,8 @@ class Pilot:
         )
         self._memory = self.policy.begin(self.count).numpy()
         self._fresh = np.ones(self.count, dtype=bool)
-        self._goal_fit, self._steps = goal_motion.empty_sums(self.count).numpy(), 0
+        self._goal_fit = goal_motion.empty_sums(self.count).numpy()
+        self._steps = 0
         self._times: tuple[
             float, ...
             # of the rows of history and response, newest first; those beyond are copies of the
@@ -209,22 +210,25 @@ class Pilot:
                 come a period apart.
         """
         begin = time.perf_counter()
-        goal_w, attached = np.asarray(goal_w).reshape(-1, 3), np.asarray(attached).reshape(-1, 1)
+        goal_w = np.asarray(goal_w).reshape(-1, 3)
+        attached = np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
-        given = () if keypoints is None else tuple(map(np.asarray, keypoints))
-        observation, *rest = self._seen(views, given)
-        if now is not None and self._bridged(now, rest):
-            observation, *rest = self._seen(views, given)
-        self._history, *seen = rest
+        inputs = () if keypoints is None else tuple(map(np.asarray, keypoints))
+        observation, *state = self._seen(views, inputs)
+        if now is not None and self._bridged(now, state):
+            observation, *state = self._seen(views, inputs)
+        self._history, *frame = state
         if self.layout.response:
-            self._answers, *seen = seen
+            self._answers, *frame = frame
         if self.layout.fits:
-            self._goal_fit, *seen = seen
+            self._goal_fit, *frame = frame
         decided = time.perf_counter()
         action, command, release, self._memory = self._decide(observation, self._memory)
         self._unasked = self._previous[:, 4]
-        self._previous, self._fresh, self._steps = action, self._later, self._steps + 1
-        points, valid = seen if seen else (None, None)
+        self._previous = action
+        self._fresh = self._later
+        self._steps = self._steps + 1
+        points, valid = frame if frame else (None, None)
         self.spent = (decided - begin, time.perf_counter() - decided)
         return PilotOutput(action, command, release, observation, points, valid)
 
@@ -234,8 +238,8 @@ class Pilot:
         """
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
-    def _seen(self, views: np.ndarray, given: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """Return the observation of a step from its measurements and the memory; ``given``:
+    def _seen(self, views: np.ndarray, inputs: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+        """Return the observation of a step from its measurements and the memory; ``inputs``:
         keypoints of a detector.
         """
         carried: tuple[np.ndarray, ...] = (self._previous, self._history, self._fresh)
@@ -244,34 +248,35 @@ class Pilot:
         if self.layout.fits:
             self._time[:] = self._steps * self.period
             carried += (self._goal_fit, self._time)
-        return (self._observe_given if given else self._observe)(views, *carried, *given)
+        return (self._observe_given if inputs else self._observe)(views, *carried, *inputs)
 
-    def _bridged(self, now: float, seen: Sequence[np.ndarray]) -> bool:
+    def _bridged(self, timestamp: float, frame: Sequence[np.ndarray]) -> bool:
         """Make history and response those of steps a period apart, as in training; whether steps
         before this one were late or missing.
 
         Args:
-            now: of this step [s]. seen: history and response with this step in them, newest first.
+            timestamp: of this step [s].
+            frame: history and response with this step in them, newest first.
         """
-        times, period, rows = (
-            self._times,
-            self.period,
-            1 + max(self.layout.history, self.layout.response),
-        )
-        ages = [now - time for time in times]
+        times = self._times
+        period = self.period
+        rows = 1 + max(self.layout.history, self.layout.response)
+        ages = [timestamp - time for time in times]
         due = [
-            now - k * period for k in range(1, 1 + rows) if ages and k * period < ages[-1] + JITTER
+            timestamp - k * period
+            for k in range(1, 1 + rows)
+            if ages and k * period < ages[-1] + JITTER
         ]
         late = len(due) != len(times) or any(
             abs(time - when) > JITTER for time, when in zip(times, due)
         )
         if late:
-            self._history = _resampled(self._history, seen[0], ages, period)
+            self._history = _resampled(self._history, frame[0], ages, period)
             if self.layout.response:
-                self._answers = _resampled(self._answers, seen[1], ages, period)
+                self._answers = _resampled(self._answers, frame[1], ages, period)
             self._steps += max(round(ages[0] / period) - 1, 0)
             times = tuple(due)
-        self._times = (now, *times[: rows - 1])
+        self._times = (timestamp, *times[: rows - 1])
         return late
 
     def _measured(self, *views: np.ndarray | bool) -> np.ndarray:
@@ -279,7 +284,7 @@ class Pilot:
 
         Raises ValueError: one of another shape.
         """
-        at = 0
+        row = 0
         for (name, width), value in zip(VIEWS.items(), views):
             array = np.asarray(value)
             if array.shape != (self.count, width) and not (
@@ -288,8 +293,8 @@ class Pilot:
                 raise ValueError(
                     f"{name} has shape {array.shape}; expected ({self.count}, {width})"
                 )
-            self._views[:, at : at + width] = array
-            at += width
+            self._views[:, row : row + width] = array
+            row += width
         return self._views
 
     def _observed(
@@ -310,13 +315,15 @@ class Pilot:
         """
         answers: tuple[Tensor, ...] = ()
         if self.layout.response:
-            answers, further = further[:1], further[1:]
+            answers = further[:1]
+            further = further[1:]
         pos, quat, vel, rate, payload, goal, attached = views.split(list(VIEWS.values()), -1)
-        rot, fitted = ob.rotation_from_quat(quat), 2 if self.layout.fits else 0
-        seen = further[fitted:]
-        if not seen and self.camera is not None:
-            seen = seen_keypoints(self.camera, pos, rot, goal, payload)
-        points, valid = (seen[0], seen[1]) if seen else (None, None)
+        rot = ob.rotation_from_quat(quat)
+        fitted = 2 if self.layout.fits else 0
+        fit = further[fitted:]
+        if not fit and self.camera is not None:
+            fit = seen_keypoints(self.camera, pos, rot, goal, payload)
+        points, valid = (fit[0], fit[1]) if fit else (None, None)
         part = ob.state_part(pos, goal, payload)
         if points is not None and self.layout.name == "vision":
             part = points.flatten(1)
@@ -329,7 +336,7 @@ class Pilot:
                 self.layout, frame, valid, self.camera, fit_sums, time, fresh
             )
             sums = (new,)
-        answers = tuple(push(held, ob.answer(frame, previous), fresh) for held in answers)
+        answers = tuple(push(buffer, ob.answer(frame, previous), fresh) for buffer in answers)
         earlier = answers[0][:, 1:] if answers else None
         observation, history = ob.observe(
             self.layout,
@@ -343,7 +350,7 @@ class Pilot:
             places,
             earlier,
         )
-        return observation, history, *answers, *sums, *seen
+        return observation, history, *answers, *sums, *fit
 
     def _decision(
         self, observation: Tensor, memory: Tensor
@@ -365,9 +372,10 @@ class Pilot:
         """
         if self.camera is None:
             raise PolicyError("this pilot has no camera")
-        still, goal_w = np.zeros((self.count, 3)), np.asarray(goal_w).reshape(-1, 3)
+        zero = np.zeros((self.count, 3))
+        goal_w = np.asarray(goal_w).reshape(-1, 3)
         views = torch.from_numpy(
-            self._measured(pos_w, quat_wb, still, still, payload_w, goal_w, np.ones((1, 1)))
+            self._measured(pos_w, quat_wb, zero, zero, payload_w, goal_w, np.ones((1, 1)))
         )
         pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
         points, valid = seen_keypoints(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)

@@ -87,10 +87,12 @@ class Policy:
         _check_shapes(self)
         for part, declared in (("observation", self.obs_dim), ("action", self.action_dim)):
             section = self.contract.get(part)
-            told = section.get("dimension", declared) if isinstance(section, Mapping) else declared
-            if told != declared:
+            dimension = (
+                section.get("dimension", declared) if isinstance(section, Mapping) else declared
+            )
+            if dimension != declared:
                 raise PolicyError(
-                    f"the contract says {part} dimension {told}, the network has {declared}"
+                    f"the contract says {part} dimension {dimension}, the network has {declared}"
                 )
 
     @property
@@ -138,10 +140,10 @@ class Policy:
 
         Raises PolicyError if the last axis of the observations is not D long.
         """
-        seen = self._fitting(obs)
+        fitted = self._fitting(obs)
         if self.estimator is not None:
-            seen, memory = self.estimator.step(seen, memory)
-        return self.decide(seen), memory
+            fitted, memory = self.estimator.step(fitted, memory)
+        return self.decide(fitted), memory
 
     def actor(self, count: int) -> Callable[[Tensor], Tensor]:
         """Function of the observations of one throw after the other step, shape (E, D); it carries
@@ -209,10 +211,11 @@ class Policy:
         Returns:
             What differs by allowance: dotted key -> the value here, None where there is nothing.
         """
-        trained, now = flattened(self.contract, sections), flattened(contract_now, sections)
-        known = sorted(trained.keys() | now.keys())
+        trained = flattened(self.contract, sections)
+        current = flattened(contract_now, sections)
+        keys = sorted(trained.keys() | current.keys())
         differing = [
-            key for key in known if not _same(trained.get(key, _ABSENT), now.get(key, _ABSENT))
+            key for key in keys if not _same(trained.get(key, _ABSENT), current.get(key, _ABSENT))
         ]
         allowed = [
             key
@@ -221,13 +224,13 @@ class Policy:
         ]
         if refused := tuple(key for key in differing if key not in allowed):
             lines = (
-                f"  {key}: trained with {_show(trained, key)}, here {_show(now, key)}"
+                f"  {key}: trained with {_show(trained, key)}, here {_show(current, key)}"
                 for key in refused
             )
             raise MismatchError(
                 "the policy was trained under other conditions:\n" + "\n".join(lines), refused
             )
-        return {key: now.get(key) for key in allowed}
+        return {key: current.get(key) for key in allowed}
 
     def save(self, path: str | Path) -> None:
         """Write the policy file, whole or not at all.
@@ -322,17 +325,19 @@ class Policy:
             contract: Conditions of the training.
             made_by: Where it comes from.
         """
-        known = ("mlp.", "obs_normalizer.", "distribution.")
-        foreign = sorted(key for key in state if not key.startswith(known))
+        prefixes = ("mlp.", "obs_normalizer.", "distribution.")
+        foreign = sorted(key for key in state if not key.startswith(prefixes))
         index = sorted(
             int(key.split(".")[1])
             for key in state
             if key.startswith("mlp.") and key.endswith(".weight")
         )
         if foreign or not index:
-            came = ", ".join(foreign) or "no mlp.<i>.weight"
-            wanted = "mlp.<i>.weight, mlp.<i>.bias, obs_normalizer._mean, obs_normalizer._std"
-            raise PolicyError(f"got {came}; expected the state of an rsl_rl MLPModel: {wanted}")
+            received = ", ".join(foreign) or "no mlp.<i>.weight"
+            expected = "mlp.<i>.weight, mlp.<i>.bias, obs_normalizer._mean, obs_normalizer._std"
+            raise PolicyError(
+                f"got {received}; expected the state of an rsl_rl MLPModel: {expected}"
+            )
 
         def take(key: str) -> Tensor:
             return state[key].detach().to("cpu", torch.float32).clone()
@@ -375,8 +380,8 @@ def _check_shapes(policy: Policy) -> None:
             )
     for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases)):
         if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
-            came = f"weight {tuple(weight.shape)} and bias {tuple(bias.shape)}"
-            raise PolicyError(f"layer {i} has {came}; expected (n, {width}) and (n,)")
+            received = f"weight {tuple(weight.shape)} and bias {tuple(bias.shape)}"
+            raise PolicyError(f"layer {i} has {received}; expected (n, {width}) and (n,)")
         width = weight.shape[0]
         named += [(f"layer {i} weight", weight), (f"layer {i} bias", bias)]
     for name, tensor in named:
@@ -400,8 +405,8 @@ def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
         raise PolicyError(
             f"{path}: format version {version}; this program reads versions {readable}"
         )
-    wanted = {"activation": str, "contract": dict, "made_by": dict}
-    for key, kind in wanted.items():
+    schema = {"activation": str, "contract": dict, "made_by": dict}
+    for key, kind in schema.items():
         if not isinstance(header.get(key), kind):
             raise PolicyError(
                 f"{path}: header entry '{key}' is {header.get(key)!r}; expected a {kind.__name__}"

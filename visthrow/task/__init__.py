@@ -384,7 +384,9 @@ def _out_of_place(e: Experiment) -> Iterator[str]:
     """Return the contradiction among an experiment's lengths and times: a number in another unit is
     off by a hundred or more.
     """
-    start, bounds, release = e.task.start, e.task.bounds, e.release
+    start = e.task.start
+    bounds = e.task.bounds
+    release = e.release
     low, high = bounds.altitude
     hangs = e.rope.length + e.rope.payload_offset - e.rope.mount[2]
     if not low <= start.spawn_height <= high:
@@ -416,8 +418,11 @@ def _no_vehicle(e: Experiment) -> Iterator[str]:
     """Return the reason why an experiment's vehicle is impossible: thrust and weight, moments of
     inertia and size, thrust and speed of the rotors.
     """
-    vehicle, rotors, motor = e.vehicle, e.vehicle.rotors, e.vehicle.controller.max_thrust
-    mass, thrust = plant_of(e).total_mass, e.task.action.max_thrust
+    vehicle = e.vehicle
+    rotors = e.vehicle.rotors
+    motor = e.vehicle.controller.max_thrust
+    mass = plant_of(e).total_mass
+    thrust = e.task.action.max_thrust
     if not GRAVITY * mass < min(4.0 * motor, thrust):
         yield (
             f"vehicle, rope and payload weigh {mass:g} kg, {GRAVITY * mass:.3g} N, but thrust is"
@@ -508,7 +513,8 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
 
     A draw that an effect's physical bounds forbid is put on the bound. ConfigError for a covariance
     that is none."""
-    diagnosed, plant = experiment.diagnosed, plant_of(experiment)
+    diagnosed = experiment.diagnosed
+    plant = plant_of(experiment)
     if diagnosed.plants == 1 or not diagnosed.effects:
         return [plant]
     import numpy as np

@@ -120,11 +120,10 @@ class Member:
         return [*self.told, *(math.log(abs(self._number(path))) for path in HIDDEN)]
 
     def _number(self, path: str) -> float:
-        value = (
-            self.plant.vehicle
-            if hasattr(self.plant.vehicle, path.split(".")[0])
-            else self.plant.rope
-        )
+        if hasattr(self.plant.vehicle, path.split(".")[0]):
+            value = self.plant.vehicle
+        else:
+            value = self.plant.rope
         for part in path.split("."):
             value = value[int(part)] if part.isdigit() else getattr(value, part)  # type: ignore[index]
         return float(value)  # type: ignore[arg-type]
@@ -167,13 +166,12 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     """
     chosen = members(experiment)[number]
     inverse_units = chosen.units.inverse
-    plant, task = (
-        in_units(chosen.plant, inverse_units),
-        in_units(experiment.task, inverse_units, TASK),
-    )
+    plant = in_units(chosen.plant, inverse_units)
+    task = in_units(experiment.task, inverse_units, TASK)
     action = replace(task.action, max_thrust=4.0 * plant.vehicle.controller.max_thrust)
     task = replace(task, action=action, observation=replace(task.observation, setup="none"))
-    size, camera = chosen.units.length, experiment.camera
+    size = chosen.units.length
+    camera = experiment.camera
     mount = replace(camera.mount, position_b=tuple(size * x for x in camera.mount.position_b))
     camera = replace(
         camera,
@@ -209,26 +207,26 @@ def specialised(
             "policy with a contract of one vehicle; expected one that was trained for a fleet, with"
             " setup told"
         )
-    one, chosen = alone(experiment, number), members(experiment)[number]
+    one = alone(experiment, number)
+    chosen = members(experiment)[number]
     layout = ob.layout_of(experiment.task.observation)
-    sizes, known = _sizes(layout, chosen.units), layout.dimension - layout.setup
-    spread, stated = (
-        policy.std + policy.eps,
-        torch.tensor(chosen.setup(experiment.task.observation.setup)),
-    )
+    sizes = _sizes(layout, chosen.units)
+    fixed = layout.dimension - layout.setup
+    spread = policy.std + policy.eps
+    stated = torch.tensor(chosen.setup(experiment.task.observation.setup))
     first = policy.weights[0]
-    bias = policy.biases[0] + first[:, known:] @ ((stated - policy.mean[known:]) / spread[known:])
+    bias = policy.biases[0] + first[:, fixed:] @ ((stated - policy.mean[fixed:]) / spread[fixed:])
     contract = contract_of(one)
     made_by = {**policy.made_by, "config": config.to_dict(one, defaults=False)}
     return (
         Policy(
-            (first[:, :known], *policy.weights[1:]),
+            (first[:, :fixed], *policy.weights[1:]),
             (bias, *policy.biases[1:]),
             policy.activation,
             contract,
             made_by,
-            policy.mean[:known] * sizes,
-            spread[:known] * sizes,
+            policy.mean[:fixed] * sizes,
+            spread[:fixed] * sizes,
         ),
         one,
     )
@@ -236,12 +234,15 @@ def specialised(
 
 def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
     """Size in SI units of each entry of an observation without the set-up, shape (D,)."""
-    length, speed, rate = units.length, units.length / units.time, 1.0 / units.time
+    length = units.length
+    speed = units.length / units.time
+    rate = 1.0 / units.time
     vehicle = [length] * 3 + [speed] * 3 + [rate] * 3 + [1.0] * 6
     thing = 1.0 if layout.name == "vision" else length  # images have no size
     offsets = [thing] * (layout.goal + layout.payload * (1 + layout.history))
     places = ([length] * 2 + [1.0] * 4)[: layout.located]
-    motion, step = [speed] * layout.motion, [speed] * 3 + [rate] * 3 + [1.0] * 4
+    motion = [speed] * layout.motion
+    step = [speed] * 3 + [rate] * 3 + [1.0] * 4
     return torch.tensor(
         vehicle
         + [1.0] * 5

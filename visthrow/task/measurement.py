@@ -51,11 +51,9 @@ class Throws:
             return {"target": self.target, "throws": len(self.success), "success": 0.0}
         good = self.success
         goal = np.array([[self.target, 0.0]]) if self.goal_w is None else self.goal_w[good]
-        bias, error, duration = (
-            (self.landing_w[good] - goal).mean(axis=0),
-            self.error[good],
-            self.duration[good],
-        )
+        bias = (self.landing_w[good] - goal).mean(axis=0)
+        error = self.error[good]
+        duration = self.duration[good]
         return {
             "target": self.target,
             "throws": len(good),

@@ -19,25 +19,25 @@ from visthrow.common.errors import ConfigError
 from visthrow.common.workers import done
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import STILL, SWAY, Calibration, Hovered, solved, sway
+from visthrow.onboard.calibration import HOVER, SWAY, Calibration, Hovered, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.training.env import ThrowEnv
 
 SETTLE = 3.0  # after the sway [s]; of its swing some 10 deg remain
-FEW = (
+TOO_FEW = (
     8  # calibrations of half a second each: here they are done before other processes have started
 )
 
 
 def calibrated_start(
-    experiment: Experiment, kept: list[Calibration | None] | None = None
+    experiment: Experiment, records: list[Calibration | None] | None = None
 ) -> Callable[[ThrowEnv], TensorDict]:
     """Return the start of :func:`visthrow.training.protocol.throw`; ConfigError for another layout
     than vision, or goals that move.
 
-    ``kept`` takes the calibration of each throw; None where there was none, and keypoints stay as
-    they came."""
+    ``records`` receives the calibration of each throw, or None where there was none: its keypoints
+    stay uncorrected."""
     observation = experiment.task.observation
     if observation.layout != "vision" or experiment.task.target.moves:
         raise ConfigError(
@@ -47,8 +47,8 @@ def calibrated_start(
 
     def begin(env: ThrowEnv) -> TensorDict:
         estimates = _calibrations(experiment, _hovered(env))
-        if kept is not None:
-            kept[:] = estimates
+        if records is not None:
+            records[:] = estimates
         turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in estimates]
         scale = [c.scale if c else 0.0 for c in estimates]
         return env.begin_throws(
@@ -60,17 +60,20 @@ def calibrated_start(
 
 def _hovered(env: ThrowEnv) -> list[Hovered]:
     """Hover, sway and settle; what was measured till the end of the sway, of each vehicle."""
-    cfg, period = env.cfg, env.cfg.sim.control_period
-    steps, last = round((STILL + SWAY) / period), round((STILL + SWAY + SETTLE) / period)
+    cfg = env.cfg
+    period = env.cfg.sim.control_period
+    steps = round((HOVER + SWAY) / period)
+    last = round((HOVER + SWAY + SETTLE) / period)
     controller = HoverController(HoverParams(), period, env.num_envs)
     rate = torch.tensor(cfg.task.action.max_rate)
     env.reset()
-    home, rows = env.views.state["pos_w"].cpu().numpy().copy(), []
+    home = env.views.state["pos_w"].cpu().numpy().copy()
+    rows = []
     mass = plant_of(cfg).total_mass
     for k in range(last):
         measured = _measured(env)
         command = controller.step(*measured[:3], home, mass)
-        since = k * period - STILL
+        since = k * period - HOVER
         if 0.0 <= since < SWAY:
             command[:, 1:3] += sway(since)
         if k < steps:
@@ -108,7 +111,7 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
     """The calibration of each hover; None where it shows too little."""
     solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
-    estimates = dict(done(solve, hovered, cores() if len(hovered) > FEW else 1, "calibrations"))
+    estimates = dict(done(solve, hovered, cores() if len(hovered) > TOO_FEW else 1, "calibrations"))
     return [
         None if isinstance(estimates[place], str) else estimates[place]
         for place in range(len(hovered))

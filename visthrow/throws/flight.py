@@ -39,12 +39,12 @@ class Sight(Protocol):
     seen: tuple[np.ndarray, np.ndarray] | None
 
     def look(
-        self, now: Snapshot, measured: Snapshot, goal_w: np.ndarray, carried: np.ndarray
+        self, snapshot: Snapshot, measured: Snapshot, goal_w: np.ndarray, carried: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Take a picture on each vehicle and return ``seen``.
 
         Args:
-            now: true states. measured: states that the detector knows attitude and height of.
+            snapshot: true states. measured: states that the detector knows attitude and height of.
             goal_w: goals [m], shape (E, 3), world frame. carried: whether a payload hangs, (E,).
         """
 
@@ -81,16 +81,18 @@ class Pilots(ABC):
             goal_w: at its start [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
             first_action: normalised command of the hover before, shape (E, 4 or 5).
         """
-        self.experiment, self.goal_w, self.first_action = experiment, goal_w, first_action
+        self.experiment = experiment
+        self.goal_w = goal_w
+        self.first_action = first_action
         self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
 
     @abstractmethod
-    def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
-        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``held`` are the
+    def decide(self, flight: "Flight", snapshot: Snapshot, latched: np.ndarray) -> Decision:
+        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``latched`` are the
         hover controller's commands.
         """
 
-    def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
+    def wait(self, flight: "Flight", snapshot: Snapshot) -> dict[int, str]:
         """Vehicles that are not to throw if the hover ended here, and why; called each period of
         the hover before the throw.
         """
@@ -114,7 +116,9 @@ class Policies(Pilots):
 
         ``draws``: state policies too have a camera, to be drawn. ``eyes``: whose rendered pictures
         keypoints come from; None: they are what measured poses project to."""
-        self.eyes, self._waited, self._lost = eyes, 0, {}
+        self.eyes = eyes
+        self._waited = 0
+        self._lost = {}
         share = len(goal_w) // len(loaded)
         self.slices = [slice(i * share, (i + 1) * share) for i in range(len(loaded))]
         looks = [
@@ -131,31 +135,32 @@ class Policies(Pilots):
             goal_vel_w,
         )
 
-    def wait(self, flight: "Flight", seen: Snapshot) -> dict[int, str]:
+    def wait(self, flight: "Flight", snapshot: Snapshot) -> dict[int, str]:
         self._waited += 1
         if self.eyes is not None and self._waited % LOOK_EVERY == 0:
-            self.eyes.look(flight.plant.exposed, seen, self.goal_w, seen.attached)
+            self.eyes.look(flight.plant.exposed, snapshot, self.goal_w, snapshot.attached)
             self._lost = {
                 e: f"refused: the {name} is not seen in the hover"
                 for e, name in self.eyes.lost().items()
             }
         return self._lost
 
-    def decide(self, flight: "Flight", seen: Snapshot, held: np.ndarray) -> Decision:
-        outs, goal_w, looked = [], flight.goal_at(seen.time), None
+    def decide(self, flight: "Flight", snapshot: Snapshot, latched: np.ndarray) -> Decision:
+        outs = []
+        goal_w = flight.goal_at(snapshot.time)
+        looked = None
         if self.eyes is not None:  # nobody looks any more once all have let go
-            looked = (
-                self.eyes.look(flight.plant.exposed, seen, goal_w, seen.attached)
-                if np.any(flight.flown)
-                else self.eyes.seen
-            )
+            if np.any(flight.flown):
+                looked = self.eyes.look(flight.plant.exposed, snapshot, goal_w, snapshot.attached)
+            else:
+                looked = self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
             keypoints = None if looked is None else (looked[0][part], looked[1][part])
             outs.append(
                 pilot.act(
-                    *(getattr(seen, name)[part] for name in VIEWS),
+                    *(getattr(snapshot, name)[part] for name in VIEWS),
                     goal_w[part],
-                    seen.attached[part],
+                    snapshot.attached[part],
                     keypoints,
                 )
             )
@@ -166,10 +171,10 @@ class Policies(Pilots):
 class Recorder:
     """Keeps nothing of a flight; the children do."""
 
-    def before(self, flight: "Flight", seen: Snapshot, sent: Decision) -> None:
+    def before(self, flight: "Flight", snapshot: Snapshot, sent: Decision) -> None:
         """Called each period with what was measured and is sent, before the plant moves."""
 
-    def after(self, flight: "Flight", seen: Snapshot, sent: Decision) -> None:
+    def after(self, flight: "Flight", snapshot: Snapshot, sent: Decision) -> None:
         """Called after it, with the new state in ``flight.now``."""
 
 
@@ -189,11 +194,10 @@ def throw(seconds: float | None = None) -> Phase:
     """
 
     def over(flight: "Flight") -> bool:
-        longest = (
-            flight.pilots.experiment.task.bounds.time_limit + FALL_TIME
-            if seconds is None
-            else seconds
-        )
+        if seconds is None:
+            longest = flight.pilots.experiment.task.bounds.time_limit + FALL_TIME
+        else:
+            longest = seconds
         return not np.any(flight.open) or flight.lasted(longest)
 
     return Phase(True, over)
@@ -228,15 +232,15 @@ class Flight:
         ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the
         vehicles are."""
         count = plant.count
-        self.plant, self.pilots, self.recorder = plant, pilots, recorder or Recorder()
+        self.plant = plant
+        self.pilots = pilots
+        self.recorder = recorder or Recorder()
         self._now: Snapshot | None = None
         self.home_w = self.now.pos_w if home_w is None else home_w
         self.begin = math.nan
-        self.open, self.flown, self.failed = (
-            np.ones(count, bool),
-            np.zeros(count, bool),
-            np.zeros(count, bool),
-        )
+        self.open = np.ones(count, bool)
+        self.flown = np.zeros(count, bool)
+        self.failed = np.zeros(count, bool)
         self.failures: list[str | None] = [None] * count
         self.commands: list[np.ndarray] = []
         self._refused: dict[int, str] = {}  # by the pilots, in the hover
@@ -283,13 +287,14 @@ class Flight:
 
     def fail(self, vehicle: int, cause: str) -> None:
         """Note that a vehicle's throw has failed, unless it had before."""
-        self.failed[vehicle], self.failures[vehicle] = True, self.failures[vehicle] or cause
+        self.failed[vehicle] = True
+        self.failures[vehicle] = self.failures[vehicle] or cause
 
     def _period(self, throws: bool) -> None:
         """Measure, decide, send."""
         plant = self.plant
         measurement = plant.measured()
-        hold_command = self._held(measurement)
+        hold_command = self._latched_now(measurement)
         self.flown = self.open & measurement.attached & throws
         sent = Decision(hold_command, np.zeros(plant.count, bool))
         if math.isnan(self.begin):
@@ -308,32 +313,36 @@ class Flight:
             self.judge(self.now)
         self.recorder.after(self, measurement, sent)
 
-    def _held(self, seen: Snapshot) -> np.ndarray:
+    def _latched_now(self, snapshot: Snapshot) -> np.ndarray:
         """Commands of the hover controller."""
         plant = self.plant.params
-        mass = plant.vehicle.body.mass + np.where(seen.attached, plant.rope.hanging_mass, 0.0)
-        return self._hover.step(seen.pos_w, seen.quat_wb, seen.vel_w, self.home_w, mass)
+        mass = plant.vehicle.body.mass + np.where(snapshot.attached, plant.rope.hanging_mass, 0.0)
+        return self._hover.step(snapshot.pos_w, snapshot.quat_wb, snapshot.vel_w, self.home_w, mass)
 
-    def judge(self, now: Snapshot) -> None:
+    def judge(self, snapshot: Snapshot) -> None:
         """Note whose throw has failed or is over, by the state after a period."""
-        plant, landing = self.plant, self.plant.landing
-        carrying = self.flown & now.attached
-        for cause, mask in self._causes(now).items():
+        plant = self.plant
+        landing = self.plant.landing
+        carrying = self.flown & snapshot.attached
+        for cause, mask in self._causes(snapshot).items():
             for e in np.flatnonzero(mask & carrying):
                 self.fail(e, cause)
         fallen = plant.time - np.nan_to_num(landing.separation_time)
-        for e in np.flatnonzero(~now.attached & ~landing.landed & (fallen > FALL_TIME)):
+        for e in np.flatnonzero(~snapshot.attached & ~landing.landed & (fallen > FALL_TIME)):
             self.fail(e, f"the payload did not land within {FALL_TIME:g} s of its separation")
         self.open &= ~(self.failed | landing.landed)
 
-    def _causes(self, now: Snapshot) -> dict[str, np.ndarray]:
+    def _causes(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
         """Which throws have ended early, by cause, the first that holds first: the ends of an
         episode of training.
         """
-        experiment, pos_w, payload_w = self.pilots.experiment, now.pos_w, now.payload_pos_w
-        bounds, rope = experiment.task.bounds, experiment.rope
+        experiment = self.pilots.experiment
+        pos_w = snapshot.pos_w
+        payload_w = snapshot.payload_pos_w
+        bounds = experiment.task.bounds
+        rope = experiment.rope
         touching = rope.payload_radius + experiment.vehicle.collision_radius
-        upright = 1.0 - 2.0 * (now.quat_wb[:, 0] ** 2 + now.quat_wb[:, 1] ** 2)
+        upright = 1.0 - 2.0 * (snapshot.quat_wb[:, 0] ** 2 + snapshot.quat_wb[:, 1] ** 2)
         height = experiment.release.landing_height
         carrying = terminations.while_carrying(
             bounds, pos_w, upright, payload_w, self.plant.time - self.begin, height
@@ -342,7 +351,7 @@ class Flight:
             "the simulation failed": ~(np.isfinite(pos_w) & np.isfinite(payload_w)).all(1),
             **terminations.out_of_bounds(bounds, pos_w),
             "the payload hit the vehicle": np.linalg.norm(payload_w - pos_w, axis=1) < touching,
-            **{cause: mask & ~now.latched for cause, mask in carrying.items()},
+            **{cause: mask & ~snapshot.latched for cause, mask in carrying.items()},
         }
 
 
@@ -351,7 +360,9 @@ class Smoothness:
 
     def __init__(self, first: np.ndarray) -> None:
         """Begin with the command before the first, shape (E, 4 or more)."""
-        self._last, self._sum, self._steps = first, np.zeros(len(first)), np.zeros(len(first))
+        self._last = first
+        self._sum = np.zeros(len(first))
+        self._steps = np.zeros(len(first))
 
     def add(self, action: np.ndarray, active: np.ndarray | bool = True) -> None:
         """Count normalised commands, shape (E, 4 or more), of vehicles that are being flown."""
@@ -376,12 +387,10 @@ class Scores(Recorder):
 
     def __init__(self, pilots: Pilots) -> None:
         """Begin before the throw."""
-        self.clearance, self.smoothness = (
-            np.full(len(pilots.goal_w), np.inf),
-            Smoothness(pilots.first_action),
-        )
+        self.clearance = np.full(len(pilots.goal_w), np.inf)
+        self.smoothness = Smoothness(pilots.first_action)
 
-    def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+    def after(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
         if sent.action is None:
             return
         state = flight.now

@@ -30,18 +30,17 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
     for folder in map(Path, folders):
         paths = sorted(folder.glob(PATTERN))
         if not paths:
-            hint = (
-                ", ".join(sorted(path.name for path in folder.iterdir()))
-                if folder.is_dir()
-                else "no such folder"
-            )
+            if folder.is_dir():
+                hint = ", ".join(sorted(path.name for path in folder.iterdir()))
+            else:
+                hint = "no such folder"
             ticks = folder / TICKS
-            made = f"Of a run that was killed they are made by: visthrow hil view {folder}"
+            advice = f"Of a run that was killed they are made by: visthrow hil view {folder}"
             if ticks.is_file() and '"state": "throw"' not in ticks.read_text(errors="replace"):
-                made = "No throw was begun in this run"
+                advice = "No throw was begun in this run"
             raise LogError(
                 f"{folder}: no {PATTERN} in it ({hint or 'empty'}); expected the folder of a run"
-                f" with throws. {made}"
+                f" with throws. {advice}"
             )
         logs += map(FlightLog.load, paths)
     return logs
@@ -121,7 +120,9 @@ def smoothness(log: FlightLog) -> float:
     `visthrow.training.protocol` has it.
     """
     times = log.meta["times"]
-    of, seen = log["action"], log["observation"]
+    of = log["action"]
+    observation = log["observation"]
     during = (of.time >= times["policy_start"] - 1e-9) & (of.time < times["recovery"] - 1e-9)
-    action, before = of.values[during, :4], seen.values[during, VEHICLE : VEHICLE + 4]
+    action = of.values[during, :4]
+    before = observation.values[during, VEHICLE : VEHICLE + 4]
     return float(np.sqrt(np.mean(np.square(action - before))))

@@ -63,7 +63,7 @@ def load_policy(
     for part in allow:
         _check_part(part, (policy.contract, contract_here, contract_of(experiment, whole=True)))
     try:
-        widened = _within(policy, experiment)
+        widened = _allowed_sections(policy, experiment)
         departures = policy.require(contract_here, allow=(*allow, *widened))
         departures = {
             key: value for key, value in departures.items() if key.split("[")[0] not in widened
@@ -120,11 +120,12 @@ def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) 
     )
 
 
-def _within(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
+def _allowed_sections(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
     """Keys of the contract that differ, but no further than the training went: latencies inside its
     range.
     """
-    observation, trained = experiment.task.observation, policy.contract.get("observation", {})
+    observation = experiment.task.observation
+    trained = policy.contract.get("observation", {})
     low, high = trained.get("latency", (0.0, 0.0))
     jitter = trained.get("latency_jitter", 0.0)
     covered = (

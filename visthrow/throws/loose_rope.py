@@ -55,7 +55,8 @@ class LooseRope:
         h = duration / count
         for _ in range(count):
             moved = self._with_links(self.offset_w + h * self.velocity_w)
-            self.velocity_w, self.offset_w = (moved - self.offset_w) / h, moved
+            self.velocity_w = (moved - self.offset_w) / h
+            self.offset_w = moved
 
     def sink(self, duration: float, ground: float) -> None:
         """Fall and come to rest for a time [s] while the ball lies still, its centre over a ground
@@ -72,7 +73,8 @@ class LooseRope:
             end = np.zeros(3)
             for i in range(len(moved) - 1, -1, -1):
                 end = moved[i] = _on_link(moved[i], end, self._lengths[i], ground)
-            self.velocity_w, self.offset_w = (moved - self.offset_w) / h, moved
+            self.velocity_w = (moved - self.offset_w) / h
+            self.offset_w = moved
 
     def _with_links(self, moved: np.ndarray) -> np.ndarray:
         """Put positions back onto the links, along the links' directions before the step."""

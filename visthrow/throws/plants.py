@@ -118,14 +118,13 @@ class HybridPlant:
         """
         from sim.hybrid import HybridSim, rope_variants
 
-        self.params, self.count, self.noise, self.latency = (
-            plant_of(experiment),
-            count,
-            noise,
-            latency,
-        )
+        self.params = plant_of(experiment)
+        self.count = count
+        self.noise = noise
+        self.latency = latency
         self.period = self.params.sim.control_period
-        self._start, self._action = start, experiment.task.action
+        self._start = start
+        self._action = experiment.task.action
         ropes = None if start is None else rope_variants(self.params.rope, start)
         self._sim = HybridSim(self.params, count, device, seed, ropes=ropes, motors=motors)
         self._rng = np.random.default_rng(seed)
@@ -145,9 +144,11 @@ class HybridPlant:
         self._begin()
 
     def _begin(self) -> None:
-        self.time, count = 0.0, self.count
+        self.time = 0.0
+        count = self.count
         self._state: Snapshot | None = None  # since the last step; made when somebody asks
-        self._latched, self._separation = np.zeros(count, bool), np.full(count, np.nan)
+        self._latched = np.zeros(count, bool)
+        self._separation = np.full(count, np.nan)
         self._ropes: list[LooseRope | None] = [None] * count
         bias = 0.0 if self.noise is None else self.noise.observation_bias
         self._bias = bias * self._rng.standard_normal((5, count, 3))
@@ -218,10 +219,8 @@ class HybridPlant:
 
         from visthrow.onboard import actions as act
 
-        max_thrust, rates = (
-            self._action.max_thrust,
-            torch.tensor(self._action.max_rate, dtype=torch.float64),
-        )
+        max_thrust = self._action.max_thrust
+        rates = torch.tensor(self._action.max_rate, dtype=torch.float64)
         action = act.action_from_command(
             torch.from_numpy(np.asarray(command, dtype=float)), max_thrust, rates
         )
@@ -252,10 +251,8 @@ class HybridPlant:
 
     def _ball(self) -> tuple[np.ndarray, np.ndarray]:
         """Ball in flight: position and velocity; at rest after landing."""
-        pos, vel = (
-            self._sim.get("payload_pos_w").astype(float),
-            self._sim.get("payload_vel_w").astype(float),
-        )
+        pos = self._sim.get("payload_pos_w").astype(float)
+        vel = self._sim.get("payload_vel_w").astype(float)
         landing = self.landing
         pos, vel = flown(
             self.params.rope, self.params.air, pos, vel, np.nan_to_num(self.time - self._separation)
@@ -312,17 +309,17 @@ class HybridPlant:
         know no chord."""
         return self._erring(self.state)
 
-    def _erring(self, now: Snapshot) -> Snapshot:
+    def _erring(self, snapshot: Snapshot) -> Snapshot:
         if self.noise is None:
-            return now
+            return snapshot
         error = self._error
         return replace(
-            now,
-            pos_w=now.pos_w + error[0],
-            vel_w=now.vel_w + error[1],
-            rate_b=now.rate_b + error[2],
-            payload_pos_w=now.payload_pos_w + error[3],
-            quat_wb=turned(now.quat_wb, error[4]),
+            snapshot,
+            pos_w=snapshot.pos_w + error[0],
+            vel_w=snapshot.vel_w + error[1],
+            rate_b=snapshot.rate_b + error[2],
+            payload_pos_w=snapshot.payload_pos_w + error[3],
+            quat_wb=turned(snapshot.quat_wb, error[4]),
         )
 
     @property
@@ -349,20 +346,21 @@ class ReferenceAdapter:
 
         latency = float(np.mean(experiment.task.observation.latency))
         trained = ReferenceExtras(mocap_latency=latency, payload_drag=experiment.rope.payload_drag)
-        extras = (
-            config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
-            if realistic
-            else trained
-        )
+        if realistic:
+            extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
+        else:
+            extras = trained
         self.name = "reference-realistic" if realistic else "reference"
-        self.params, self.count = plant_of(experiment), count
+        self.params = plant_of(experiment)
+        self.count = count
         self.period = self.params.sim.control_period
         self._plant = ReferencePlant(self.params, extras, seed, count)
         self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
 
     def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
-        level, still = np.tile([0.0, 0.0, 0.0, 1.0], (self.count, 1)), np.zeros((self.count, 3))
-        self._plant.reset(pos_w, level, still, still, cable_dir_w)
+        level = np.tile([0.0, 0.0, 0.0, 1.0], (self.count, 1))
+        zero = np.zeros((self.count, 3))
+        self._plant.reset(pos_w, level, zero, zero, cable_dir_w)
 
     def __getattr__(self, name: str) -> Any:
         """``time``, ``step``, ``state``, ``exposed`` and ``landing`` are the plant's own."""
@@ -391,9 +389,9 @@ def flown(
 
     def acceleration(v: np.ndarray) -> np.ndarray:
         airspeed = v - wind
-        across = np.cross([0.0, 0.0, 1.0], airspeed)
-        size = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        turned = side * across + lift * np.cross(airspeed, across / size)
+        sideways = np.cross([0.0, 0.0, 1.0], airspeed)
+        size = np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-12)
+        turned = side * sideways + lift * np.cross(airspeed, sideways / size)
         return np.linalg.norm(airspeed, axis=1, keepdims=True) * (turned - share * airspeed) - [
             0.0,
             0.0,
@@ -401,7 +399,9 @@ def flown(
         ]
 
     count = max(int(np.ceil(np.max(time, initial=0.0) / FALL_STEP)), 1)
-    h, x, v = time / count, pos_w, vel_w
+    h = time / count
+    x = pos_w
+    v = vel_w
     for _ in range(count):
         a = acceleration(v)
         b = acceleration(v + 0.5 * h * a)
@@ -438,10 +438,13 @@ def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
     if not np.any(age):
         return newest
     row = np.minimum(age.astype(int), len(states) - 2)
-    late, share, each = {}, (age - row)[:, None], np.arange(len(age))
+    late = {}
+    share = (age - row)[:, None]
+    rows = np.arange(len(age))
     for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w"):
         values = np.stack([getattr(state, name) for state in states])
-        newer, older = values[row, each], values[row + 1, each]
+        newer = values[row, rows]
+        older = values[row + 1, rows]
         late[name] = newer + share * (older - newer)
     late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
     return replace(newest, **late)

@@ -40,9 +40,10 @@ class Recording(Recorder):
 
     def __init__(self, names: Sequence[str], count: int, meta: dict[str, Any]) -> None:
         """Start empty, with standard channels that a snapshot has."""
-        self.names, self.recorders = names, [FlightRecorder(meta) for _ in range(count)]
+        self.names = names
+        self.recorders = [FlightRecorder(meta) for _ in range(count)]
 
-    def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+    def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
         state = flight.now
         for e, recorder in enumerate(self.recorders):
             recorder.add(state.time, **{name: getattr(state, name)[e] for name in self.names})
@@ -69,14 +70,16 @@ class _Full(Recording):
         self._before: Snapshot | None = None
         self._sampled = -np.inf  # stamp of the last measured sample [s]
 
-    def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        super().before(flight, seen, sent)
-        recorder, state, throws = self.recorders[0], flight.now, sent.action is not None
+    def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
+        super().before(flight, snapshot, sent)
+        recorder = self.recorders[0]
+        state = flight.now
+        throws = sent.action is not None
         if sent.release[0] and self.latch is None:
             self.latch = state.time
         looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
         points, valid = looked or self.pilots.pilots[0].see(
-            seen.pos_w, seen.quat_wb, seen.payload_pos_w, self.pilots.goal_w
+            snapshot.pos_w, snapshot.quat_wb, snapshot.payload_pos_w, self.pilots.goal_w
         )
         recorder.add(
             state.time,
@@ -108,17 +111,16 @@ class _Full(Recording):
         """Rope now; after the landing it sinks to the ground instead of standing still as the
         plants leave it.
         """
-        state, landing, before, period = (
-            flight.now,
-            flight.plant.landing,
-            self._before,
-            flight.plant.period,
-        )
+        state = flight.now
+        landing = flight.plant.landing
+        before = self._before
+        period = flight.plant.period
         if not landing.landed[0] or before is None:
             return np.array(state.cable_points_w[0])
         if self._resting is None:
             age = max(landing.time[0] - before.time, 1e-3)
-            points, ball = state.cable_points_w[0], state.payload_pos_w[0]
+            points = state.cable_points_w[0]
+            ball = state.payload_pos_w[0]
             speed = (points - before.cable_points_w[0]) / age
             self._resting = LooseRope(points, np.clip(speed, -20.0, 20.0), ball, np.zeros(3))
             period = state.time - landing.time[0]
@@ -164,7 +166,7 @@ def fly(
     recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
     hangs_still = _hovering(
-        lambda now: bool(np.linalg.norm(now.payload_vel_w[0]) < QUIET_SPEED),
+        lambda snapshot: bool(np.linalg.norm(snapshot.payload_vel_w[0]) < QUIET_SPEED),
         home,
         HOVER_LEAST,
         HOVER_MOST,
@@ -174,10 +176,10 @@ def fly(
     )
     recovery = plant.time
 
-    def recovered(now: Snapshot) -> bool:  # the payload lies on the ground or hangs still
+    def recovered(snapshot: Snapshot) -> bool:  # the payload lies on the ground or hangs still
         return bool(
-            np.linalg.norm(now.vel_w[0]) < QUIET_SPEED
-            and (plant.landing.landed[0] or now.attached[0])
+            np.linalg.norm(snapshot.vel_w[0]) < QUIET_SPEED
+            and (plant.landing.landed[0] or snapshot.attached[0])
         )
 
     flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
@@ -192,7 +194,8 @@ def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
     limit = loaded.experiment.task.bounds.horizontal
     if goal_w.shape != (3,) or not np.all(np.isfinite(goal_w)):
         raise ConfigError(f"goal {goal_w}; expected three finite numbers [m]")
-    distance, trained = float(np.hypot(*goal_w[:2])), loaded.experiment.task.start.goal_radius
+    distance = float(np.hypot(*goal_w[:2]))
+    trained = loaded.experiment.task.start.goal_radius
     if distance > limit:
         where = f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m"
         raise ConfigError(f"{where}, and '{loaded.name}' was trained on goals within {trained:g} m")
@@ -212,27 +215,32 @@ def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dic
 
 
 def _hovering(
-    quiet: Callable[[Snapshot], bool], home: np.ndarray, least: float, most: float
+    quiet: Callable[[Snapshot], bool], home: np.ndarray, shortest: float, longest: float
 ) -> Phase:
     """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
-    still = 0.0
+    calm = 0.0
 
-    def over(flight: Flight) -> bool:
-        nonlocal still
+    def finished(flight: Flight) -> bool:
+        nonlocal calm
         close = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
-        still = still + flight.plant.period if close and quiet(flight.now) else 0.0
-        return flight.elapsed >= least - 1e-9 and (still >= QUIET_TIME or flight.elapsed >= most)
+        calm = calm + flight.plant.period if close and quiet(flight.now) else 0.0
+        return flight.elapsed >= shortest - 1e-9 and (
+            calm >= QUIET_TIME or flight.elapsed >= longest
+        )
 
-    return Phase(False, over)
+    return Phase(False, finished)
 
 
 def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     """The log with the last state, and how the throw ended."""
-    plant, state, recorder = flight.plant, flight.now, recording.recorders[0]
+    plant = flight.plant
+    state = flight.now
+    recorder = recording.recorders[0]
     recorder.add(state.time, **{name: getattr(state, name)[0] for name in recording.names})
     plant.measured()
     recording.sample(flight)
-    landing, failure = plant.landing, flight.failures[0]
+    landing = plant.landing
+    failure = flight.failures[0]
     times = {
         "policy_start": flight.begin,
         "latch": recording.latch,
@@ -243,7 +251,8 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
     if not np.isnan(landing.separation_time[0]):
         times["separation"] = float(landing.separation_time[0])
     if landing.landed[0]:
-        point, when = landing.point_w[0], float(landing.time[0])
+        point = landing.point_w[0]
+        when = float(landing.time[0])
         times["landing"] = when
         recorder.add(when, landing=point)
         off = point[:2] - flight.pilots.goal_w[0, :2]

@@ -77,7 +77,8 @@ def fly_batch(
     Returns :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws
     first, and ``goal_w`` where goals move; NaN where a throw failed."""
     flown = [loaded[i] for i in job.policies]
-    experiment, count = flown[0].experiment, job.count * len(flown)
+    experiment = flown[0].experiment
+    count = job.count * len(flown)
     plant, rng = batch_plant(experiment, plant_name, job.target, job.batch, count, job.seed)
     home = place_in_hover(plant, experiment, rng)
     pilots = Policies(
@@ -94,7 +95,7 @@ def fly_batch(
 class _Scores(Scores):
     """Tells of the progress too."""
 
-    def before(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
+    def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
         progress(min(flight.plant.time / (HOVER_TIME + THROW_TIME), 0.99))
 
 
@@ -104,10 +105,8 @@ def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generato
     """
     if not experiment.task.target.moves:
         return np.zeros((count, 3))
-    speed, heading = (
-        rng.uniform(*experiment.task.target.speed, count),
-        rng.uniform(0.0, 2.0 * math.pi, count),
-    )
+    speed = rng.uniform(*experiment.task.target.speed, count)
+    heading = rng.uniform(0.0, 2.0 * math.pi, count)
     return np.column_stack((speed * np.cos(heading), speed * np.sin(heading), np.zeros(count)))
 
 
@@ -173,7 +172,8 @@ class Throwing(Workers):
         ):
             raise ConfigError("policies of different plants cannot fly in one batch")
         self.jobs = plan(len(loaded), targets, throws, seed, together, size)
-        self._count, self._targets = len(loaded), list(targets)
+        self._count = len(loaded)
+        self._targets = list(targets)
         flown = partial(fly_batch, list(loaded), plant_name)
         super().__init__(flown, self.jobs, processes or cores(), "throws on the reference plant")
 
@@ -182,8 +182,8 @@ class Throwing(Workers):
         :class:`visthrow.task.measurement.Throws` a target.
         """
         self.label *= show
-        found = dict(self)
-        parts = [found[index] for index in range(len(self.jobs))]
+        results = dict(self)
+        parts = [results[index] for index in range(len(self.jobs))]
         return [
             [self._throws(parts, policy, target) for target in self._targets]
             for policy in range(self._count)

@@ -63,9 +63,10 @@ class Result:
         """Landing points of the successful throws from the target, or where it was at impact [m],
         shape (N, 2): along x, to the left.
         """
-        goal = (
-            self.of("goal_w") if "goal_w" in self.columns else np.array([self.unit["target"], 0.0])
-        )
+        if "goal_w" in self.columns:
+            goal = self.of("goal_w")
+        else:
+            goal = np.array([self.unit["target"], 0.0])
         return self.of("landing_w") - goal
 
 
@@ -176,15 +177,18 @@ def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
     """Read all results in folders and files, by key; of two with one key the later place counts."""
     results: dict[str, Result] = {}
     for place in map(Path, places):
-        files = (
-            sorted(place.glob("*.json")) if place.is_dir() else [place] if place.exists() else []
-        )
+        if place.is_dir():
+            files = sorted(place.glob("*.json"))
+        elif place.exists():
+            files = [place]
+        else:
+            files = []
         for path in files:
             results.update({result.key: result for result in load(path)})
     return results
 
 
-def join(found: Iterable[Result]) -> list[Result]:
+def join(results: Iterable[Result]) -> list[Result]:
     """Put the batches of one set of throws together: units that differ in nothing but ``batch`` and
     its size, in order.
 
@@ -192,14 +196,15 @@ def join(found: Iterable[Result]) -> list[Result]:
     """
     whole: list[Result] = []
     groups: dict[str, dict[int, Result]] = {}
-    for result in found:
+    for result in results:
         if "batch" not in result.unit:
             whole.append(result)
             continue
         common = {
             name: value for name, value in result.unit.items() if name not in ("batch", "throws")
         }
-        group, batch = groups.setdefault(key_of(common), {}), result.unit["batch"]
+        group = groups.setdefault(key_of(common), {})
+        batch = result.unit["batch"]
         if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
             group[batch] = result
     return whole + [_joined([group[batch] for batch in sorted(group)]) for group in groups.values()]
@@ -233,7 +238,7 @@ def work(
     units: Sequence[dict[str, Any]],
     folder: str | Path,
     function: Callable[[dict], tuple[dict[str, np.ndarray], dict[str, Any]]],
-    known: dict[str, Result] | None = None,
+    recorded: dict[str, Result] | None = None,
     processes: int = 1,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Result]:
@@ -243,10 +248,10 @@ def work(
     Args:
         units, folder: what is wanted, and where each result is written when it is done.
         function: of a unit, importable by its name; returns columns and extra figures.
-        known: results from elsewhere, by key; they count as done.
+        recorded: results from elsewhere, by key; they count as done.
         processes, say: 1 works in this one; told of the progress.
     """
-    results = {**load_all([folder]), **(known or {})}
+    results = {**load_all([folder]), **(recorded or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
     begin = time.monotonic()
     one = partial(finish, folder, function, provenance.commit(), provenance.command())

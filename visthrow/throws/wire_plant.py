@@ -55,10 +55,8 @@ class HybridWirePlant:
     def _fine(self, experiment: Experiment) -> Experiment:
         """The experiment with this plant's period, nothing measured late."""
         observation = replace(experiment.task.observation, latency=(0.0, 0.0))
-        sim, task = (
-            replace(experiment.sim, control_period=self.period),
-            replace(experiment.task, observation=observation),
-        )
+        sim = replace(experiment.sim, control_period=self.period)
+        task = replace(experiment.task, observation=observation)
         return replace(experiment, sim=sim, task=task)
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
@@ -79,19 +77,20 @@ class HybridWirePlant:
     @property
     def state(self) -> dict[str, np.ndarray]:
         """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached: the truth."""
-        now = self._plant.state
+        state = self._plant.state
         names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "attached")
-        return {name: getattr(now, name)[0] for name in names}
+        return {name: getattr(state, name)[0] for name in names}
 
     @property
     def landing(self) -> dict[str, list[float] | float | None]:
         """The payload's landing and separation, None before them."""
-        now = self._plant.landing
-        landed, apart = bool(now.landed[0]), float(now.separation_time[0])
+        landing = self._plant.landing
+        landed = bool(landing.landed[0])
+        separation = float(landing.separation_time[0])
         return {
-            "landing_w": now.point_w[0].tolist() if landed else None,
-            "landing_time": float(now.time[0]) if landed else None,
-            "separation_time": None if np.isnan(apart) else apart,
+            "landing_w": landing.point_w[0].tolist() if landed else None,
+            "landing_time": float(landing.time[0]) if landed else None,
+            "separation_time": None if np.isnan(separation) else separation,
         }
 
 
@@ -121,25 +120,19 @@ class HybridMotorPlant(HybridWirePlant):
 
     def __init__(self, experiment: Experiment, seed: int) -> None:
         super().__init__(experiment, seed)
-        controller, thrust, battery = (
-            experiment.vehicle.controller,
-            experiment.vehicle.thrust,
-            experiment.vehicle.battery,
-        )
+        controller = experiment.vehicle.controller
+        thrust = experiment.vehicle.thrust
+        battery = experiment.vehicle.battery
         self._full_speed = (controller.max_thrust / thrust.k_f) ** 0.5
         mixing = controller.kind == "motor_mixing"
-        self._k_f, self._reference = (
-            thrust.k_f,
-            (controller.calibration_voltage if mixing else battery.reference_voltage),
-        )
+        self._k_f = thrust.k_f
+        self._reference = controller.calibration_voltage if mixing else battery.reference_voltage
         self._plant.stop_motors()
         self._stand: dict[str, np.ndarray] | None = self._plant.hold()
         self._look()
         self.force_b = np.array([0.0, 0.0, GRAVITY])
-        self._ground, self._floor = (
-            experiment.vehicle.collision_radius,
-            experiment.rope.payload_radius,
-        )
+        self._ground = experiment.vehicle.collision_radius
+        self._floor = experiment.rope.payload_radius
         self.touchdown: float | None = None
 
     def look(self) -> dict[str, np.ndarray]:
@@ -157,16 +150,15 @@ class HybridMotorPlant(HybridWirePlant):
 
     def _look(self) -> None:
         self._now = self.look()
-        self.quat_wb, self.rate_b = self._now["quat_wb"], self._now["rate_b"]
+        self.quat_wb = self._now["quat_wb"]
+        self.rate_b = self._now["rate_b"]
 
     def _built(self, experiment: Experiment) -> HybridPlant:
         queue = replace(
             experiment.vehicle.queue, delay=0.0
         )  # the firmware's own path comes in its place
-        vehicle, release = (
-            replace(experiment.vehicle, queue=queue),
-            replace(experiment.release, lag=MECHANISM),
-        )
+        vehicle = replace(experiment.vehicle, queue=queue)
+        release = replace(experiment.release, lag=MECHANISM)
         return HybridPlant(
             self._fine(replace(experiment, vehicle=vehicle, release=release)), motors=True
         )
@@ -179,10 +171,10 @@ class HybridMotorPlant(HybridWirePlant):
     @property
     def state(self) -> dict[str, np.ndarray]:
         """Return the state as `HybridWirePlant` does; a hanging ball stays above the ground."""
-        now = super().state
-        ball = now["payload_pos_w"].copy()
+        state = super().state
+        ball = state["payload_pos_w"].copy()
         ball[2] = max(ball[2], self._floor)
-        return now | {"payload_pos_w": ball}
+        return state | {"payload_pos_w": ball}
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under motor commands, 0 to 1, shape (4,); release: see
@@ -224,9 +216,11 @@ class HybridMotorPlant(HybridWirePlant):
         stand = self._plant.hold()
         for name in ("vel_w", "rate_b", "cable_vel_w"):
             stand[name][:] = 0.0
-        stand["quat_wb"][:], stand["cable_dir_w"][:] = level, (0.0, 0.0, -1.0)
+        stand["quat_wb"][:] = level
+        stand["cable_dir_w"][:] = (0.0, 0.0, -1.0)
         stand["pos_w"][..., 2] = self._ground
-        self._stand, self.force_b = stand, np.array([0.0, 0.0, GRAVITY])
+        self._stand = stand
+        self.force_b = np.array([0.0, 0.0, GRAVITY])
         self._plant.hold(stand)
         self._look()
 

@@ -43,7 +43,7 @@ class Network(nn.Module):
     parts and shapes.
     """
 
-    def __init__(self, kept: Tensor, learnt: Tensor, width: int, p: DistillationParams):
+    def __init__(self, passed: Tensor, learnt: Tensor, width: int, p: DistillationParams):
         """Begin with an estimate of what is kept: the entry of the observation that each estimate
         corrects, ``width`` for none, shape (S,).
 
@@ -53,17 +53,20 @@ class Network(nn.Module):
         widths = (p.hidden, *p.inner)
         self.encoder = nn.Linear(width, p.hidden)
         self.inner = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
-        self.gru, self.output = nn.GRU(widths[-1], p.memory), nn.Linear(p.memory, len(kept))
+        self.gru = nn.GRU(widths[-1], p.memory)
+        self.output = nn.Linear(p.memory, len(passed))
         with torch.no_grad():
             self.output.weight.mul_(0.1)
             self.output.bias.zero_()
         self.normalizer = EmpiricalNormalization(width)
-        self.register_buffer("kept", kept)
+        self.register_buffer("kept", passed)
         self.register_buffer("learnt", learnt.float())
 
     def frozen(self) -> Estimator:
         """The estimator that flies; it shares the parameters."""
-        mask, gru, normaliser = self.learnt, self.gru, self.normalizer
+        mask = self.learnt
+        gru = self.gru
+        normaliser = self.normalizer
         parts = [
             normaliser.mean,
             normaliser.std + normaliser.eps,
@@ -92,7 +95,8 @@ class Distillation:
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        self.cfg, self.p = experiment, experiment.distillation
+        self.cfg = experiment
+        self.p = experiment.distillation
         observation = experiment.task.observation
         if experiment.task.target.moves or observation.layout != "vision":
             raise ConfigError(
@@ -115,7 +119,9 @@ class Distillation:
                 " policy; expected one without goal_velocity, located and response"
             )
         self.env = env = ThrowEnv(experiment, device, seed)
-        self.iterations, E, T = self.p.iterations, env.num_envs, self.p.horizon
+        self.iterations = self.p.iterations
+        E = env.num_envs
+        T = self.p.horizon
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
         passed, learnt = _passed(env.layout, self._layout)
@@ -146,15 +152,14 @@ class Distillation:
         """Fly one batch from new starts and record what was seen, what there was, and until when
         each throw lasted.
         """
-        env, policy = self.env, self.teacher
-        seen, memory = (
-            env.reset()["actor"],
-            torch.zeros(env.num_envs, self.p.memory, device=env.device),
-        )
+        env = self.env
+        policy = self.teacher
+        observed = env.reset()["actor"]
+        memory = torch.zeros(env.num_envs, self.p.memory, device=env.device)
         alive = torch.ones_like(self._alive[0])
         fresh = alive > 0.0
         for k in range(self.p.horizon):
-            self._obs[k].copy_(seen)
+            self._obs[k].copy_(observed)
             truth, history = ob.observe(
                 self._layout,
                 env.exact_frame(self._age),
@@ -167,9 +172,10 @@ class Distillation:
             self._history.copy_(history)
             self._truth[k].copy_(truth)
             self._alive[k].copy_(alive)
-            estimate, memory = self._flying.step(seen, memory)
+            estimate, memory = self._flying.step(observed, memory)
             observations, _, done, _ = env.step(policy.decide(estimate))
-            seen, alive = observations["actor"], alive * (done == 0)
+            observed = observations["actor"]
+            alive = alive * (done == 0)
 
     def collect(self, done: float) -> None:
         self.env.clear_totals()
@@ -188,15 +194,15 @@ class Distillation:
             for rows in torch.randperm(self.env.num_envs, device=self.env.device).chunk(
                 self.p.minibatches
             ):
-                obs, truth, alive = self._obs[:, rows], self._truth[:, rows], self._alive[:, rows]
+                obs = self._obs[:, rows]
+                truth = self._truth[:, rows]
+                alive = self._alive[:, rows]
                 estimate = self.network(obs)
                 off = F.smooth_l1_loss(
                     estimate / self._scales, truth / self._scales, reduction="none"
                 ).mean(-1)
-                target, action = (
-                    act.clip_action(self.teacher.decide(truth)),
-                    self.teacher.decide(estimate),
-                )
+                target = act.clip_action(self.teacher.decide(truth))
+                action = self.teacher.decide(estimate)
                 wrong = (
                     act.clip_action(action) - target
                 ).detach()  # beyond the limits only the way back counts
@@ -229,7 +235,8 @@ class Distillation:
         )
 
     def take_up(self, policy: Policy) -> None:
-        e, n = policy.estimator, self.network
+        e = policy.estimator
+        n = self.network
         fits = e is not None and {k: v.shape for k, v in e.parts().items()} == {
             k: v.shape for k, v in n.frozen().parts().items()
         }
@@ -266,19 +273,17 @@ class Distillation:
         self._refresh()
 
 
-def _passed(seen: ob.Layout, wanted: ob.Layout) -> tuple[Tensor, Tensor]:
+def _passed(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
     """Which entry of a vision observation each entry of a state observation corrects, and which of
     these are learnt.
     """
-    none, vehicle, places = (
-        seen.dimension,
-        list(range(ob.VEHICLE + 5)),
-        seen.dimension - seen.motion - seen.located,
-    )
-    goal = [places, places + 1] if seen.located else [none, none]
-    between = wanted.dimension - len(vehicle) - len(goal) - 1
-    columns = torch.tensor([*vehicle, *goal, *[none] * between, places - seen.validity - 1])
-    learnt = torch.ones(wanted.dimension, dtype=torch.bool)
+    none = vision.dimension
+    vehicle = list(range(ob.VEHICLE + 5))
+    places = vision.dimension - vision.motion - vision.located
+    goal = [places, places + 1] if vision.located else [none, none]
+    between = state.dimension - len(vehicle) - len(goal) - 1
+    columns = torch.tensor([*vehicle, *goal, *[none] * between, places - vision.validity - 1])
+    learnt = torch.ones(state.dimension, dtype=torch.bool)
     learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = (
         False  # the action before and the latch are known
     )

@@ -63,8 +63,11 @@ class ThrowEnv(VecEnv):
                 caller's to seed.
             count: number of environments; default the experiment's.
         """
-        self.cfg, self.device, task = experiment, device, experiment.task
-        self.num_envs, self.num_actions = count or experiment.ppo.environments, act.ACTIONS
+        self.cfg = experiment
+        self.device = device
+        task = experiment.task
+        self.num_envs = count or experiment.ppo.environments
+        self.num_actions = act.ACTIONS
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
         fleet = members(experiment)
         plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
@@ -74,11 +77,10 @@ class ThrowEnv(VecEnv):
             name: [getattr(plant, name) for plant in plants for _ in range(share)]
             for name in ("vehicle", "air", "release")
         }
-        variants = (
-            {f"{name}s": parts for name, parts in parts_of.items()}
-            if fleet or len(plants) > 1
-            else {}
-        )
+        if fleet or len(plants) > 1:
+            variants = {f"{name}s": parts for name, parts in parts_of.items()}
+        else:
+            variants = {}
         self.sim = HybridSim(
             plant_of(experiment), self.num_envs, device, seed, ropes=ropes, **variants
         )
@@ -86,7 +88,8 @@ class ThrowEnv(VecEnv):
         self.layout = ob.layout_of(task.observation)
         self._found: tuple[Tensor, Tensor] | None = None  # by a calibration
         self.camera = KeypointCamera(experiment.camera, device)
-        E, make = self.num_envs, {"device": device, "dtype": torch.float32}
+        E = self.num_envs
+        make = {"device": device, "dtype": torch.float32}
         self._max_thrust: float | Tensor = task.action.max_thrust
         self._start_action = torch.tensor(
             act.hover_action(GRAVITY * plant_of(experiment).total_mass, self._max_thrust), **make
@@ -95,19 +98,15 @@ class ThrowEnv(VecEnv):
         if fleet:
             each_of = torch.arange(E, device=device) % len(ropes) // share
 
-            def of(values: list) -> Tensor:
+            def per_environment(values: list) -> Tensor:
                 return torch.tensor(values, **make)[each_of]
 
-            self._max_thrust, self._start_action = (
-                of([[m.max_thrust] for m in fleet]),
-                of([m.first_action for m in fleet]),
-            )
-            self._setup, self._known = (
-                of([m.setup(task.observation.setup) for m in fleet]),
-                of([m.exact for m in fleet]),
-            )
-            self._clock = of([m.units.time for m in fleet])
-            self.camera.radius = of([m.plant.rope.payload_radius for m in fleet])
+            self._max_thrust = per_environment([[m.max_thrust] for m in fleet])
+            self._start_action = per_environment([m.first_action for m in fleet])
+            self._setup = per_environment([m.setup(task.observation.setup) for m in fleet])
+            self._known = per_environment([m.exact for m in fleet])
+            self._clock = per_environment([m.units.time for m in fleet])
+            self.camera.radius = per_environment([m.plant.rope.payload_radius for m in fleet])
         self._max_rate = torch.tensor(task.action.max_rate, **make)
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)
         self._change_weights = torch.tensor(task.reward.command_change, **make)
@@ -127,21 +126,16 @@ class ThrowEnv(VecEnv):
 
     def _remembered(self) -> dict[str, Tensor]:
         """Return the buffers that an episode carries beside the simulator's state."""
-        task, E, make = (
-            self.cfg.task,
-            self.num_envs,
-            {"device": self.device, "dtype": torch.float32},
-        )
-        observation, latency, device = (
-            task.observation,
-            self.cfg.camera.noise.history_length,
-            self.device,
-        )
-        oldest = (
-            observation.oldest
-            if self._clock is None
-            else observation.oldest / float(self._clock.min())
-        )
+        task = self.cfg.task
+        E = self.num_envs
+        make = {"device": self.device, "dtype": torch.float32}
+        observation = task.observation
+        latency = self.cfg.camera.noise.history_length
+        device = self.device
+        if self._clock is None:
+            oldest = observation.oldest
+        else:
+            oldest = observation.oldest / float(self._clock.min())
         memory = {
             "previous": torch.zeros(E, act.ACTIONS, **make),
             "history": torch.zeros(E, 1 + self.layout.history, self.layout.payload, **make),
@@ -201,12 +195,12 @@ class ThrowEnv(VecEnv):
         offset = ob.state_part(pose[:, :3], self.views.goal_w, pose[:, ob.VEHICLE :])
         return torch.cat([pose[:, : ob.VEHICLE], offset], dim=-1)
 
-    def begin_throws(self, found: tuple[Tensor, Tensor]) -> TensorDict:
+    def begin_throws(self, correction: tuple[Tensor, Tensor]) -> TensorDict:
         """Begin throws where the vehicles are, with what a calibration in the hover before found.
 
         Keypoints are corrected from here on for the cameras' turns [rad], shape (E, 3), and errors
         of focal length [-], shape (E,)."""
-        self._found = found
+        self._found = correction
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
         self.episode_length_buf.zero_()
         self._memory["previous"].copy_(self._start_action.expand_as(self._memory["previous"]))
@@ -237,7 +231,8 @@ class ThrowEnv(VecEnv):
         ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are
         means over the released."""
         totals = dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
-        released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
+        released = max(totals["released"], 1.0)
+        episodes = max(totals["episodes"], 1.0)
         means = {name: totals[name] / released for name in ("landing_error", "duration")}
         return {"released": totals["released"] / episodes, **means, "episodes": totals["episodes"]}
 
@@ -289,7 +284,8 @@ class ThrowEnv(VecEnv):
 
     def _apply(self, actions: Tensor, hold: bool = False, mask: wp.array | None = None) -> Tensor:
         """Fly one control period; returns the clipped actions."""
-        task, memory = self.cfg.task, self._memory
+        task = self.cfg.task
+        memory = self._memory
         action = act.clip_action(actions)
         noisy = (
             action[:, : act.COMMANDS]
@@ -309,18 +305,14 @@ class ThrowEnv(VecEnv):
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step just made."""
-        task, state, out, period = (
-            self.cfg.task,
-            self.views.state,
-            self.views.out,
-            self.cfg.sim.control_period,
-        )
-        p, time, released, latched = (
-            task.reward,
-            self.episode_length_buf * period,
-            out["separated"] != 0,
-            state["release_timer"] >= 0.0,
-        )
+        task = self.cfg.task
+        state = self.views.state
+        out = self.views.out
+        period = self.cfg.sim.control_period
+        p = task.reward
+        time = self.episode_length_buf * period
+        released = out["separated"] != 0
+        latched = state["release_timer"] >= 0.0
         negative = ~released & terminations.negative(
             task.bounds,
             state["pos_w"],
@@ -369,7 +361,9 @@ class ThrowEnv(VecEnv):
 
     def _begin(self, fresh: Tensor) -> None:
         """Draw what holds for an episode where one begins."""
-        memory, noise, camera = self._memory, self.cfg.task.noise, self.cfg.camera
+        memory = self._memory
+        noise = self.cfg.task.noise
+        camera = self.cfg.camera
         self.episode_length_buf.masked_fill_(fresh, 0)
         torch.where(fresh[:, None], self._start_action, memory["previous"], out=memory["previous"])
         spreads = {
@@ -396,7 +390,8 @@ class ThrowEnv(VecEnv):
         if fast > 0.0:
             velocity = memory["goal_vel"]
             sample = torch.rand_like(velocity[:, :2])
-            speed, heading = slow + (fast - slow) * sample[:, 0], 2.0 * math.pi * sample[:, 1]
+            speed = slow + (fast - slow) * sample[:, 0]
+            heading = 2.0 * math.pi * sample[:, 1]
             new = torch.stack(
                 [speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)], dim=-1
             )
@@ -404,8 +399,10 @@ class ThrowEnv(VecEnv):
 
     def _late(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Pose sample as old as the episode's latency, linear between two control steps."""
-        memory, observation = self._memory, self.cfg.task.observation
-        poses, age = hist.push(memory["poses"], pose, fresh), memory["pose_age"]
+        memory = self._memory
+        observation = self.cfg.task.observation
+        poses = hist.push(memory["poses"], pose, fresh)
+        age = memory["pose_age"]
         memory["poses"].copy_(poses)
         if observation.oldest == 0.0:
             return pose
@@ -421,7 +418,9 @@ class ThrowEnv(VecEnv):
     @rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state."""
-        state, memory, noise = self.views.state, self._memory, self.cfg.task.noise
+        state = self.views.state
+        memory = self._memory
+        noise = self.cfg.task.noise
         payload = self.views.out["payload_pos_w"]
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
@@ -481,7 +480,9 @@ class ThrowEnv(VecEnv):
         self, actor: Tensor, vehicle: Tensor, payload: Tensor, time: Tensor, fresh: Tensor
     ) -> Tensor:
         """Critic's view: what ``ppo.privileged`` names."""
-        state, memory, named = self.views.state, self._memory, self.cfg.ppo.privileged
+        state = self.views.state
+        memory = self._memory
+        named = self.cfg.ppo.privileged
         parts = [actor]
         if "exact" in named:
             offset = ob.state_part(state["pos_w"], self.views.goal_w, payload)
@@ -511,7 +512,8 @@ class ThrowEnv(VecEnv):
         """Keypoints as the detector reports them: errors of mount and focal length, latency, noise,
         drop-out, held images.
         """
-        memory, camera = self._memory, self.cfg.camera
+        memory = self._memory
+        camera = self.cfg.camera
         points, valid = keypoints(self.camera, pos_w, rot_wb, goal_w, payload_w, self.extrinsics())
         if camera.noise.seen_radius < 1.0:
             valid = valid & (points.square().sum(-1) <= camera.noise.seen_radius**2)
@@ -533,11 +535,9 @@ class ThrowEnv(VecEnv):
             valid = torch.where(repeated[:, None], memory["held_valid"], valid)
             memory["held_points"].copy_(points)
             memory["held_valid"].copy_(valid)
-        return (
-            (points, valid)
-            if self._found is None
-            else corrected_keypoints(self.camera, points, valid, *self._found)
-        )
+        if self._found is None:
+            return (points, valid)
+        return corrected_keypoints(self.camera, points, valid, *self._found)
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""
@@ -547,12 +547,12 @@ class ThrowEnv(VecEnv):
             "memory": self._memory,
             "obs": self._observations,
         }
-        found = {
+        tensors_ = {
             f"{group}.{name}": tensor
             for group, tensors in groups.items()
             for name, tensor in tensors.items()
         }
-        return found | {
+        return tensors_ | {
             "episode": wp.to_torch(self.sim.episode),
             "goal_w": self.views.goal_w,
             "length": self.episode_length_buf,

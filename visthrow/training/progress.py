@@ -55,7 +55,10 @@ class TrainLog:
             last, done: iteration that the run ends at, and those that a resumed run has behind it.
             minutes: that it may take, where they are limited.
         """
-        self.samples, self.last, self.done, self.minutes = samples, last, done, minutes
+        self.samples = samples
+        self.last = last
+        self.done = done
+        self.minutes = minutes
         rows = _rows(path, done) if done and path.exists() else []
         text = io.StringIO()
         writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
@@ -99,7 +102,7 @@ class TrainLog:
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
             f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
             f" {terminal.clock(figures['wall_s'])},"
-            f" {terminal.clock(self._left(figures['iteration'], elapsed))} left"
+            f" {terminal.clock(self._remaining(figures['iteration'], elapsed))} left"
         )
         if self._picture is not None:
             self._picture.draw(text, figures, throws)
@@ -108,10 +111,10 @@ class TrainLog:
         elif figures["iteration"] % 25 == 0:
             print(text, flush=True)
 
-    def _left(self, iteration: int, gone: float) -> float:
+    def _remaining(self, iteration: int, elapsed_: float) -> float:
         """Time to the last iteration or the end of the minutes at the speed so far [s]."""
-        remaining = (self.last - iteration) * gone / max(iteration - self.done, 1)
-        return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - gone)
+        remaining = (self.last - iteration) * elapsed_ / max(iteration - self.done, 1)
+        return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed_)
 
 
 class Picture:
@@ -137,11 +140,12 @@ class Picture:
         self._training.append((figures["wall_s"], figures["landing_error"]))
         if throws is not None:
             self._thrown.append((figures["wall_s"], figures["error_2m"]))
-            self._last, self._said = throws, figures_text(figures)
-        now = time.perf_counter()
-        if throws is None and now - self._drawn < REDRAWN:
+            self._last = throws
+            self._said = figures_text(figures)
+        time_ = time.perf_counter()
+        if throws is None and time_ - self._drawn < REDRAWN:
             return
-        self._drawn = now
+        self._drawn = time_
         lines = [text, *self.lines()]
         up = f"\x1b[{self._lines}A" if self._lines else ""
         print(up + "".join(f"\x1b[2K{line}\n" for line in lines), end="", flush=True)
@@ -150,7 +154,8 @@ class Picture:
     def lines(self) -> list[str]:
         """The picture without its head line."""
         chart = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
-        points, last = [], self._last
+        points = []
+        last = self._last
         if last is not None:
             offsets = last.landing_w - ((last.target, 0.0) if last.goal_w is None else last.goal_w)
             points = [(-float(y), float(x)) for x, y in offsets[last.success]]
@@ -164,7 +169,8 @@ class Picture:
 
 def evaluated(throws: Throws) -> dict[str, float]:
     """Columns of an evaluation; no error where none landed."""
-    row, nan = throws.summary(), float("nan")
+    row = throws.summary()
+    nan = float("nan")
     return {
         "error_2m": row.get("error_mean", nan),
         "duration_2m": row.get("duration_mean", nan),

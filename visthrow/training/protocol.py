@@ -36,7 +36,8 @@ def as_flown(experiment: Experiment) -> Experiment:
     """Return the experiment as its policies are flown and measured: without training's faults."""
     if not experiment.flown:
         return experiment
-    text, name = config.dumps(experiment), "the configuration of the training"
+    text = config.dumps(experiment)
+    name = "the configuration of the training"
     return config.loads(Experiment, text, list(experiment.flown), name=name)
 
 
@@ -72,7 +73,8 @@ def throw(
 def _fly(
     env: ThrowEnv, policy, target: float, count: int, begin: Callable[[ThrowEnv], TensorDict]
 ) -> Throws:
-    observations, previous = begin(env), env.previous_action.clone()
+    observations = begin(env)
+    previous = env.previous_action.clone()
     open_ = torch.ones(count, dtype=torch.bool, device=env.device)
     tensors: dict[str, torch.Tensor] = {}
     change, steps = torch.zeros(2, count, device=env.device)

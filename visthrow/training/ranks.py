@@ -43,11 +43,9 @@ class Ranks:
     @property
     def rsl_rl(self) -> dict | None:
         """rsl_rl's ``multi_gpu`` dictionary."""
-        return (
-            {"global_rank": self.rank, "local_rank": self.local, "world_size": self.world}
-            if self.world > 1
-            else None
-        )
+        if self.world > 1:
+            return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.world}
+        return None
 
     def share(self, *modules: nn.Module) -> None:
         """Give every process the first one's weights and buffers."""
@@ -79,11 +77,9 @@ class Ranks:
         saved: list[bytes] = [payload] * self.world
         if self.world > 1:
             distributed.gather_object(payload, saved if self.lead else None)
-        return (
-            [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved]
-            if self.lead
-            else []
-        )
+        if self.lead:
+            return [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved]
+        return []
 
     def leave(self) -> None:
         """Part from the others.

@@ -7,6 +7,7 @@ the run."""
 
 import contextlib
 import json
+import math
 import os
 import signal
 import sys
@@ -104,7 +105,7 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
             f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}",
             file=sys.stderr,
         )
-    return 0 if why == OVER else EXIT_INTERRUPTED
+    return 0 if why == OUT_OF_TIME else EXIT_INTERRUPTED
 
 
 def _check(args: Options) -> None:
@@ -132,7 +133,8 @@ def _begun(args: Options) -> tuple:
     """Experiment, policy to start from or None, folder and seed of a new run; StorageError where
     the folder holds one already.
     """
-    path, seed = config.find("train", args.config), 1 if args.seed is None else args.seed
+    path = config.find("train", args.config)
+    seed = 1 if args.seed is None else args.seed
     folder = Path(args.out or f"runs/{path.stem}-{seed}")
     provenance.check_free(folder)
     if args.start is None:
@@ -177,7 +179,7 @@ def _resumed(args: Options) -> tuple:
     return experiment, None, folder, seed
 
 
-DONE, REACHED, OVER, STOPPED = ENDS = (
+DONE, REACHED, OUT_OF_TIME, STOPPED = ENDS = (
     "finished",
     "reached the error that was asked for",
     "the time is over",
@@ -193,12 +195,14 @@ class Regularly:
     time allows.
     """
 
-    def __init__(self, every: int | None, share: float):
-        """Begin; ``every``: iterations, None leaves it to the clock; ``share``: of the wall time
+    def __init__(self, period: int | None, share: float):
+        """Begin; ``period``: iterations, None leaves it to the clock; ``share``: of the wall time
         then, 0 for never.
         """
-        self._every, self._share = every, share
-        self._after, self._wait = time.perf_counter(), FIRST
+        self._every = period
+        self._share = share
+        self._after = time.perf_counter()
+        self._wait = FIRST
 
     def due(self, iteration: int) -> bool:
         """Whether to do it after this iteration."""
@@ -220,20 +224,21 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
 
     TrainError where a file cannot be written; what the last checkpoint holds is not lost.
     """
-    start, kept, why, ranks = time.perf_counter(), trainer.iteration, DONE, trainer.ranks
+    deadline = time.perf_counter() + 60.0 * (args.minutes or math.inf)
+    saved = trainer.iteration
+    why = DONE
+    ranks = trainer.ranks
     evaluations = Regularly(
         args.evaluate_every,
         EVALUATION_SHARE if args.until or viewer or sys.stdout.isatty() else 0.0,
     )
     checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
-    picture = (
-        viewer(trainer) if viewer and ranks.lead else contextlib.nullcontext(lambda throws: None)
-    )
-    log = (
-        TrainLog(folder / "progress.csv", trainer.algorithm.samples, last, kept, args.minutes)
-        if ranks.lead
-        else None
-    )
+    picture = contextlib.nullcontext(lambda throws: None)
+    log = None
+    if ranks.lead:
+        samples = trainer.algorithm.samples
+        log = TrainLog(folder / "progress.csv", samples, last, saved, args.minutes)
+        picture = viewer(trainer) if viewer else picture
     try:
         with (
             log or contextlib.nullcontext(),
@@ -241,7 +246,8 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
             picture as show,
         ):
             while trainer.iteration < last and why == DONE:
-                figures, throws = trainer.step(), None
+                figures = trainer.step()
+                throws = None
                 if ranks.lead and evaluations.due(trainer.iteration):
                     with evaluations.timed():
                         throws = trainer.throw(EVALUATION_TARGET)
@@ -251,20 +257,19 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
                 if ranks.agree(checkpoints.due(trainer.iteration)):
                     with checkpoints.timed():
                         trainer.save(folder / CHECKPOINT)
-                    kept = trainer.iteration
+                    saved = trainer.iteration
                 if args.until and throws is not None and throws.within(args.until):
                     why = REACHED
-                elif trainer.iteration < last:
-                    spent = args.minutes and time.perf_counter() - start > 60 * args.minutes
-                    why = STOPPED if stop.asked else OVER if spent else DONE
+                elif trainer.iteration < last and stop.asked:
+                    why = STOPPED
+                elif trainer.iteration < last and time.perf_counter() > deadline:
+                    why = OUT_OF_TIME
                 why = ENDS[ranks.agree(ENDS.index(why))]
             trainer.save(folder / CHECKPOINT)
     except (OSError, StorageError) as error:
-        state = (
-            f"the checkpoint of iteration {kept} is whole; make room and go on with --resume"
-            if kept
-            else "no checkpoint yet"
-        )
+        state = "no checkpoint yet"
+        if saved:
+            state = f"the checkpoint of iteration {saved} is whole; free space and use --resume"
         raise TrainError(
             f"{folder}: cannot write ({error}) in iteration {trainer.iteration}; {state}"
         ) from error

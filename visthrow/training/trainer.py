@@ -23,12 +23,10 @@ from visthrow.training.device import rounded_products
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ranks import Ranks
 
-CHECKPOINT, POLICY, SUMMARY, EVALUATION = (
-    "checkpoint.pt",
-    "policy.npz",
-    "summary.json",
-    "evaluation.json",
-)
+CHECKPOINT = "checkpoint.pt"
+POLICY = "policy.npz"
+SUMMARY = "summary.json"
+EVALUATION = "evaluation.json"
 """Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its
 end, and of one that did not.
 """
@@ -120,7 +118,8 @@ def fitted(experiment: Experiment, policy: Policy) -> Experiment:
             f'--from: the policy is one {kinds[0]} a memory; algorithm = "{experiment.algorithm}"'
             f" trains those {kinds[1]}"
         )
-    p, hidden = experiment.ppo, tuple(len(bias) for bias in policy.biases[:-1])
+    p = experiment.ppo
+    hidden = tuple(len(bias) for bias in policy.biases[:-1])
     layers = {"hidden": hidden, "critic": p.critic or p.hidden, "activation": policy.activation}
     return dataclasses.replace(
         experiment, ppo=dataclasses.replace(p, **layers, normalize=policy.mean is not None)
@@ -145,7 +144,10 @@ class Trainer:
         torch.manual_seed(seed * 1000 + ranks.rank)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)  # captures and synchronisation go to the current device
-        self.experiment, self.device, self.seed, self.ranks = experiment, device, seed, ranks
+        self.experiment = experiment
+        self.device = device
+        self.seed = seed
+        self.ranks = ranks
         self.algorithm = build(experiment, device, seed * 1000 + ranks.rank, ranks)
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
@@ -155,7 +157,8 @@ class Trainer:
         """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and
         ``learning_s`` [s].
         """
-        start, done = time.perf_counter(), min(self.iteration / self.algorithm.iterations, 1.0)
+        start = time.perf_counter()
+        done = min(self.iteration / self.algorithm.iterations, 1.0)
         self.algorithm.collect(done)
         if self.device.startswith("cuda"):
             torch.cuda.synchronize()
@@ -265,7 +268,8 @@ class Trainer:
                 " ones"
             )
         self.iteration = saved["iteration"]
-        rank, parts = self.ranks.rank, saved["ranks"]
+        rank = self.ranks.rank
+        parts = saved["ranks"]
         has_state = rank < len(parts)
         part = io.BytesIO(parts[rank if has_state else 0].numpy().tobytes())
         state = torch.load(part, map_location=self.device, weights_only=True)

@@ -66,7 +66,7 @@ def _look(series: int) -> tuple[str, str]:
 
 
 def _axes(
-    count: int, columns: int, width: float, height: float, more: float, sharex: bool = False
+    count: int, columns: int, width: float, height: float, margin: float, sharex: bool = False
 ) -> tuple[Any, Any]:
     """A figure so wide [inch] with axes for ``count`` panels, each row so high, and
     some room more.
@@ -78,7 +78,7 @@ def _axes(
     figure, axes = plt.subplots(
         rows,
         columns,
-        figsize=(width, height * rows + more),
+        figsize=(width, height * rows + margin),
         layout="constrained",
         squeeze=False,
         sharex=sharex,
@@ -89,12 +89,12 @@ def _axes(
     return figure, axes
 
 
-def _labelled(axes: Any, below: str | None, left: str, **look: Any) -> None:
+def _labelled(axes: Any, below: str | None, ylabel: str, **look: Any) -> None:
     """Name the outer axes of a grid."""
     for axis in axes[-1] if below else ():
         axis.set_xlabel(below, **look)
     for axis in axes[:, 0]:
-        axis.set_ylabel(left, **look)
+        axis.set_ylabel(ylabel, **look)
 
 
 def marks(
@@ -117,7 +117,9 @@ def marks(
     )
     handles = {}
     for row in rows:
-        (colour, marker), value, paper = _look(row.series), row.interval, row.paper
+        (colour, marker) = _look(row.series)
+        value = row.interval
+        paper = row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
         axis.plot(
             [value.low, value.high],
@@ -148,7 +150,8 @@ def marks(
     axis.set_axisbelow(True)
     axis.set_xlabel(xlabel)
     if len(handles) > 1:
-        keys, names = sorted(handles), [*series, "the paper's vehicle"]
+        keys = sorted(handles)
+        names = [*series, "the paper's vehicle"]
         figure.legend(
             [handles[key] for key in keys], [names[key] for key in keys], loc="outside right upper"
         )
@@ -181,8 +184,8 @@ def scatter(
     half = float(np.clip(1.06 * reach, 0.12, 0.7))
     columns = min(columns, len(panels))
     size = WIDTH / max(columns, 3)
-    wide, more = (max(size * columns, 6.4), 1.1) if heading else (size * columns, 0.8)
-    figure, axes = _axes(len(panels), columns, wide, size, more, sharex=True)
+    wide, margin = (max(size * columns, 6.4), 1.1) if heading else (size * columns, 0.8)
+    figure, axes = _axes(len(panels), columns, wide, size, margin, sharex=True)
     for axis, (title, series) in zip(axes.flat, panels):
         _target(axis, half)
         for i, (label, points) in enumerate(series):
@@ -280,11 +283,10 @@ def trades(panels: Sequence[Trade]) -> bytes:
             labels[label] = axis.plot(*best.T, marker + "-", color=colour, ms=5.5, lw=1.4)[0]
         for label, points in panel.crosses:
             starred = len(points) <= 2
-            look = (
-                {"marker": "*", "ms": 11, "ls": "none", "mec": "white"}
-                if starred
-                else {"marker": "x", "ms": 6, "ls": "--"}
-            )
+            if starred:
+                look = {"marker": "*", "ms": 11, "ls": "none", "mec": "white"}
+            else:
+                look = {"marker": "x", "ms": 6, "ls": "--"}
             labels[label] = axis.plot(*points.T, color=style.QUIET, lw=1.1, **look)[0]
         for i, (label, duration, error) in enumerate(panel.stars):
             colour = style.COLOURS[3 + i]
@@ -310,11 +312,10 @@ def trades(panels: Sequence[Trade]) -> bytes:
             labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
         empty = [label for _, label, points in panel.fronts if not len(points)]
         if empty or not panel.fronts:
-            caption = (
-                "no setting landed all its throws:\n" + "\n".join(empty)
-                if empty
-                else "not swept yet"
-            )
+            if empty:
+                caption = "no setting landed all its throws:\n" + "\n".join(empty)
+            else:
+                caption = "not swept yet"
             axis.text(
                 0.03,
                 0.02,

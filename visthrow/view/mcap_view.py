@@ -24,7 +24,8 @@ from visthrow.logs.flightlog import FlightLog
 
 IMAGE_PERIOD = 0.04  # between two pictures of the image plane [s]
 
-_NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
+_NUMBER = {"type": "number"}
+_TEXT = {"type": "string"}
 
 
 def _object(**properties: Any) -> dict[str, Any]:
@@ -85,7 +86,8 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     stamps = [channel.time[0] for channel in log.channels.values() if len(channel.time)]
     if not stamps:
         raise LogError(f"{path}: a flight log without a sample; expected one at least")
-    begin, stream = min(stamps), io.BytesIO()
+    begin = min(stamps)
+    stream = io.BytesIO()
     writer = writing.Writer(stream)
     writer.start(library="visthrow")
     schemas = {
@@ -171,7 +173,8 @@ def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
 
 def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
     """Rope, ball and goal as things of the 3D panel."""
-    width, side = 2.0 * experiment.rope.payload_radius, experiment.camera.goal_side
+    width = 2.0 * experiment.rope.payload_radius
+    side = experiment.camera.goal_side
     things: list[tuple[str, str, Any]] = [
         (
             "cable_points_w",
@@ -234,7 +237,8 @@ def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
     """The image plane with its keypoints, as pictures of the camera's size."""
     if "keypoints" not in log or "keypoints_valid" not in log:
         return
-    camera, last = KeypointCamera(experiment.camera), -np.inf
+    camera = KeypointCamera(experiment.camera)
+    last = -np.inf
     visible = log["keypoints_valid"].hold(log["keypoints"].time)
     for time, points, valid in zip(
         log["keypoints"].time, log["keypoints"].values, visible, strict=True

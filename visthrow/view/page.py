@@ -11,7 +11,8 @@ from visthrow import __version__
 from visthrow.common.storage import atomic_write
 from visthrow.view.parts import Grid, Picture, Section, Text
 
-_BOLD, _CODE = re.compile(r"\*\*(.+?)\*\*"), re.compile(r"`(.+?)`")
+_BOLD = re.compile(r"\*\*(.+?)\*\*")
+_CODE = re.compile(r"`(.+?)`")
 
 
 def _marked(text: str) -> str:

@@ -117,7 +117,8 @@ def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
     """
     goal = np.asarray(goal_w, dtype=float)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    middle, reach = 0.5 * goal[:2], 0.5 * np.abs(goal[:2]) + FIELD
+    middle = 0.5 * goal[:2]
+    reach = 0.5 * np.abs(goal[:2]) + FIELD
     floor = rr.Boxes3D(
         centers=[[*middle, -0.011]],
         half_sizes=[[*reach, 0.01]],
@@ -211,7 +212,8 @@ def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
 
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
     """A line that grows from the policy's start to the landing."""
-    times, time = log.meta["times"], log[name].time
+    times = log.meta["times"]
+    time = log[name].time
     rows = np.flatnonzero(
         (time >= times["policy_start"] - 1e-9) & (time <= times.get("landing", np.inf) + 0.02)
     )[1:]
@@ -286,7 +288,8 @@ def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
     """Keypoints in the plane of :func:`_plane`; those that are not valid stand grey where they
     read.
     """
-    points, valid = 100.0 * log["keypoints"].values, log["keypoints_valid"].values.astype(bool)
+    points = 100.0 * log["keypoints"].values
+    valid = log["keypoints_valid"].values.astype(bool)
     for name, part in (
         ("goal", slice(0, GOAL_KEYPOINTS)),
         ("payload", slice(GOAL_KEYPOINTS, None)),
@@ -303,9 +306,9 @@ def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
     _points(stream, log, "camera/invalid", points, ~valid)
 
 
-def _points(stream, log: FlightLog, entity: str, points: np.ndarray, shown: np.ndarray) -> None:
-    columns = rr.Points2D.columns(positions=points[shown].astype(np.float32)).partition(
-        shown.sum(axis=1)
+def _points(stream, log: FlightLog, entity: str, points: np.ndarray, visible: np.ndarray) -> None:
+    columns = rr.Points2D.columns(positions=points[visible].astype(np.float32)).partition(
+        visible.sum(axis=1)
     )
     stream.send_columns(entity, [_times(log, "keypoints")], columns)
 
@@ -321,7 +324,8 @@ def _outline(
         return
     corners = points[whole]
     if box:
-        x, y = corners[:, [0, 2, 2, 0], 0], corners[:, [1, 1, 3, 3], 1]
+        x = corners[:, [0, 2, 2, 0], 0]
+        y = corners[:, [1, 1, 3, 3], 1]
         corners = np.stack((x, y), axis=-1)
     closed = np.concatenate((corners, corners[:, :1]), axis=1).astype(np.float32)
     columns = rr.LineStrips2D.columns(strips=list(closed)).partition(whole.astype(int))

@@ -45,7 +45,8 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
             "the flight has no release and landing to draw:"
             f" {log.meta['result'].get('failure') or 'it was cut short'}"
         )
-    start, separation = times["policy_start"], times["separation"]
+    start = times["policy_start"]
+    separation = times["separation"]
     halfway = start + 0.55 * (separation - start)
     views = [
         ("Hover", start),
@@ -72,13 +73,12 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
     quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
-    where = (
-        f"Flown on {log.meta['plant_meaning']}"
-        if log.meta["plant"] == "poses"
-        else f"Simulated on {log.meta['plant_meaning']}"
-    )
-    drawn = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
-    figure.text(y=1.0 - 0.54 / height, s=f"{where}, seen from the side. {drawn}", **quiet)
+    if log.meta["plant"] == "poses":
+        where = f"Flown on {log.meta['plant_meaning']}"
+    else:
+        where = f"Simulated on {log.meta['plant_meaning']}"
+    legend = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
+    figure.text(y=1.0 - 0.54 / height, s=f"{where}, seen from the side. {legend}", **quiet)
     unseen = "" if all_seen else "; a cross: outside the field of view"
     field = f"{camera.fisheye.fov_deg:g}°"
     note = (
@@ -90,7 +90,8 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
 
 
 def _headline(log: FlightLog) -> str:
-    result, goal = log.meta["result"], log.meta["goal_w"]
+    result = log.meta["result"]
+    goal = log.meta["goal_w"]
     return (
         f"Policy {log.meta['policy']}, target {np.hypot(goal[0], goal[1]):.1f} m: the ball lands "
         f"{100 * result['error']:.1f} cm from it, {result['duration']:.2f} s after the start"
@@ -133,13 +134,14 @@ def _side_view(
 ) -> None:
     from matplotlib.patches import Circle, Rectangle
 
-    left, right, top = side
-    times, goal = log.meta["times"], log.meta["goal_w"]
+    origin_x, right, top = side
+    times = log.meta["times"]
+    goal = log.meta["goal_w"]
     axis.set(
-        xlim=(left, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5)
+        xlim=(origin_x, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5)
     )
     axis.add_patch(
-        Rectangle((left, -GROUND), right - left, GROUND, color="#EFEDE8", lw=0, zorder=0)
+        Rectangle((origin_x, -GROUND), right - origin_x, GROUND, color="#EFEDE8", lw=0, zorder=0)
     )
     axis.axhline(0.0, color=style.QUIET, lw=1.0, zorder=1)
     axis.plot(
@@ -164,7 +166,8 @@ def _side_view(
     visible = (payload.time >= times["policy_start"]) & (payload.time < time)
     path = np.vstack([payload.values[visible], log["payload_pos_w"].at(time)])
     when = np.append(payload.time[visible], time)
-    carried, flown = when <= times["separation"] + 1e-6, when >= times["separation"] - 0.02
+    carried = when <= times["separation"] + 1e-6
+    flown = when >= times["separation"] - 0.02
     axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
     if np.count_nonzero(flown) > 1:
         axis.plot(
@@ -218,7 +221,8 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
         return visible
     pixels = lens.denormalize(points[0].double()).numpy()
     for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
-        right, middle = pixels[part, 0].max(), pixels[part, 1].mean()
+        right = pixels[part, 0].max()
+        middle = pixels[part, 1].mean()
         axis.annotate(
             name,
             (right, middle),

@@ -71,10 +71,8 @@ def markdown(rows: Sequence[dict], title: str) -> str:
 
 
 def _cells(row: dict) -> tuple[str, ...]:
-    head, paper = (
-        (row["policy"], f"{row['target']:.1f}", str(row["throws"])),
-        of_paper(row["layout"], row["target"]),
-    )
+    head = (row["policy"], f"{row['target']:.1f}", str(row["throws"]))
+    paper = of_paper(row["layout"], row["target"])
     success = f"{100 * row['success']:.1f} %"
     if not row["success"]:
         return (*head, "-", "-", success, "-", "-", paper)
@@ -113,22 +111,22 @@ def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
             "smoothness",
         ]
     )
-    for policy, plant, of in throws:
-        for i in range(len(of.success)):
+    for policy, plant, results in throws:
+        for i in range(len(results.success)):
             numbers = (
-                *of.landing_w[i],
-                of.error[i],
-                of.duration[i],
-                of.clearance[i],
-                of.smoothness[i],
+                *results.landing_w[i],
+                results.error[i],
+                results.duration[i],
+                results.clearance[i],
+                results.smoothness[i],
             )
             writer.writerow(
                 [
                     policy,
                     plant,
-                    of.target,
+                    results.target,
                     i,
-                    int(of.success[i]),
+                    int(results.success[i]),
                     *("" if np.isnan(x) else f"{x:.6g}" for x in numbers),
                 ]
             )

@@ -40,7 +40,8 @@ def curve(
     values = [v for _, _, v in points] or [1.0]
     top = next((rise for rise in RISES if rise >= max(values)), max(values))
     bottom = next((rise for rise in reversed(RISES) if rise <= min(values)), min(values))
-    bottom, end = min(bottom, 0.5 * top), max([t for _, t, _ in points] or [1.0])
+    bottom = min(bottom, 0.5 * top)
+    end = max([t for _, t, _ in points] or [1.0])
     grid = [[" "] * width for _ in range(height)]
     for mark, t, v in points:
         row = round((height - 1) * math.log(top / v) / math.log(top / bottom))
@@ -81,10 +82,11 @@ def scatter(
     return [edge, *(f"|{row}|" for row in cells), edge]
 
 
-def side_by_side(left: Sequence[str], right: Sequence[str], gap: int = 3) -> list[str]:
+def side_by_side(first: Sequence[str], right: Sequence[str], gap: int = 3) -> list[str]:
     """Two blocks of lines next to each other."""
-    rows, width = max(len(left), len(right)), max(map(len, left), default=0)
-    padded = [(block[i] if i < len(block) else "") for block in (left, right) for i in range(rows)]
+    rows = max(len(first), len(right))
+    width = max(map(len, first), default=0)
+    padded = [(block[i] if i < len(block) else "") for block in (first, right) for i in range(rows)]
     return [f"{a:<{width}}{'':<{gap}}{b}".rstrip() for a, b in zip(padded[:rows], padded[rows:])]
 
 

@@ -13,7 +13,7 @@ from tests.unit.on_logs.test_check import faults, flight, log_of
 from visthrow.diagnose.inputs import setup
 from visthrow.logs import read
 from visthrow.logs.check import relations
-from visthrow.logs.check.rows import Known
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions, copies
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -44,7 +44,7 @@ def shifted(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
     return FlightLog({**log.channels, **channels}, log.meta)
 
 
-def bad(log: FlightLog, known: Known = CRAZYFLIE) -> str:
+def bad(log: FlightLog, known: KnownVehicle = CRAZYFLIE) -> str:
     (checked,) = check([log], known)
     return " | ".join(
         f"{row.topic} {row.channel}: {row.text}" for row in checked.rows if row.verdict == "bad"
@@ -146,7 +146,7 @@ def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
 
 def test_the_cable_is_held_against_the_models():
     assert "apart by +70.8 % of the model's cable of 0.3 m: another cable" in bad(
-        FLIGHTS[204], Known(cable_length=0.3)
+        FLIGHTS[204], KnownVehicle(cable_length=0.3)
     )
 
 

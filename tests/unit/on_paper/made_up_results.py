@@ -102,7 +102,7 @@ def _ablations(rng):
 
 def _baselines(rng):
     for target in TARGETS:
-        yield baseline(rng, thrower.OWN, "none", target, 0.002, 1.6)
+        yield baseline(rng, thrower.IDEAL, "none", target, 0.002, 1.6)
         for compensation, lost in (("none", 10), ("delay", 0), ("both", 0)):
             yield baseline(rng, "hybrid", compensation, target, 0.05, 1.6, lost)
     for i, speed in enumerate(front.SPEEDS):
@@ -111,7 +111,7 @@ def _baselines(rng):
             for bounds, faster in zip(thrower.BOUNDS, (0.0, 0.4)):
                 fast = 1.3 + 0.1 * i + 0.2 * j - faster
                 yield baseline(
-                    rng, thrower.OWN, "none", 2.0, 0.03 / fast**3, fast, bounds=bounds, **how
+                    rng, thrower.IDEAL, "none", 2.0, 0.03 / fast**3, fast, bounds=bounds, **how
                 )
                 yield baseline(
                     rng,

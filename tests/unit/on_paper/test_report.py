@@ -261,7 +261,7 @@ def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch):
     monkeypatch.setattr(
         baseline_record,
         "full",
-        lambda: [thrower.unit(thrower.OWN, "none", target, 1) for target in (1.5, 2.0)],
+        lambda: [thrower.unit(thrower.IDEAL, "none", target, 1) for target in (1.5, 2.0)],
     )
     words = ["--records", str(tmp_path / "records"), "--out", str(tmp_path / "out")]
     record = tmp_path / "records" / "throws" / "baseline.json"

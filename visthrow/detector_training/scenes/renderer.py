@@ -38,7 +38,9 @@ class Renderer:
         if samples < 1:
             raise ValueError(f"renderer: samples {samples}; expected 1 or more")
         start()
-        self.lens, self.device, self.samples = lens, device, samples
+        self.lens = lens
+        self.device = device
+        self.samples = samples
         pixels = pyramid(photographs() if files is None else files)
         self.textures = len(pixels)
         self._pixels = wp.array(pixels, dtype=wp.uint8, device=device)
@@ -97,6 +99,8 @@ class Renderer:
         )  # Warp runs a launch on the CPU in the thread that asks for it
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
             list(
-                threads.map(launch, (slice(at, at + share) for at in range(0, scenes.count, share)))
+                threads.map(
+                    launch, (slice(first, first + share) for first in range(0, scenes.count, share))
+                )
             )
         return image

@@ -3,6 +3,7 @@ picture.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -68,7 +69,8 @@ class Draw:
 
     def __init__(self, count: int, seed: int) -> None:
         """Start a batch."""
-        self.count, self.generator = count, torch.Generator().manual_seed(seed)
+        self.count = count
+        self.generator = torch.Generator().manual_seed(seed)
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """Uniform numbers, shape (E, ...)."""
@@ -116,7 +118,8 @@ def random_scenes(
         textures: number of photographs. count: E. seed: of all.
         nuisances: of the pictures; left out, all.
     """
-    d, n = Draw(count, seed), nuisances or Nuisances()
+    d = Draw(count, seed)
+    n = nuisances or Nuisances()
     pos = torch.cat([d.uniform(-0.4, 1.0, 1), d.uniform(-0.4, 0.4, 1), d.uniform(0.8, 2.3, 1)], -1)
     lean = d.uniform(0.0, 1.0, 1).square() * math.radians(65.0)
     rot_wb = rotation_from_vector(torch.cat([lean * d.way(), d.uniform(-0.5, 0.5, 1)], -1))
@@ -155,8 +158,13 @@ def posed_scenes(
     """
     from camera.mount import nominal_rot_cb
 
-    count, make = len(pos_w), lambda row: torch.tensor(row).float().repeat(len(pos_w), 1)
-    rot_wb, lens_b = rot_wb.float(), torch.tensor(params.mount.position_b)
+    count = len(pos_w)
+
+    def make(row: Sequence[float]) -> Tensor:
+        return torch.tensor(row).float().repeat(len(pos_w), 1)
+
+    rot_wb = rot_wb.float()
+    lens_b = torch.tensor(params.mount.position_b)
     eye = pos_w.float() + rot_wb @ lens_b
     rot_wc = rot_wb @ nominal_rot_cb(params.mount).float().T
     mount = rot_wb @ (torch.tensor([0.0, 0.0, -0.02]) - lens_b)
@@ -197,12 +205,10 @@ def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
     count = scenes.count
     flat = lambda *columns: torch.cat([c if c.dim() == 2 else c[:, None] for c in columns], -1)  # noqa: E731
-    ground, walls, ball, goal = (
-        scenes.ground.clone(),
-        scenes.walls.clone(),
-        scenes.ball.clone(),
-        scenes.goal.clone(),
-    )
+    ground = scenes.ground.clone()
+    walls = scenes.walls.clone()
+    ball = scenes.ball.clone()
+    goal = scenes.goal.clone()
     pictured = d.chance(n.ground)
     tint = d.uniform(0.45, 1.1, 1) * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
     ground = torch.where(
@@ -354,7 +360,8 @@ class Truth:
 def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
     """See `Truth`; all scenes have this lens."""
     rot = torch.from_numpy(Rotation.from_quat(scenes.pose[:, 3:7].double().numpy()).as_matrix())
-    c, s = scenes.goal[:, 3].double().cos(), scenes.goal[:, 3].double().sin()
+    c = scenes.goal[:, 3].double().cos()
+    s = scenes.goal[:, 3].double().sin()
     turn = torch.stack([c, -s, s, c], -1).unflatten(-1, (2, 2))
     square = (
         goal_corners_w(torch.zeros(1, 2, dtype=torch.float64), 1.0)[:, :, :2]
@@ -370,13 +377,15 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
     for _ in range(3):
         world = points + speed * time - eye - vel * time
         static = world @ rot
-        seen = torch.einsum("ekji,ekj->eki", rotation_from_vector(rate * time), static)
-        pixels, visible = lens.project(seen)
+        static_c = torch.einsum("ekji,ekj->eki", rotation_from_vector(rate * time), static)
+        pixels, visible = lens.project(static_c)
         time = ((pixels[..., 1:2] + 0.5) / lens.params.height - 0.5) * scenes.shutter[
             :, None, 1:2
         ].double()
     visible = visible & lens.on_sensor(pixels)
     _, sides = lens.project_normalized(
-        ball_extremes_c(lens, seen[:, 4], float(scenes.ball[0, 3])), clip=False
+        ball_extremes_c(lens, static_c[:, 4], float(scenes.ball[0, 3])), clip=False
     )
-    return Truth(seen[:, 4], seen[:, :4], rot, sides.all(1) & visible[:, 4], visible[:, :4].all(1))
+    return Truth(
+        static_c[:, 4], static_c[:, :4], rot, sides.all(1) & visible[:, 4], visible[:, :4].all(1)
+    )

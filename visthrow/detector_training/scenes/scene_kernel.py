@@ -17,14 +17,14 @@ SIZE = wp.constant(textures.SIZE)
 
 
 @wp.func
-def angle_of(radius: float, k: wp.vec4, most: float) -> float:
+def angle_of(radius: float, k: wp.vec4, limit: float) -> float:
     """Angle off the axis at a distance from the principal point, theta_d [rad]."""
-    theta = wp.min(radius, most)
+    theta = wp.min(radius, limit)
     for _ in range(LENS_STEPS):
         t2 = theta * theta
         value = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
         slope = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
-        theta = wp.clamp(theta - (value - radius) / wp.max(slope, 0.05), 0.0, most)
+        theta = wp.clamp(theta - (value - radius) / wp.max(slope, 0.05), 0.0, limit)
     return theta
 
 
@@ -39,12 +39,12 @@ def mirrored(x: float) -> float:
 def texel(
     textures: wp.array2d(dtype=wp.uint8), which: int, base: int, size: int, x: int, y: int
 ) -> wp.vec3:
-    at = base + (wp.min(y, size - 1) * size + wp.min(x, size - 1)) * 3
+    address = base + (wp.min(y, size - 1) * size + wp.min(x, size - 1)) * 3
     return (
         wp.vec3(
-            float(textures[which, at]),
-            float(textures[which, at + 1]),
-            float(textures[which, at + 2]),
+            float(textures[which, address]),
+            float(textures[which, address + 1]),
+            float(textures[which, address + 2]),
         )
         / 255.0
     )
@@ -92,11 +92,11 @@ def texture(
 @wp.func
 def sphere(eye: wp.vec3, ray: wp.vec3, centre: wp.vec3, radius: float) -> float:
     """Distance to a ball along a ray, or a large number."""
-    to = centre - eye
-    along = wp.dot(ray, to)
-    inside = radius * radius - wp.dot(to, to) + along * along
-    hit = inside > 0.0 and along > 0.0
-    return wp.where(hit, along - wp.sqrt(wp.max(inside, 0.0)), 1.0e9)
+    offset = centre - eye
+    distance = wp.dot(ray, offset)
+    discriminant = radius * radius - wp.dot(offset, offset) + distance * distance
+    hit = discriminant > 0.0 and distance > 0.0
+    return wp.where(hit, distance - wp.sqrt(wp.max(discriminant, 0.0)), 1.0e9)
 
 
 @wp.func
@@ -143,7 +143,7 @@ def square(
 @wp.func
 def on_ground(
     e: int,
-    at: wp.vec3,
+    point: wp.vec3,
     depth: float,
     grazing: float,
     pixel: float,
@@ -161,8 +161,8 @@ def on_ground(
     """
     c = wp.cos(ground[e, 2])
     s = wp.sin(ground[e, 2])
-    u = (c * at[0] + s * at[1]) / ground[e, 1] + ground[e, 3]
-    v = (c * at[1] - s * at[0]) / ground[e, 1] + ground[e, 4]
+    u = (c * point[0] + s * point[1]) / ground[e, 1] + ground[e, 3]
+    v = (c * point[1] - s * point[0]) / ground[e, 1] + ground[e, 4]
     footprint = depth * pixel / (wp.max(grazing, 0.03) * ground[e, 1])
     colour = texture(textures, int(ground[e, 0]), u, v, footprint, chance)
     colour = wp.cw_mul(colour, wp.vec3(ground[e, 5], ground[e, 6], ground[e, 7]))
@@ -171,25 +171,25 @@ def on_ground(
         if kind == 1 or kind == 2:
             tc = wp.cos(things[e, i, 6])
             ts = wp.sin(things[e, i, 6])
-            dx = at[0] - things[e, i, 1]
-            dy = at[1] - things[e, i, 2]
-            across = (tc * dx + ts * dy) / things[e, i, 4]
-            along = (tc * dy - ts * dx) / things[e, i, 5]
+            dx = point[0] - things[e, i, 1]
+            dy = point[1] - things[e, i, 2]
+            lateral = (tc * dx + ts * dy) / things[e, i, 4]
+            axial = (tc * dy - ts * dx) / things[e, i, 5]
             covered = wp.where(
                 kind == 1,
-                across * across + along * along < 1.0,
-                wp.max(wp.abs(across), wp.abs(along)) < 1.0,
+                lateral * lateral + axial * axial < 1.0,
+                wp.max(wp.abs(lateral), wp.abs(axial)) < 1.0,
             )
             if covered:
                 colour = wp.vec3(things[e, i, 7], things[e, i, 8], things[e, i, 9])
-                rim = wp.max(wp.abs(across), wp.abs(along)) > things[e, i, 10]
+                rim = wp.max(wp.abs(lateral), wp.abs(axial)) > things[e, i, 10]
                 colour = wp.where(
                     rim, wp.vec3(things[e, i, 11], things[e, i, 11], things[e, i, 11]), colour
                 )
     gc = wp.cos(goal[e, 3])
     gs = wp.sin(goal[e, 3])
-    dx = at[0] - goal[e, 0]
-    dy = at[1] - goal[e, 1]
+    dx = point[0] - goal[e, 0]
+    dy = point[1] - goal[e, 1]
     field = wp.vec3(goal[e, 6], goal[e, 7], goal[e, 8])
     edge = wp.vec3(goal[e, 9], goal[e, 10], goal[e, 11])
     dark = wp.vec3(goal[e, 12], goal[e, 13], goal[e, 14])
@@ -208,8 +208,8 @@ def on_ground(
     for body in range(2):
         high = wp.where(body == 0, wp.vec3(ball[e, 0], ball[e, 1], ball[e, 2]), eye)
         size = wp.where(body == 0, ball[e, 3], 0.09)
-        x = at[0] - high[0] + dir[0] / dir[2] * high[2]
-        y = at[1] - high[1] + dir[1] / dir[2] * high[2]
+        x = point[0] - high[0] + dir[0] / dir[2] * high[2]
+        y = point[1] - high[1] + dir[1] / dir[2] * high[2]
         soft = size + 0.15 * high[2]
         strength = light[e, 7] * size / soft
         colour = colour * (1.0 - strength * wp.exp(-(x * x + y * y) / (soft * soft)))
@@ -235,9 +235,9 @@ def on_walls(
     )
     tz = wp.where(ray[2] > 1.0e-4, (walls[e, 2] - eye[2]) / wp.max(ray[2], 1.0e-4), 1.0e9)
     depth = wp.min(wp.min(tx, ty), tz)
-    at = eye + ray * depth
-    u = wp.where(depth == tx, at[1], at[0])
-    v = wp.where(depth == tz, at[1], at[2])
+    point = eye + ray * depth
+    u = wp.where(depth == tx, point[1], point[0])
+    v = wp.where(depth == tz, point[1], point[2])
     colour = texture(
         textures,
         int(walls[e, 0]),
@@ -291,17 +291,17 @@ def radiance(
     for i in range(things.shape[1]):
         if int(things[e, i, 0]) == 3:
             place = wp.vec3(things[e, i, 1], things[e, i, 2], things[e, i, 3])
-            near = sphere(eye, ray, place, things[e, i, 4])
-            if near < depth:
-                depth = near
-                normal = (eye + ray * near - place) / things[e, i, 4]
+            sphere_depth = sphere(eye, ray, place, things[e, i, 4])
+            if sphere_depth < depth:
+                depth = sphere_depth
+                normal = (eye + ray * sphere_depth - place) / things[e, i, 4]
                 colour = wp.vec3(things[e, i, 7], things[e, i, 8], things[e, i, 9]) * lit(
                     normal, dir, light[e, 3]
                 )
-    near = sphere(eye, ray, centre, ball[e, 3])
-    if near < depth:
-        depth = near
-        normal = (eye + ray * near - centre) / ball[e, 3]
+    sphere_depth = sphere(eye, ray, centre, ball[e, 3])
+    if sphere_depth < depth:
+        depth = sphere_depth
+        normal = (eye + ray * sphere_depth - centre) / ball[e, 3]
         turn = wp.quat(ball[e, 7], ball[e, 8], ball[e, 9], ball[e, 10])
         shade = felt(
             normal,
@@ -313,14 +313,14 @@ def radiance(
     if rope[e, 3] > 0.0:
         top = wp.vec3(rope[e, 0], rope[e, 1], rope[e, 2]) + eye
         way = centre - top
-        across = wp.cross(ray, way)
-        apart = wp.abs(wp.dot(top - eye, across)) / wp.max(wp.length(across), 1.0e-9)
+        sideways = wp.cross(ray, way)
+        gap = wp.abs(wp.dot(top - eye, sideways)) / wp.max(wp.length(sideways), 1.0e-9)
         a = wp.dot(way, way)
         b = wp.dot(ray, way)
         off = top - eye
         share = (b * wp.dot(off, ray) - wp.dot(off, way)) / wp.max(a - b * b, 1.0e-9)
         reach = wp.dot(ray, off + way * share)
-        if apart < rope[e, 3] and share > 0.0 and share < 1.0 and reach > 0.0 and reach < depth:
+        if gap < rope[e, 3] and share > 0.0 and share < 1.0 and reach > 0.0 and reach < depth:
             colour = wp.vec3(rope[e, 4], rope[e, 5], rope[e, 6])
     return wp.cw_mul(colour, wp.vec3(light[e, 4], light[e, 5], light[e, 6]))
 
@@ -350,9 +350,9 @@ def render(
     height = float(image.shape[1])
     chance = wp.rand_init(seed + int(sensor[e, 5]), (v * image.shape[2] + u))
     k = wp.vec4(lens[e, 4], lens[e, 5], lens[e, 6], lens[e, 7])
-    most = lens[e, 8]
-    t2 = most * most
-    edge = most * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    field_limit = lens[e, 8]
+    t2 = field_limit * field_limit
+    edge = field_limit * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
     pixel = 1.0 / lens[e, 0]
     quat = wp.quat(pose[e, 3], pose[e, 4], pose[e, 5], pose[e, 6])
     rate = wp.vec3(pose[e, 10], pose[e, 11], pose[e, 12])
@@ -369,7 +369,7 @@ def render(
         radius = wp.sqrt(x * x + y * y)
         level = wp.randf(chance)
         if radius <= edge:
-            theta = angle_of(radius, k, most)
+            theta = angle_of(radius, k, field_limit)
             scale = wp.where(radius > 1.0e-6, wp.sin(theta) / wp.max(radius, 1.0e-6), 1.0)
             ray_c = wp.vec3(x * scale, y * scale, wp.cos(theta))
             angle = wp.length(rate) * time
@@ -387,7 +387,7 @@ def render(
                 ball[e, 1] + ball[e, 5] * time,
                 ball[e, 2] + ball[e, 6] * time,
             )
-            seen = radiance(
+            radiance_ = radiance(
                 e,
                 eye,
                 ray,
@@ -403,7 +403,7 @@ def render(
                 things,
                 textures,
             )
-            total += seen * wp.pow(wp.max(wp.cos(0.5 * theta), 0.0), lens[e, 9])
+            total += radiance_ * wp.pow(wp.max(wp.cos(0.5 * theta), 0.0), lens[e, 9])
     colour = total * (sensor[e, 0] / float(samples))
     for c in range(3):
         value = (

@@ -64,9 +64,10 @@ def pyramid(files: list[Path]) -> np.ndarray:
         if picture is None:
             raise ValueError(f"{path}: no picture that OpenCV can read")
         side = min(picture.shape[:2])
-        top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
+        top = (picture.shape[0] - side) // 2
+        margin = (picture.shape[1] - side) // 2
         level = cv2.resize(
-            picture[top : top + side, left : left + side, ::-1],
+            picture[top : top + side, margin : margin + side, ::-1],
             (SIZE, SIZE),
             interpolation=cv2.INTER_AREA,
         )

@@ -16,7 +16,7 @@ from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import unit_evidence
 from visthrow.logs.axes import turn_of
 from visthrow.logs.check import physics, relations, thrust
-from visthrow.logs.check.rows import Known
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 from visthrow.logs.readers.layout import unit_of
@@ -1029,7 +1029,7 @@ def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | Non
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
     small quadrotor at rest air.
     """
-    applied = thrust.thrust_of(log, Known(thrust_input=_driving(log, found)))
+    applied = thrust.thrust_of(log, KnownVehicle(thrust_input=_driving(log, found)))
     if (
         applied is None
         or "quat_wb" not in log

@@ -18,7 +18,7 @@ from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.logs import read_all, takes_mapping
-from visthrow.logs.check.rows import Known
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
@@ -91,7 +91,7 @@ def load(name: str | Path) -> Setup:
     return config.load(Setup, config.find("diagnose", str(name)))
 
 
-def known(name: str | Path | None, plant: str | None = None) -> Known:
+def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
     """Return what a setup, or the plant of an experiment, says of the vehicle.
 
     ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the
@@ -101,14 +101,14 @@ def known(name: str | Path | None, plant: str | None = None) -> Known:
     flyer = load(name).flyer if name is not None else None
     if flyer is not None:
         length = flyer.cable.length if flyer.cable is not None else 0.0
-        return Known(length, flyer.total_mass, flyer.input, flyer.thrust_map)
+        return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map)
     if plant is None:
-        return Known()
+        return KnownVehicle()
     from visthrow.task import Experiment, plant_of
 
     trained = plant_of(config.load(Experiment, config.find("train", plant)))
     rope = trained.rope
-    return Known(
+    return KnownVehicle(
         rope.length + rope.payload_offset,
         trained.vehicle.body.mass + rope.rope_mass + rope.payload_mass,
     )

@@ -15,7 +15,7 @@ import numpy as np
 
 from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded import measured
-from visthrow.logs.axes import EVERY, matrix_of
+from visthrow.logs.axes import EXCHANGES, matrix_of
 from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -192,7 +192,7 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
         f"x, y, z of the vehicle are ({text}) of the command",
         nats,
         len(clear),
-        len(EVERY),
+        len(EXCHANGES),
         _rows(change),
     )
 

@@ -16,7 +16,7 @@ THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
 
 # a vehicle whose position keeps within this [m] for the whole log has not flown, if its motors
 # stood or nothing tells
-STILL = 0.01
+STILL_SPEED = 0.01
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,9 @@ def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
         return Row("answers", question.name, "warn", "cannot be answered: the vehicle did not fly")
     reached = figures.get(question.excited)
     if question.excited and (reached is None or reached < question.least):
-        came = "nothing" if reached is None else f"{reached:.3g}"
+        measured = "nothing" if reached is None else f"{reached:.3g}"
         text = (
-            f"cannot be answered: {question.excited} is {came}, at least {question.least:g} is"
+            f"cannot be answered: {question.excited} is {measured}, at least {question.least:g} is"
             " needed"
         )
         return Row("answers", question.name, "warn", text)
@@ -142,11 +142,12 @@ def excitation(log: FlightLog) -> dict[str, float]:
 
 def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
     """First and last time in the air, by height or by thrust."""
-    found = _first(log, POSITIONS)
-    if found is None:
+    signal = _first(log, POSITIONS)
+    if signal is None:
         return -np.inf, np.inf
-    _, time, pos = found
-    above, period = pos[:, 2] - np.percentile(pos[:, 2], 1), np.median(np.diff(time))
+    _, time, pos = signal
+    above = pos[:, 2] - np.percentile(pos[:, 2], 1)
+    period = np.median(np.diff(time))
     up = above > 0.15 * np.max(above) if np.max(above) > 0.3 else np.ones(len(above), bool)
     if "flying" in log and len(log["flying"].time):
         up &= log["flying"].hold(time)
@@ -161,38 +162,38 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
 
 
 def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    if found := _first(log, POSITIONS, 50):
-        time, vel = relations.derivative(*found[1:], 0.1)
+    if signal := _first(log, POSITIONS, 50):
+        time, vel = relations.derivative(*signal[1:], 0.1)
         speed = np.linalg.norm(vel[(time >= flown[0]) & (time <= flown[1])], axis=1)
         if len(speed):
             figures["speed_p95_m_s"] = float(np.percentile(speed, 95))
             figures["seconds_hover"] = float(np.sum(speed < 0.15) * np.median(np.diff(time)))
-    if found := _first(log, ATTITUDES):
-        x, y, z, w = found[2].T
+    if signal := _first(log, ATTITUDES):
+        x, y, z, w = signal[2].T
         yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
         figures["yaw_range_deg"] = float(np.degrees(np.percentile(yaw, 98) - np.percentile(yaw, 2)))
-    if found := _first(log, ("rate_b",)):
-        figures["rate_p95_rad_s"] = float(np.percentile(np.linalg.norm(found[2], axis=1), 95))
+    if signal := _first(log, ("rate_b",)):
+        figures["rate_p95_rad_s"] = float(np.percentile(np.linalg.norm(signal[2], axis=1), 95))
 
 
 def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    if found := _first(log, THRUSTS):
-        name, time, values = found
+    if signal := _first(log, THRUSTS):
+        name, time, values = signal
         values = values[(time >= flown[0]) & (time <= flown[1])]
         thrust = values[:, 0] if name in ("command", "thrust_command") else np.mean(values, axis=1)
         thrust = thrust**2 if name == "motor_speed" else thrust
         if len(thrust):
             low, middle, high = np.percentile(thrust, [5, 50, 95])
             figures["thrust_range"] = float((high - low) / max(middle, 1e-9))
-    if found := _first(log, ("battery_voltage",), 0):
-        figures["voltage_range"] = float(np.percentile(found[2], 95) - np.percentile(found[2], 5))
+    if signal := _first(log, ("battery_voltage",), 0):
+        figures["voltage_range"] = float(np.percentile(signal[2], 95) - np.percentile(signal[2], 5))
 
 
 def _payload(log: FlightLog, figures: dict) -> None:
-    found = _first(log, ("payload_pos_w",), 49)
-    if found is None:
+    signal = _first(log, ("payload_pos_w",), 49)
+    if signal is None:
         return
-    _, time, pos = found
+    _, time, pos = signal
     _, vel = relations.derivative(time, pos, 0.1)
     if len(vel):
         figures["payload_speed_p95_m_s"] = float(np.percentile(np.linalg.norm(vel, axis=1), 95))
@@ -206,10 +207,8 @@ def _payload(log: FlightLog, figures: dict) -> None:
 
 
 def _standing(log: FlightLog, figures: dict) -> None:
-    place, thrust = (
-        _first(log, POSITIONS),
-        _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 0),
-    )
+    place = _first(log, POSITIONS)
+    thrust = _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 0)
     idle = "throttle" in log and np.ptp(log["throttle"].values) == 0.0
     if thrust is not None:
         name, _, values = thrust
@@ -218,7 +217,7 @@ def _standing(log: FlightLog, figures: dict) -> None:
         )
     if place is not None:
         width = np.max(np.percentile(place[2], 98, axis=0) - np.percentile(place[2], 2, axis=0))
-        if width < STILL and (idle or thrust is None):
+        if width < STILL_SPEED and (idle or thrust is None):
             figures["still"] = 1.0
     elif idle:
         figures["idle"] = 1.0

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visthrow.common.constants import GRAVITY
-from visthrow.logs.axes import EVERY, MATRICES, OURS, is_mirror
+from visthrow.logs.axes import EXCHANGES, MATRICES, OURS, is_mirror
 from visthrow.logs.check import relations
-from visthrow.logs.check.rows import NOTHING, Known, Row
+from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import Channel, FlightLog
 
 # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
@@ -37,15 +37,17 @@ _PUSHED = 0.2
 _LONGER, _OTHER_CABLE = 0.05, 0.25  # of the model's length: markers sit off the ends, another cable
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
-_SEEN = 0.5
+_CORRELATED = 0.5
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
 
-def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
+def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> list[Row]:
     """Return the findings of all checks of what moves how in one flight."""
     rows = list(_plausible(log))
     for prefix in _PREFIXES:
-        pos, vel, quat = f"{prefix}pos_w", f"{prefix}vel_w", f"{prefix}quat_wb"
+        pos = f"{prefix}pos_w"
+        vel = f"{prefix}vel_w"
+        quat = f"{prefix}quat_wb"
         if pos in log and vel in log:
             rows += _velocity(log, pos, vel)
         if quat in log and prefix != "payload_":
@@ -54,13 +56,13 @@ def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
             rows += _forces(log, quat, vel if vel in log else pos)
     rows += _still_gravity(log)
     rows += _commands(log)
-    rows += _cable(log, known)
+    rows += _cable(log, vehicle)
     rows += _same(log)
     return rows
 
 
-def usable(time: np.ndarray, values: np.ndarray, least: float) -> bool:
-    return len(time) > 50 and bool(np.max(np.std(values, axis=0)) > least)
+def usable(time: np.ndarray, values: np.ndarray, threshold: float) -> bool:
+    return len(time) > 50 and bool(np.max(np.std(values, axis=0)) > threshold)
 
 
 def median_tilt(attitude: Channel) -> float:
@@ -90,11 +92,12 @@ def _plausible(log: FlightLog) -> Iterator[Row]:
         speeds = np.linalg.norm(relations.derivative(time, pos, 0.1)[1], axis=1)
         if not len(speeds):
             continue
-        fast, far = float(np.percentile(speeds, 99)), float(np.max(np.abs(pos)))
-        figures = {"speed_p99_m_s": fast, "farthest_m": far}
-        if fast > _FASTEST or far > _FARTHEST:
+        fast = float(np.percentile(speeds, 99))
+        farthest = float(np.max(np.abs(pos)))
+        figures = {"speed_p99_m_s": fast, "farthest_m": farthest}
+        if fast > _FASTEST or farthest > _FARTHEST:
             text = (
-                f"{fast:.3g} m/s and {far:.3g} m from the origin: no such vehicle; millimetres"
+                f"{fast:.3g} m/s and {farthest:.3g} m from the origin: no such vehicle; millimetres"
                 " taken for metres?"
             )
             yield Row("units", name, "bad", text, figures)
@@ -132,13 +135,14 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
 
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
-    (time_p, p), (time_v, v) = log[pos].samples(), log[vel].samples()
+    (time_p, p) = log[pos].samples()
+    (time_v, v) = log[vel].samples()
     if not (usable(time_p, p, 0.02) and usable(time_v, v, 0.0)):
         return []
-    found = relations.relate(*relations.derivative(time_p, p), time_v, v)
+    relation = relations.relate(*relations.derivative(time_p, p), time_v, v)
     notes = [log.meta.get("ingest", {}).get(name, {}) for name in (pos, vel)]
-    message, other = (of.get("message") for of in notes)
-    return _compared(found, f"d({pos})/dt", vel, message is not None and message == other)
+    message, second = (note.get("message") for note in notes)
+    return _compared(relation, f"d({pos})/dt", vel, message is not None and message == second)
 
 
 def _rates(log: FlightLog, quat: str) -> list[Row]:
@@ -156,104 +160,104 @@ def _rates(log: FlightLog, quat: str) -> list[Row]:
 
 
 def _compared(
-    found: relations.Relation | None, first: str, second: str, one_clock: bool = False
+    relation: relations.Relation | None, first: str, second: str, one_clock: bool = False
 ) -> list[Row]:
     """Rows about a pair that should be one and the same motion; ``one_clock``: of one message."""
-    if found is None:
+    if relation is None:
         return []
-    both = f"{first}, {second}"
-    figures = _figures(found)
-    if _apart(found):
+    channels = f"{first}, {second}"
+    figures = _figures(relation)
+    if _disagrees(relation):
         text = (
-            f"hardly go together in any axes (correlation {found.axes_correlation:.2f}): not the"
+            f"hardly go together in any axes (correlation {relation.axes_correlation:.2f}): not the"
             " same flight, or noise"
         )
-        return [Row("frames", both, "bad", text, figures)]
-    if _turned(found):
+        return [Row("frames", channels, "bad", text, figures)]
+    if _turned(relation):
         return [
             Row(
                 "frames",
-                both,
+                channels,
                 "bad",
-                f"go together {_better(found)}",
-                figures | {"axes": found.axes, "nats": found.nats},
+                f"go together {_better(relation)}",
+                figures | {"axes": relation.axes, "nats": relation.nats},
             )
         ]
     rows = [
         Row(
             "frames",
-            both,
+            channels,
             "ok",
-            f"go together as they are, correlation {found.correlation:.2f}",
+            f"go together as they are, correlation {relation.correlation:.2f}",
             figures,
         )
     ]
-    if not 0.67 < found.scale < 1.5:
-        hint = relations.unit_hint(found.scale) or "no unit explains it"
-        weak = abs(found.correlation) < 0.7 and 0.4 < found.scale < 1.5
+    if not 0.67 < relation.scale < 1.5:
+        hint = relations.unit_hint(relation.scale) or "no unit explains it"
+        weak = abs(relation.correlation) < 0.7 and 0.4 < relation.scale < 1.5
         text = (
-            f"the second is {found.scale:.4g} times the first:"
+            f"the second is {relation.scale:.4g} times the first:"
             f" {'noise dilutes it' if weak else hint}"
         )
-        rows.append(Row("units", both, "warn" if weak else "bad", text, figures))
-    return [*rows, _late(found, both, figures, one_clock)]
+        rows.append(Row("units", channels, "warn" if weak else "bad", text, figures))
+    return [*rows, _late(relation, channels, figures, one_clock)]
 
 
-def _figures(found: relations.Relation) -> dict[str, float]:
+def _figures(relation: relations.Relation) -> dict[str, float]:
     return {
-        "correlation": found.correlation,
-        "delay_s": found.delay,
-        "delay_sd_s": found.delay_sd,
-        "scale": found.scale,
+        "correlation": relation.correlation,
+        "delay_s": relation.delay,
+        "delay_sd_s": relation.delay_sd,
+        "scale": relation.scale,
     }
 
 
-def _turned(found: relations.Relation) -> bool:
-    return found.nats > _NATS and found.axes_correlation > found.correlation + CLEARLY
+def _turned(relation: relations.Relation) -> bool:
+    return relation.nats > _NATS and relation.axes_correlation > relation.correlation + CLEARLY
 
 
-def _better(found: relations.Relation) -> str:
+def _better(relation: relations.Relation) -> str:
     """Words about an exchange of axes that beats those as they are."""
-    text = f"as ({found.axes}), {found.nats:.0f} nats better: {_kind(found.axes)} "
-    return text + f"(correlation {found.axes_correlation:.2f}, not {found.correlation:.2f})"
+    text = f"as ({relation.axes}), {relation.nats:.0f} nats better: {_kind(relation.axes)} "
+    return text + f"(correlation {relation.axes_correlation:.2f}, not {relation.correlation:.2f})"
 
 
 def _kind(axes: str) -> str:
     return "a mirror image" if is_mirror(axes) else "axes exchanged or turned"
 
 
-def _late(found: relations.Relation, both: str, figures: dict, one_clock: bool) -> Row:
+def _late(relation: relations.Relation, channels: str, figures: dict, one_clock: bool) -> Row:
     """Report the delay of a second measurement of one motion, and its remedy."""
-    if found.delay_sd > _UNTOLD:
+    if relation.delay_sd > _UNTOLD:
         text = "how late the second is cannot be told: too slow, or too noisy"
-        return Row("delay", both, "ok", text, figures)
+        return Row("delay", channels, "ok", text, figures)
     text = (
-        f"the second is {1e3 * found.delay:+.1f} ms behind the first (sd"
-        f" {1e3 * found.delay_sd:.1f} ms)"
+        f"the second is {1e3 * relation.delay:+.1f} ms behind the first (sd"
+        f" {1e3 * relation.delay_sd:.1f} ms)"
     )
-    far = (
-        abs(found.delay) > _DELAY_BAD
-        and found.delay_sd < 0.3 * abs(found.delay)
-        and found.correlation > FIRMLY
+    large = (
+        abs(relation.delay) > _DELAY_BAD
+        and relation.delay_sd < 0.3 * abs(relation.delay)
+        and relation.correlation > FIRMLY
     )
-    if far and one_clock:
+    if large and one_clock:
         text += ": both are of one message, so a filter makes it"
-    elif far:
+    elif large:
         text += (
-            f": streams on clocks apart; add {-found.delay:+.3f} s to the second's time (offset of"
-            " its clock in the mapping)"
+            f": streams on clocks apart; add {-relation.delay:+.3f} s to the second's time"
+            " (offset of its clock in the mapping)"
         )
-    late = abs(found.delay) > max(_DELAY_WARN, 2.0 * found.delay_sd)
-    verdict = "bad" if far and not one_clock else "warn" if late else "ok"
-    return Row("delay", both, verdict, text, figures)
+    late = abs(relation.delay) > max(_DELAY_WARN, 2.0 * relation.delay_sd)
+    verdict = "bad" if large and not one_clock else "warn" if late else "ok"
+    return Row("delay", channels, verdict, text, figures)
 
 
-def _apart(found: relations.Relation) -> bool:
+def _disagrees(relation: relations.Relation) -> bool:
     """Whether two signals hardly go together, in whatever axes; the best of 48 exchanges reaches
     0.5 by chance.
     """
-    return found.axes_correlation < BELONGS or (
-        found.correlation < BELONGS and found.axes_correlation < FIRMLY
+    return relation.axes_correlation < BELONGS or (
+        relation.correlation < BELONGS and relation.axes_correlation < FIRMLY
     )
 
 
@@ -261,11 +265,12 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     """The mean force on the body, turned to the world, must hold the vehicle up."""
     if "acc_b" not in log:
         return []
-    (time_q, q), (time_a, acc) = log[quat].samples(), log["acc_b"].samples()
+    (time_q, q) = log[quat].samples()
+    (time_a, acc) = log["acc_b"].samples()
     if len(time_q) < 50 or len(time_a) < 50:
         return []
-    at = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
-    mean_w = np.mean(Rotation.from_quat(q).apply(acc[at]), axis=0)
+    nearest = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
+    mean_w = np.mean(Rotation.from_quat(q).apply(acc[nearest]), axis=0)
     extra = np.zeros(3)
     if pos in log and len(log[pos].time) > 50:
         time_p, p = log[pos].samples()
@@ -275,22 +280,22 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     size = float(np.linalg.norm(mean_w))
     tilt = float(np.degrees(np.arccos(np.clip(mean_w[2] / max(size, 1e-9), -1.0, 1.0))))
     figures = {"mean_m_s2": mean_w.tolist(), "tilt_deg": tilt}
-    both = f"acc_b, {quat}"
+    channels = f"acc_b, {quat}"
     hint = relations.unit_hint(size / GRAVITY)
     if not 0.85 < size / GRAVITY < 1.15:
         text = (
             f"the mean force is {size:.4g} m/s^2, not {GRAVITY}:"
             f" {hint or 'axes are exchanged, or gravity is missing'}"
         )
-        return [Row("units" if hint else "frames", both, "bad", text, figures)]
+        return [Row("units" if hint else "frames", channels, "bad", text, figures)]
     if tilt > 30.0:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
-        return [Row("frames", both, "bad", text, figures)]
+        return [Row("frames", channels, "bad", text, figures)]
     verdict = "warn" if tilt > 3.0 or abs(size / GRAVITY - 1.0) > 0.03 else "ok"
     return [
         Row(
             "frames",
-            both,
+            channels,
             verdict,
             f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up",
             figures,
@@ -306,7 +311,8 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     not pull as well."""
     if path not in log or ("acc_b" not in log and "payload_pos_w" in log and "attached" not in log):
         return []
-    (time_p, p), (time_q, q) = log[path].samples(), log[quat].samples()
+    (time_p, p) = log[path].samples()
+    (time_q, q) = log[quat].samples()
     if len(time_p) < 50 or len(time_q) < 50:
         return []
     time, acc = accelerations(time_p, p, log[path].unit)
@@ -318,44 +324,51 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         if len(time_a) < 50:
             return []
         pushed = relations.attitude_at(time_q, q, time_a).apply(force_b) - [0.0, 0.0, GRAVITY]
-        pushed, name = relations.mean_over(time_a, pushed, time, _SPAN), "acc_b"
+        pushed = relations.mean_over(time_a, pushed, time, _SPAN)
+        name = "acc_b"
     else:
         up = turn.apply([0.0, 0.0, 1.0])
         pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * [1.0, 1.0, 0.0]
-        acc, name, force_b = acc * [1.0, 1.0, 0.0], "thrust along z", None
-    found = relations.relate(time, acc, time, pushed)
-    if found is None:
+        acc = acc * [1.0, 1.0, 0.0]
+        name = "thrust along z"
+        force_b = None
+    relation = relations.relate(time, acc, time, pushed)
+    if relation is None:
         return []
-    both = f"d({path})/dt, {quat} {name}"
-    wrong = _exchanged(time, acc, pushed, turn, found.axes_delay, both, force_b is not None)
+    channels = f"d({path})/dt, {quat} {name}"
+    wrong = _exchanged(time, acc, pushed, turn, relation.axes_delay, channels, force_b is not None)
     if wrong is None and force_b is not None:
         wrong = _exchanged_body(
-            time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY]), time_a, force_b, both
+            time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY]), time_a, force_b, channels
         )
-    return [wrong] if wrong is not None else _pushed(found, acc, pushed, both, force_b is not None)
+    return (
+        [wrong]
+        if wrong is not None
+        else _pushed(relation, acc, pushed, channels, force_b is not None)
+    )
 
 
 def _exchanged_body(
-    time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray, force_b: np.ndarray, both: str
+    time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray, force_b: np.ndarray, channels: str
 ) -> Row | None:
     """Which exchange of axes level with the rotors an accelerometer has: it feels the little that
     drag and cable leave there.
     """
-    at = time[(time > time_a[0] + _SPAN) & (time < time_a[-1] - _SPAN)]
-    if len(at) < 50:
+    grid = time[(time > time_a[0] + _SPAN) & (time < time_a[-1] - _SPAN)]
+    if len(grid) < 50:
         return None
-    felt = relations.mean_over(time_a, force_b, at, 2.0 * _SPAN)
-    found = relations.relate(
-        at, relations.on_grid(time, expected_b, at), at, felt, reach=_DELAY_BAD
+    felt = relations.mean_over(time_a, force_b, grid, 2.0 * _SPAN)
+    relation = relations.relate(
+        grid, relations.on_grid(time, expected_b, grid), grid, felt, reach=_DELAY_BAD
     )
-    if found is None or found.nats < _NATS or found.axes_correlation < _SEEN:
+    if relation is None or relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
         return None
     return Row(
         "frames",
-        both,
+        channels,
         "bad",
-        f"acc_b fits {_better(found)}",
-        {"axes": found.axes, "of": "acc_b", "nats": found.nats},
+        f"acc_b fits {_better(relation)}",
+        {"axes": relation.axes, "of": "acc_b", "nats": relation.nats},
     )
 
 
@@ -371,57 +384,56 @@ def accelerations(
 
 
 def _pushed(
-    found: relations.Relation, acc: np.ndarray, pushed: np.ndarray, both: str, sensed: bool
+    relation: relations.Relation, acc: np.ndarray, pushed: np.ndarray, channels: str, sensed: bool
 ) -> list[Row]:
     """Rows about a push that has the axes of the change of velocity."""
     off = np.mean(pushed - acc, axis=0)
     figures = {
-        "correlation": found.correlation,
-        "delay_s": found.delay,
-        "scale": found.scale,
+        "correlation": relation.correlation,
+        "delay_s": relation.delay,
+        "scale": relation.scale,
         "offset_m_s2": off.tolist(),
     }
-    if found.correlation < FIRMLY and not sensed:
+    if relation.correlation < FIRMLY and not sensed:
         return []  # a payload or a draught pushes as well
-    if found.correlation < FIRMLY:
-        verdict = (
-            "bad"
-            if found.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0
-            else "warn"
-        )
+    if relation.correlation < FIRMLY:
+        if relation.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0:
+            verdict = "bad"
+        else:
+            verdict = "warn"
         text = (
-            f"hardly go together (correlation {found.correlation:.2f}): attitude or accelerometer"
-            " of another flight, or noise"
+            f"hardly go together (correlation {relation.correlation:.2f}):"
+            " attitude or accelerometer of another flight, or noise"
         )
-        return [Row("frames", both, verdict, text, figures)]
+        return [Row("frames", channels, verdict, text, figures)]
     rows = [
         Row(
             "frames",
-            both,
+            channels,
             "ok",
-            f"go together as they are, correlation {found.correlation:.2f}",
+            f"go together as they are, correlation {relation.correlation:.2f}",
             figures,
         )
     ]
-    if not 0.5 < found.scale < 2.0:
-        hint = relations.unit_hint(found.scale) or "no unit explains it"
+    if not 0.5 < relation.scale < 2.0:
+        hint = relations.unit_hint(relation.scale) or "no unit explains it"
         rows.append(
             Row(
                 "units",
-                both,
+                channels,
                 "bad" if hint else "warn",
-                f"the second is {found.scale:.4g} times the first: {hint}",
+                f"the second is {relation.scale:.4g} times the first: {hint}",
                 figures,
             )
         )
     if sensed:
-        rows.append(_late(found, both, figures, False))
+        rows.append(_late(relation, channels, figures, False))
         if np.linalg.norm(off) > _OFFSET:
             text = (
                 f"the second is off by ({', '.join(f'{x:+.2f}' for x in off)}) m/s^2 in the mean:"
                 " bias, or a tilted mount"
             )
-            rows.append(Row("frames", both, "warn", text, figures))
+            rows.append(Row("frames", channels, "warn", text, figures))
     return rows
 
 
@@ -431,37 +443,38 @@ def _exchanged(
     pushed: np.ndarray,
     turn: Rotation,
     delay: float,
-    both: str,
+    channels: str,
     sensed: bool,
 ) -> Row | None:
     """Which exchange of axes, of the path or of the accelerometer, or which turn of the attitude,
     makes both fit.
     """
-    inside = (time + delay > time[0]) & (time + delay < time[-1])
-    acc, turn = acc[inside], turn[inside]
-    pushed = relations.on_grid(time, pushed, time[inside] + delay)
+    overlap = (time + delay > time[0]) & (time + delay < time[-1])
+    acc = acc[overlap]
+    turn = turn[overlap]
+    pushed = relations.on_grid(time, pushed, time[overlap] + delay)
     tried = {"path": np.einsum("kij,nj->kni", MATRICES, acc) - pushed}
     if sensed:
         gravity = np.array([0.0, 0.0, GRAVITY])
         force_b = turn.inv().apply(pushed + gravity)
-        seen = np.einsum("nij,kjm,nm->kni", turn.as_matrix(), MATRICES, force_b)
-        tried["acc_b"] = acc - (seen - gravity)
+        turned = np.einsum("nij,kjm,nm->kni", turn.as_matrix(), MATRICES, force_b)
+        tried["acc_b"] = acc - (turned - gravity)
     errors = {
-        (what, EVERY[k]): float(np.mean(e**2))
-        for what, of in tried.items()
-        for k, e in enumerate(of)
+        (what, EXCHANGES[k]): float(np.mean(e**2))
+        for what, error in tried.items()
+        for k, e in enumerate(error)
     }
     plain = errors["path", OURS]
-    (what, axes), least = min(errors.items(), key=lambda item: item[1])
+    (what, axes), smallest = min(errors.items(), key=lambda item: item[1])
     independent = max(float(np.ptp(time)) / (3.0 * relations.INDEPENDENT), 10.0)
-    nats = 0.5 * independent * np.log(plain / least) - np.log(len(errors))
+    nats = 0.5 * independent * np.log(plain / smallest) - np.log(len(errors))
     strength = float(np.mean(np.var(acc, axis=0)))
-    if axes == OURS or nats < _NATS or least > 0.5 * (1.0 if what == "acc_b" else strength):
+    if axes == OURS or nats < _NATS or smallest > 0.5 * (1.0 if what == "acc_b" else strength):
         return None
     whose = "positions and velocities" if what == "path" else "the accelerometer"
     text = f"fit with ({axes}) of {whose}, {nats:.0f} nats better: {_kind(axes)}"
-    text += f" (error {np.sqrt(plain):.2f} -> {np.sqrt(least):.2f} m/s^2)"
-    return Row("frames", both, "bad", text, {"axes": axes, "of": what, "nats": nats})
+    text += f" (error {np.sqrt(plain):.2f} -> {np.sqrt(smallest):.2f} m/s^2)"
+    return Row("frames", channels, "bad", text, {"axes": axes, "of": what, "nats": nats})
 
 
 def _still_gravity(log: FlightLog) -> list[Row]:
@@ -490,45 +503,55 @@ def _still_gravity(log: FlightLog) -> list[Row]:
 def _commands(log: FlightLog) -> list[Row]:
     """Whether the measured rates, or those of the measured attitude, follow what was commanded."""
     if "rate_b" in log:
-        turning, rates = "rate_b", log["rate_b"].samples()
+        turning = "rate_b"
+        rates = log["rate_b"].samples()
     elif "quat_wb" in log:
-        turning, rates = "rate of quat_wb", relations.rates_of(*log["quat_wb"].samples())
+        turning = "rate of quat_wb"
+        rates = relations.rates_of(*log["quat_wb"].samples())
     else:
         return []
     rows: list[Row] = []
     for name in (
         name for name in ("command", "rate_setpoint_b") if name in log and usable(*rates, MOVES)
     ):
-        time, wanted = log[name].samples()
-        wanted = wanted[:, -3:]  # a command's first is thrust
+        time, set_points = log[name].samples()
+        set_points = set_points[:, -3:]  # a command's first is thrust
         if (
-            usable(time, wanted, MOVES)
-            and (found := relations.relate(time, wanted, *rates)) is not None
+            usable(time, set_points, MOVES)
+            and (relation := relations.relate(time, set_points, *rates)) is not None
         ):
-            rows += _followed(found, f"{name}, {turning}", float(np.max(np.std(rates[1], axis=0))))
+            rows += _followed(
+                relation, f"{name}, {turning}", float(np.max(np.std(rates[1], axis=0)))
+            )
     return rows
 
 
-def _followed(found: relations.Relation, both: str, spread: float) -> list[Row]:
-    figures = _figures(found)
-    if _apart(found):
+def _followed(relation: relations.Relation, channels: str, spread: float) -> list[Row]:
+    figures = _figures(relation)
+    if _disagrees(relation):
         text = (
-            f"the rates do not follow the commands (best correlation {found.axes_correlation:.2f}):"
-            " not the same flight?"
+            "the rates do not follow the commands"
+            f" (best correlation {relation.axes_correlation:.2f}): not the same flight?"
         )
-        return [Row("frames", both, "bad" if spread > _LIVELY else "warn", text, figures)]
-    if _turned(found):
-        text = f"the rates follow the commands {_better(found)}"
+        return [Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)]
+    if _turned(relation):
+        text = f"the rates follow the commands {_better(relation)}"
         return [
-            Row("frames", both, "bad", text, figures | {"axes": found.axes, "nats": found.nats})
+            Row(
+                "frames",
+                channels,
+                "bad",
+                text,
+                figures | {"axes": relation.axes, "nats": relation.nats},
+            )
         ]
-    late = found.delay < -0.005
-    hint = relations.unit_hint(found.scale)
-    weak = found.correlation < FIRMLY
+    late = relation.delay < -0.005
+    hint = relations.unit_hint(relation.scale)
+    weak = relation.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if late or weak else "ok"
     text = (
-        f"the rates follow {1e3 * found.delay:.1f} ms later, correlation {found.correlation:.2f},"
-        f" gain {found.scale:.2f}"
+        f"the rates follow {1e3 * relation.delay:.1f} ms later,"
+        f" correlation {relation.correlation:.2f}, gain {relation.scale:.2f}"
     )
     text += (
         ": before they were commanded"
@@ -539,27 +562,30 @@ def _followed(found: relations.Relation, both: str, spread: float) -> list[Row]:
         if weak
         else ""
     )
-    return [Row("delay", both, verdict, text, figures)]
+    return [Row("delay", channels, verdict, text, figures)]
 
 
-def _cable(log: FlightLog, known: Known) -> list[Row]:
+def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     if "pos_w" not in log or "payload_pos_w" not in log:
         return []
-    (time_q, q), (time_p, p) = log["pos_w"].samples(), log["payload_pos_w"].samples()
+    (time_q, q) = log["pos_w"].samples()
+    (time_p, p) = log["payload_pos_w"].samples()
     if len(time_q) < 20 or len(time_p) < 20:
         return []
-    inside = (time_p > time_q[0]) & (time_p < time_q[-1])
+    overlap = (time_p > time_q[0]) & (time_p < time_q[-1])
     if "attached" in log:
-        inside &= log["attached"].hold(time_p).astype(bool)
-    time_p, p = time_p[inside], p[inside]
+        overlap &= log["attached"].hold(time_p).astype(bool)
+    time_p = time_p[overlap]
+    p = p[overlap]
     gap = p - relations.on_grid(time_q, q, time_p)
-    length, both = np.linalg.norm(gap, axis=1), "pos_w, payload_pos_w"
+    length = np.linalg.norm(gap, axis=1)
+    channels = "pos_w, payload_pos_w"
     if len(length) < 20:
-        return [Row("frames", both, "bad", "vehicle and payload were never measured at one time")]
-    middle, spread = (
-        float(np.median(length)),
-        float(np.percentile(length, 90) - np.percentile(length, 10)),
-    )
+        return [
+            Row("frames", channels, "bad", "vehicle and payload were never measured at one time")
+        ]
+    middle = float(np.median(length))
+    spread = float(np.percentile(length, 90) - np.percentile(length, 10))
     above = float(np.mean(gap[:, 2] > 0.5 * middle))
     figures = {"median_m": middle, "p10_to_p90_m": spread, "payload_above_share": above}
     text = f"{middle:.4f} m apart (10 to 90 %: {1e3 * spread:.1f} mm)"
@@ -567,7 +593,7 @@ def _cable(log: FlightLog, known: Known) -> list[Row]:
         return [
             Row(
                 "frames",
-                both,
+                channels,
                 "bad",
                 text + ", the payload above: bodies exchanged, or z down",
                 figures,
@@ -577,18 +603,18 @@ def _cable(log: FlightLog, known: Known) -> list[Row]:
         return [
             Row(
                 "units",
-                both,
+                channels,
                 "bad",
                 text + ": no cable; millimetres taken for metres, or metres for millimetres?",
                 figures,
             )
         ]
-    rows = [Row("frames", both, "warn" if spread > 0.1 * middle else "ok", text, figures)]
-    rows += _length(middle, known.cable_length, both) if known.cable_length else []
-    return rows + _payload_late(time_q, q, time_p, p, both)
+    rows = [Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)]
+    rows += _length(middle, vehicle.cable_length, channels) if vehicle.cable_length else []
+    return rows + _payload_late(time_q, q, time_p, p, channels)
 
 
-def _length(middle: float, expected: float, both: str) -> list[Row]:
+def _length(middle: float, expected: float, channels: str) -> list[Row]:
     """The cable as measured against the model's."""
     off = middle / expected - 1.0
     figures = {"median_m": middle, "model_m": expected}
@@ -597,7 +623,7 @@ def _length(middle: float, expected: float, both: str) -> list[Row]:
     return [
         Row(
             "cable",
-            both,
+            channels,
             verdict,
             text + (": another cable, or another body" if verdict == "bad" else ""),
             figures,
@@ -606,32 +632,34 @@ def _length(middle: float, expected: float, both: str) -> list[Row]:
 
 
 def _payload_late(
-    time_q: np.ndarray, q: np.ndarray, time_p: np.ndarray, p: np.ndarray, both: str
+    time_q: np.ndarray, q: np.ndarray, time_p: np.ndarray, p: np.ndarray, channels: str
 ) -> list[Row]:
     """Measure the delay of the payload's stream: a cable keeps its length, at the right delay."""
     delays = np.arange(-0.2, 0.2001, 0.01)
-    inside = (time_p > time_q[0] + 0.2) & (time_p < time_q[-1] - 0.2)
-    if np.sum(inside) < 50:
+    overlap = (time_p > time_q[0] + 0.2) & (time_p < time_q[-1] - 0.2)
+    if np.sum(overlap) < 50:
         return []
     lengths = np.array(
         [
-            np.linalg.norm(p[inside] - relations.on_grid(time_q, q, time_p[inside] - d), axis=1)
+            np.linalg.norm(p[overlap] - relations.on_grid(time_q, q, time_p[overlap] - d), axis=1)
             for d in delays
         ]
     )
     spread = np.std(lengths, axis=1)
-    at = int(np.argmin(spread))
-    independent = max(float(np.ptp(time_p[inside])) / relations.INDEPENDENT, 10.0)
-    nats = independent * float(np.log(spread[len(delays) // 2] / max(spread[at], 1e-9)))
-    if nats < _NATS or at in (0, len(delays) - 1) or abs(delays[at]) < _DELAY_WARN:
+    best = int(np.argmin(spread))
+    independent = max(float(np.ptp(time_p[overlap])) / relations.INDEPENDENT, 10.0)
+    nats = independent * float(np.log(spread[len(delays) // 2] / max(spread[best], 1e-9)))
+    if nats < _NATS or best in (0, len(delays) - 1) or abs(delays[best]) < _DELAY_WARN:
         return []
     text = (
-        f"the payload is {1e3 * delays[at]:+.0f} ms behind the vehicle: the cable's length then"
+        f"the payload is {1e3 * delays[best]:+.0f} ms behind the vehicle: the cable's length then"
         " varies by "
     )
-    text += f"{1e3 * spread[at]:.1f} mm, not {1e3 * spread[len(delays) // 2]:.1f} ({nats:.0f} nats)"
-    verdict = "bad" if abs(delays[at]) > _DELAY_BAD else "warn"
-    return [Row("delay", both, verdict, text, {"delay_s": float(delays[at]), "nats": nats})]
+    text += (
+        f"{1e3 * spread[best]:.1f} mm, not {1e3 * spread[len(delays) // 2]:.1f} ({nats:.0f} nats)"
+    )
+    verdict = "bad" if abs(delays[best]) > _DELAY_BAD else "warn"
+    return [Row("delay", channels, verdict, text, {"delay_s": float(delays[best]), "nats": nats})]
 
 
 def _same(log: FlightLog) -> list[Row]:
@@ -642,7 +670,8 @@ def _same(log: FlightLog) -> list[Row]:
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         if first not in log or second not in log:
             continue
-        (time_a, a), (time_b, b) = log[first].samples(), log[second].samples()
+        (time_a, a) = log[first].samples()
+        (time_b, b) = log[second].samples()
         if not (usable(time_a, a, MOVES) and usable(time_b, b, MOVES)):
             continue
         rows += _compared(relations.relate(time_a, a, time_b, b), first, second)
@@ -652,18 +681,19 @@ def _same(log: FlightLog) -> list[Row]:
 
 
 def _drift(
-    time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, both: str
+    time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, channels: str
 ) -> list[Row]:
     """Whether the delay is the same from piece to piece of 5 s."""
-    delays, piece = [], 5.0
+    delays = []
+    piece = 5.0
     for start in np.arange(time_a[0], time_a[-1] - piece, piece):
         near_a = (time_a >= start) & (time_a < start + piece)
         near_b = (time_b >= start - 1.0) & (time_b < start + piece + 1.0)
         if np.sum(near_a) < 50 or np.sum(near_b) < 50 or np.max(np.std(a[near_a], axis=0)) < MOVES:
             continue
-        found = relations.relate(time_a[near_a], a[near_a], time_b[near_b], b[near_b])
-        if found is not None and found.correlation > 0.8 and found.delay_sd < _DELAY_KNOWN:
-            delays.append((start, found.delay))
+        relation = relations.relate(time_a[near_a], a[near_a], time_b[near_b], b[near_b])
+        if relation is not None and relation.correlation > 0.8 and relation.delay_sd < _DELAY_KNOWN:
+            delays.append((start, relation.delay))
     if len(delays) < 3:
         return []
     late = np.array([delay for _, delay in delays])
@@ -673,4 +703,4 @@ def _drift(
         f"the delay runs from {1e3 * np.min(late):+.1f} to {1e3 * np.max(late):+.1f} ms over"
         f" {len(late)} pieces of {piece:.0f} s"
     )
-    return [Row("delay", both, "warn" if spread > 0.01 else "ok", text, figures)]
+    return [Row("delay", channels, "warn" if spread > 0.01 else "ok", text, figures)]

@@ -6,10 +6,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visthrow.common.rotations import continuous
-from visthrow.logs.axes import EVERY, MATRICES
+from visthrow.logs.axes import EXCHANGES, MATRICES
 
 REACH = 0.4  # largest delay looked for [s]
-_NEAR = (
+_HIGH_CORRELATION = (
     0.25  # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
 )
 _LONGEST_GRID = 60_000  # samples; longer stretches are thinned
@@ -78,7 +78,8 @@ def relate(
     """
     if min(len(time_a), len(time_b)) < 2:
         return None
-    start, end = max(time_a[0], time_b[0]) + reach, min(time_a[-1], time_b[-1]) - reach
+    start = max(time_a[0], time_b[0]) + reach
+    end = min(time_a[-1], time_b[-1]) - reach
     period = max(np.median(np.diff(time_a)), np.median(np.diff(time_b)))
     period = max(period, (end - start) / _LONGEST_GRID)
     count = int((end - start) / period)
@@ -102,13 +103,16 @@ def _related(
     steps: int,
 ) -> tuple[Relation | None, np.ndarray]:
     """Relation at the times of a grid [s], and which of them go with the rest."""
-    values, count = on_grid(time_a, a, grid), len(grid)
-    first, usual_a = _centred(values), np.median(values, axis=0)
+    values = on_grid(time_a, a, grid)
+    count = len(grid)
+    first = _centred(values)
+    usual_a = np.median(values, axis=0)
     usual_b = np.median(on_grid(time_b, b, grid), axis=0)
     values = values - usual_a
     edges = np.linspace(0, count, BLOCKS, endpoint=False).astype(int)
     sums = np.zeros((2, 2 * steps + 1, BLOCKS))
-    cross, norms = np.zeros((a.shape[1], b.shape[1], 2 * steps + 1)), np.zeros(2 * steps + 1)
+    cross = np.zeros((a.shape[1], b.shape[1], 2 * steps + 1))
+    norms = np.zeros(2 * steps + 1)
     power = float(np.sum(first**2))
     for lag in range(-steps, steps + 1):
         moved = on_grid(time_b, b, grid + lag * period)
@@ -123,33 +127,52 @@ def _related(
     powers = np.add.reduceat(np.sum(values**2, axis=1), edges)
     effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
     narrowest = max(2, round(_WIDTH / period))
-    offset, sd, left, together = _delay(powers, *sums, narrowest, effective)
+    offset, sd, residual, together = _delay(powers, *sums, narrowest, effective)
     follows = np.ones(count, bool)
     if together > _TOGETHER:
         sizes = np.diff(np.append(edges, count))
-        follows = np.repeat(left < _TUMBLE * np.median(left), sizes)
-    scale_of = np.sqrt(power * norms)
-    own = np.trace(cross) / scale_of
-    at = int(np.argmax(own))
-    exchanges, matrices = (
-        (EVERY, MATRICES) if a.shape[1] == 3 else (("x", "-x"), np.array([[[1.0]], [[-1.0]]]))
-    )
-    scores = np.einsum("kij,jil->kl", matrices, cross / scale_of)
+        follows = np.repeat(residual < _TUMBLE * np.median(residual), sizes)
+    relation = _relation(cross, power, norms, effective, (offset, sd), period, steps)
+    return relation, follows
+
+
+def _relation(
+    cross: np.ndarray,
+    power: float,
+    norms: np.ndarray,
+    effective: float,
+    delay: tuple[float, float],
+    period: float,
+    steps: int,
+) -> Relation:
+    """Return the relation of two signals from their cross-correlations by lag, shape (A, B, K),
+    with the delay and its deviation [steps].
+    """
+    offset, sd = delay
+    scale = np.sqrt(power * norms)
+    correlation = np.trace(cross) / scale
+    lag = int(np.argmax(correlation))
+    if cross.shape[0] == 3:
+        exchanges = EXCHANGES
+        matrices = MATRICES
+    else:
+        exchanges = ("x", "-x")
+        matrices = np.array([[[1.0]], [[-1.0]]])
+    scores = np.einsum("kij,jil->kl", matrices, cross / scale)
     k, best_at = np.unravel_index(np.argmax(scores), scores.shape)
     best = float(scores[k, best_at])
-    plain, turned = (min(max(c, 0.0), 0.999) for c in (own[at], best))
-    nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EVERY))
-    found = Relation(
+    plain, turned = (min(max(c, 0.0), 0.999) for c in (correlation[lag], best))
+    nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EXCHANGES))
+    return Relation(
         (offset - steps) * period,
         min(sd, steps) * period,
-        float(own[at]),
-        float(np.trace(cross[:, :, at])) / power,
+        float(correlation[lag]),
+        float(np.trace(cross[:, :, lag])) / power,
         exchanges[k],
         best,
         float(best_at - steps) * period,
         float(nats),
     )
-    return found, follows
 
 
 def _delay(
@@ -172,31 +195,32 @@ def _delay(
     Returns:
         Lag, its deviation, what each block leaves, shape (K,), and the weighted correlation.
     """
-    scale, floor = np.sum(xy, axis=1) / max(float(np.sum(xx)), 1e-300), 1e-6 * np.mean(yy)
+    scale = np.sum(xy, axis=1) / max(float(np.sum(xx)), 1e-300)
+    floor = 1e-6 * np.mean(yy)
     for _ in range(_ROUNDS):
-        left = np.maximum(yy - 2.0 * scale[:, None] * xy + scale[:, None] ** 2 * xx, floor)
-        scale = np.sum(xy / left, axis=1) / np.maximum(np.sum(xx / left, axis=1), 1e-300)
-    likelihood = np.where(scale > 0.0, np.sum(-0.5 * np.log(left), axis=1), -np.inf)
-    at = int(np.argmax(likelihood))
-    together = _together(xx, xy[at], yy[at], left[at])
+        residual = np.maximum(yy - 2.0 * scale[:, None] * xy + scale[:, None] ** 2 * xx, floor)
+        scale = np.sum(xy / residual, axis=1) / np.maximum(np.sum(xx / residual, axis=1), 1e-300)
+    likelihood = np.where(scale > 0.0, np.sum(-0.5 * np.log(residual), axis=1), -np.inf)
+    best = int(np.argmax(likelihood))
+    together = _together(xx, xy[best], yy[best], residual[best])
     while 2 * half < len(likelihood):
         # the middle of the window in which the second follows best: of a slow motion noise alone
         # would make the peak of a narrow one
         mean = np.convolve(likelihood, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
-        at = int(np.argmax(mean)) + half
-        inside = np.arange(max(at - half, 0), at + half + 1)
-        fits = np.polynomial.polynomial.polyfit(inside - at, np.hstack([xy, yy])[inside], 2)
+        best = int(np.argmax(mean)) + half
+        window = np.arange(max(best - half, 0), best + half + 1)
+        fits = np.polynomial.polynomial.polyfit(window - best, np.hstack([xy, yy])[window], 2)
         vertex, sd = _vertex(xx, fits[:, : len(xx)], fits[:, len(xx) :], floor, half, independent)
         if np.isfinite(sd):
-            return at + vertex, sd, left[at], together
+            return best + vertex, sd, residual[best], together
         half *= 2
-    return float(at), np.inf, left[at], together
+    return float(best), np.inf, residual[best], together
 
 
-def _together(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, left: np.ndarray) -> float:
+def _together(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, residual: np.ndarray) -> float:
     """Correlation in which each block weighs by its noise."""
-    both, first, second = (float(np.sum(of / left)) for of in (xy, xx, yy))
-    return both / max(np.sqrt(first * second), 1e-300)
+    cross, first, second = (float(np.sum(products / residual)) for products in (xy, xx, yy))
+    return cross / max(np.sqrt(first * second), 1e-300)
 
 
 def _vertex(
@@ -216,46 +240,49 @@ def _vertex(
         half: Half the width of the parabolas [steps].
         independent: Number of samples that count as independent.
     """
-    at = 0.0
+    vertex = 0.0
     for _ in range(_ROUNDS):
-        powers = np.array([[1.0, at, at * at], [0.0, 1.0, 2.0 * at], [0.0, 0.0, 2.0]])
+        powers = np.array(
+            [[1.0, vertex, vertex * vertex], [0.0, 1.0, 2.0 * vertex], [0.0, 0.0, 2.0]]
+        )
         product, second = powers @ xy, powers @ yy  # value, slope and bend
         scale = max(float(np.sum(product[0]) / np.sum(xx)), 0.0)
-        left = second[0] - 2.0 * scale * product[0] + scale**2 * xx
-        weight = 1.0 / np.maximum(left, floor)
-        both, power = product @ weight, second @ weight
-        if both[0] <= 0.0 or power[0] <= 0.0:
-            return at, np.inf
-        slope = both[1] / both[0] - 0.5 * power[1] / power[0]
-        bend = both[2] / both[0] - (both[1] / both[0]) ** 2
+        residual = second[0] - 2.0 * scale * product[0] + scale**2 * xx
+        weight = 1.0 / np.maximum(residual, floor)
+        cross = product @ weight
+        power = second @ weight
+        if cross[0] <= 0.0 or power[0] <= 0.0:
+            return vertex, np.inf
+        slope = cross[1] / cross[0] - 0.5 * power[1] / power[0]
+        bend = cross[2] / cross[0] - (cross[1] / cross[0]) ** 2
         bend -= 0.5 * (power[2] / power[0] - (power[1] / power[0]) ** 2)
-        slopes = weight * (product[1] / both[0] - 0.5 * second[1] / power[0])
-        explained = min(float(both[0] ** 2 / (power[0] * np.sum(weight * xx))), 0.999)
+        slopes = weight * (product[1] / cross[0] - 0.5 * second[1] / power[0])
+        explained = min(float(cross[0] ** 2 / (power[0] * np.sum(weight * xx))), 0.999)
         # what the second would lose of its likelihood half the parabola's width aside
         nats = -0.5 * independent * bend * half**2 * explained / (1.0 - explained)
-        if nats < _NATS or abs(at - slope / bend) > half:
-            return at, np.inf
-        at -= slope / bend
-    return at, _STUDENT * float(np.sqrt(np.sum(slopes**2) * BLOCKS / (BLOCKS - 1)) / -bend)
+        if nats < _NATS or abs(vertex - slope / bend) > half:
+            return vertex, np.inf
+        vertex -= slope / bend
+    return vertex, _STUDENT * float(np.sqrt(np.sum(slopes**2) * BLOCKS / (BLOCKS - 1)) / -bend)
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
     return values - np.mean(values, axis=0)
 
 
-def peak(score: np.ndarray, at: int) -> tuple[float, float]:
+def peak(score: np.ndarray, index: int) -> tuple[float, float]:
     """Vertex of the parabola through the peak and its neighbours, and its curvature [1/step^2]."""
-    if not 0 < at < len(score) - 1:
+    if not 0 < index < len(score) - 1:
         return 0.0, 1e-9
-    left, top, right = score[at - 1 : at + 2]
-    curve = 2 * top - left - right
-    return (0.5 * (right - left) / curve if curve > 0.0 else 0.0), max(float(curve), 1e-9)
+    lower, top, right = score[index - 1 : index + 2]
+    curve = 2 * top - lower - right
+    return (0.5 * (right - lower) / curve if curve > 0.0 else 0.0), max(float(curve), 1e-9)
 
 
 def unit_hint(ratio: float) -> str:
     """Name the unit that a ratio of two measurements suggests, or return nothing."""
-    for known, words in UNITS.items():
-        if ratio and abs(np.log(abs(ratio) / known)) < _NEAR:
+    for factor, words in UNITS.items():
+        if ratio and abs(np.log(abs(ratio) / factor)) < _HIGH_CORRELATION:
             return words
     return ""
 
@@ -299,13 +326,15 @@ def _pairs(time: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray, np.nd
     return first, last, 0.5 * (time[first] + time[last]), width
 
 
-def mean_over(time: np.ndarray, values: np.ndarray, at: np.ndarray, span: float) -> np.ndarray:
+def mean_over(time: np.ndarray, values: np.ndarray, times: np.ndarray, span: float) -> np.ndarray:
     """Mean of a signal over ``span`` seconds about each time, shape (N, components)."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
     whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-    return (on_grid(time, whole, at + 0.5 * span) - on_grid(time, whole, at - 0.5 * span)) / span
+    return (
+        on_grid(time, whole, times + 0.5 * span) - on_grid(time, whole, times - 0.5 * span)
+    ) / span
 
 
-def attitude_at(time: np.ndarray, quat: np.ndarray, at: np.ndarray) -> Rotation:
+def attitude_at(time: np.ndarray, quat: np.ndarray, times: np.ndarray) -> Rotation:
     """Attitudes xyzw between samples, straight through the quaternions."""
-    return Rotation.from_quat(on_grid(time, continuous(quat), at))
+    return Rotation.from_quat(on_grid(time, continuous(quat), times))

@@ -25,7 +25,7 @@ def worst(rows: list[Row]) -> Verdict:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownVehicle:
     """A model's statements about a vehicle."""
 
     cable_length: float = 0.0  # to the payload's centre [m]; 0: none
@@ -36,4 +36,4 @@ class Known:
     )
 
 
-NOTHING = Known()
+NOTHING = KnownVehicle()

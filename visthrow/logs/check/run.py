@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.logs.check import excitation, physics, relations, signals, thrust
-from visthrow.logs.check.rows import NOTHING, Known, Row, Verdict, worst
+from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, Verdict, worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.readers.vehicles import Vehicle
 
@@ -35,14 +35,16 @@ class Checked:
         return worst([row for row in self.rows if row.topic != "answers"])
 
 
-def check(logs: Sequence[FlightLog], known: Known = NOTHING) -> list[Checked]:
+def check(logs: Sequence[FlightLog], vehicle: KnownVehicle = NOTHING) -> list[Checked]:
     """Look at logs one by one, and at what they have in common."""
-    common = [_copies(logs), _shared_payloads(logs), _masses(logs, known)]
+    common = [_copies(logs), _shared_payloads(logs), _masses(logs, vehicle)]
     rows = [
-        (*_look(log, known), *(row for found in common for row in found.get(i, ())))
+        (*_look(log, vehicle), *(row for shared in common for row in shared.get(i, ())))
         for i, log in enumerate(logs)
     ]
-    return [Checked(label(log, i), of) for i, (log, of) in enumerate(zip(logs, rows))]
+    return [
+        Checked(label(log, i), rows_of_log) for i, (log, rows_of_log) in enumerate(zip(logs, rows))
+    ]
 
 
 CONTRADICT = ("vehicle", "frames", "units", "delay", "thrust", "excited")
@@ -82,7 +84,7 @@ def label(log: FlightLog, number: int) -> str:
     return f"{source}:{part}" if part else source
 
 
-def _look(log: FlightLog, known: Known) -> list[Row]:
+def _look(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     if not log.channels:
         return [Row("clock", "", "bad", "no channel at all")]
     log = _until_landing(log)
@@ -100,7 +102,12 @@ def _look(log: FlightLog, known: Known) -> list[Row]:
     if kind and not Vehicle(kind).rotors_alone:
         text = f"of a {kind}: only its channels are looked at; expected a vehicle of rotors"
         return [*rows, Row("vehicle", "", "bad", text)]
-    return rows + physics.look(usable, known) + thrust.look(usable, known) + excitation.look(usable)
+    return (
+        rows
+        + physics.look(usable, vehicle)
+        + thrust.look(usable, vehicle)
+        + excitation.look(usable)
+    )
 
 
 def _until_landing(log: FlightLog) -> FlightLog:
@@ -116,7 +123,8 @@ def _until_landing(log: FlightLog) -> FlightLog:
 def _reader(log: FlightLog) -> list[Row]:
     """Return the notes of a binary log's reader."""
     rows = []
-    corrupt, dropped = log.meta.get("corrupt", 0), log.meta.get("dropped", 0)
+    corrupt = log.meta.get("corrupt", 0)
+    dropped = log.meta.get("dropped", 0)
     if corrupt or dropped:
         text = f"{corrupt} damaged stretches, {dropped} frames lost with them"
         rows.append(Row("gaps", "", "warn", text, {"corrupt": corrupt, "dropped": dropped}))
@@ -147,7 +155,7 @@ def _clocks(log: FlightLog) -> list[Row]:
     rows = []
     if len(clocks) > 1:
         text = f"{len(clocks)} clocks: " + "; ".join(
-            f"{name}: {', '.join(of)}" for name, of in clocks.items()
+            f"{name}: {', '.join(channels)}" for name, channels in clocks.items()
         )
         rows.append(Row("clock", "", "ok", text, {"clocks": len(clocks)}))
     if spans and max(start for start, _ in spans) > min(end for _, end in spans):
@@ -164,7 +172,7 @@ def _clocks(log: FlightLog) -> list[Row]:
 
 def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
     prints = [_prints(log) for log in logs]
-    found: dict[int, list[Row]] = {}
+    rows_of: dict[int, list[Row]] = {}
     for j in range(len(logs)):
         for i in range(j):
             shared = len(prints[i] & prints[j]) / max(min(len(prints[i]), len(prints[j])), 1)
@@ -173,22 +181,23 @@ def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
                     f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy"
                     " counts once"
                 )
-                found.setdefault(j, []).append(
+                rows_of.setdefault(j, []).append(
                     Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared})
                 )
-    return found
+    return rows_of
 
 
-def _masses(logs: Sequence[FlightLog], known: Known) -> dict[int, list[Row]]:
+def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[Row]]:
     """Logs whose thrust stands to the force otherwise than in the others: another battery, vehicle,
     payload or map.
     """
     masses = {
-        i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, known)) is not None
+        i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, vehicle)) is not None
     }
     if len(masses) < 2:
         return {}
-    middle, found = float(np.median(list(masses.values()))), {}
+    middle = float(np.median(list(masses.values())))
+    rows_of = {}
     for i, mass in masses.items():
         if abs(np.log(mass / middle)) > _OTHER_SCALE:
             text = (
@@ -196,13 +205,13 @@ def _masses(logs: Sequence[FlightLog], known: Known) -> dict[int, list[Row]]:
                 " middle: "
             )
             text += "the thrust's scale differs from flight to flight"
-            found[i] = [Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})]
-    return found
+            rows_of[i] = [Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})]
+    return rows_of
 
 
 def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
     """Logs of several vehicles with one payload: how far their clocks are apart."""
-    found: dict[int, list[Row]] = {}
+    rows_of: dict[int, list[Row]] = {}
     named = [
         i
         for i, log in enumerate(logs)
@@ -215,11 +224,12 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
         relation = relations.relate(time_a, a, time_b, b)
         if relation is None or relation.correlation < 0.99:
             continue
-        inside = (time_a > time_b[0] - relation.delay) & (time_a < time_b[-1] - relation.delay)
-        apart = a[inside] - relations.on_grid(time_b, b, time_a[inside] + relation.delay)
-        off = float(np.sqrt(np.mean(apart**2))) if np.any(inside) else np.inf
+        common = (time_a > time_b[0] - relation.delay) & (time_a < time_b[-1] - relation.delay)
+        difference = a[common] - relations.on_grid(time_b, b, time_a[common] + relation.delay)
+        off = float(np.sqrt(np.mean(difference**2))) if np.any(common) else np.inf
         if off < _ONE_PAYLOAD:
-            late, sd = 1e3 * relation.delay, 1e3 * relation.delay_sd
+            late = 1e3 * relation.delay
+            sd = 1e3 * relation.delay_sd
             text = f"the payload of {label(logs[first], first)} to {1e3 * off:.1f} mm, "
             text += f"this clock {late:+.1f} ms behind (sd {sd:.1f} ms)"
             figures = {
@@ -228,10 +238,10 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
                 "delay_sd_s": relation.delay_sd,
                 "rms_m": off,
             }
-            found.setdefault(second, []).append(
+            rows_of.setdefault(second, []).append(
                 Row("clock", "payload_pos_w", "warn", text, figures)
             )
-    return found
+    return rows_of
 
 
 def _prints(log: FlightLog) -> set[bytes]:
@@ -253,24 +263,24 @@ def _prints(log: FlightLog) -> set[bytes]:
             -1, 4 * rows.shape[1]
         )
         ordered = np.sort(runs, axis=1)  # NaN last
-        others = np.sum((ordered[:, 1:] != ordered[:, :-1]) & ~np.isnan(ordered[:, :-1]), axis=1)
+        changes = np.sum((ordered[:, 1:] != ordered[:, :-1]) & ~np.isnan(ordered[:, :-1]), axis=1)
         prints.update(
-            hashlib.blake2b(run.tobytes(), digest_size=8).digest() for run in runs[others > 2]
+            hashlib.blake2b(run.tobytes(), digest_size=8).digest() for run in runs[changes > 2]
         )
     return prints
 
 
-def table(checked: Checked, every: bool = False) -> str:
+def table(checked: Checked, all_rows: bool = False) -> str:
     """Print a log's rows; noise and clocks that are fine only on demand."""
     marks = {"ok": "ok  ", "warn": "WARN", "bad": "BAD "}
     lines = [f"{checked.name}: {checked.verdict}"]
-    shown = [
+    visible = [
         row
         for row in checked.rows
-        if every or row.verdict != "ok" or row.topic not in ("noise", "clock", "gaps")
+        if all_rows or row.verdict != "ok" or row.topic not in ("noise", "clock", "gaps")
     ]
-    width = max((len(row.channel) for row in shown), default=0)
-    for row in shown:
+    width = max((len(row.channel) for row in visible), default=0)
+    for row in visible:
         lines.append(
             f"  {marks[row.verdict]} {row.topic:<10} {row.channel:<{min(width, 34)}}  {row.text}"
         )

@@ -44,7 +44,7 @@ _FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad":
 """Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs.
 """
 _HARDEST = 30.0  # acceleration of a vehicle or payload that throws [m/s^2]
-_ASKED = (
+_COMMANDED = (
     "setpoint",
     "command",
     "action",
@@ -133,7 +133,8 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
 
 def _clock(name: str, channel: Channel, notes: dict) -> Row:
     steps = np.diff(channel.time)
-    period, span = float(np.median(steps)), float(np.ptp(channel.time))
+    period = float(np.median(steps))
+    span = float(np.ptp(channel.time))
     jitter = float(np.percentile(np.abs(steps - period), 95)) / period
     figures = {
         "samples": len(channel.time),
@@ -152,7 +153,8 @@ def _clock(name: str, channel: Channel, notes: dict) -> Row:
         ("unstamped", "rows unstamped"),
     ):
         if notes.get(key):
-            verdict, text = "warn", f"{text}; {notes[key]} {words}"
+            verdict = "warn"
+            text = f"{text}; {notes[key]} {words}"
             figures[key] = notes[key]
             if key != "unstamped" and notes[key] > 0.05 * notes.get("rows", len(steps)):
                 verdict = "bad"
@@ -180,13 +182,12 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
     }
     if not np.any(wide) and invalid == 0.0:
         return []
-    verdict = (
-        "bad"
-        if invalid + share > 0.5
-        else "warn"
-        if invalid + share > 0.02 or np.max(steps) > 0.5
-        else "ok"
-    )
+    if invalid + share > 0.5:
+        verdict = "bad"
+    elif invalid + share > 0.02 or np.max(steps) > 0.5:
+        verdict = "warn"
+    else:
+        verdict = "ok"
     text = (
         f"{int(np.sum(wide))} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the"
         " time, "
@@ -200,7 +201,8 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
 
 def _values(name: str, channel: Channel) -> list[Row]:
     values = channel.values.reshape(len(channel.values), -1).astype(float)
-    values, time = values[channel.valid], channel.time[channel.valid]
+    values = values[channel.valid]
+    time = channel.time[channel.valid]
     if len(values) < FEW_SAMPLES:
         return [Row("values", name, "bad", f"{len(values)} valid samples")]
     rows = []
@@ -208,7 +210,7 @@ def _values(name: str, channel: Channel) -> list[Row]:
         rows += _stuck(name, values, time)
     if any(word in name for word in _RAILED) and "setpoint" not in name and name not in _SWITCHES:
         rows += _railed(name, values)
-    if channel.unit in _FASTEST and not any(word in name for word in _ASKED):
+    if channel.unit in _FASTEST and not any(word in name for word in _COMMANDED):
         rows += _jumps(name, values, time, channel.unit)
     return rows
 
@@ -218,11 +220,14 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
     if not np.any(same):
         return []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    starts, ends = edges[::2], edges[1::2]
+    starts = edges[::2]
+    ends = edges[1::2]
     lengths = time[np.minimum(ends, len(time) - 1)] - time[starts]
-    longest, at = float(np.max(lengths)), float(time[starts[np.argmax(lengths)]])
-    total, share = float(np.sum(lengths[lengths > _STUCK_TIME])), float(np.mean(same))
-    figures = {"longest_s": longest, "at_s": at, "stuck_s": total, "repeated_share": share}
+    longest = float(np.max(lengths))
+    start = float(time[starts[np.argmax(lengths)]])
+    total = float(np.sum(lengths[lengths > _STUCK_TIME]))
+    share = float(np.mean(same))
+    figures = {"longest_s": longest, "at_s": start, "stuck_s": total, "repeated_share": share}
     if np.all(same):
         return [Row("values", name, "bad", "one value from beginning to end", figures)]
     if longest > _STUCK_TIME:
@@ -232,7 +237,7 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
                 "values",
                 name,
                 verdict,
-                f"stands still to the last digit for {longest:.2f} s at {at:.2f} s",
+                f"stands still to the last digit for {longest:.2f} s at {start:.2f} s",
                 figures,
             )
         ]
@@ -248,7 +253,8 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
 def _railed(name: str, values: np.ndarray) -> list[Row]:
     worst, where = 0.0, ""
     for column in values.T:
-        low, high = np.min(column), np.max(column)
+        low = np.min(column)
+        high = np.max(column)
         if high == low:
             continue
         for rail, words in ((low, "lowest"), (high, "highest")):
@@ -256,7 +262,8 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
                 continue  # switched off is no rail
             share = float(np.sum(column == rail) - 1) / len(column)  # one is always the least
             if share > worst:
-                worst, where = share, f"its {words} value {rail:.6g}"
+                worst = share
+                where = f"its {words} value {rail:.6g}"
     if worst <= _RAIL_SHARE:
         return []
     return [
@@ -274,26 +281,30 @@ def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[R
     """Steps that no motion makes, from sample to sample and across gaps."""
     if "quat" in name:
         values = continuous(values)
-    size, steps = np.linalg.norm(np.diff(values, axis=0), axis=1), np.diff(time)
+    size = np.linalg.norm(np.diff(values, axis=0), axis=1)
+    steps = np.diff(time)
     usual = np.maximum(np.percentile(size, 99), 1e-9)
-    near = steps < 5 * np.median(steps)
-    far = (size > 5.0 * usual) & (size / steps > _FASTEST[unit]) & near
-    unit_word, rows = "" if unit == "1" else f" {unit}", []
-    if np.any(far):
-        at = int(np.argmax(np.where(far, size, 0.0)))
-        text = (
-            f"{int(np.sum(far))} jumps, the largest {size[at]:.3g}{unit_word} at {time[at]:.2f} s"
-        )
+    adjacent = steps < 5 * np.median(steps)
+    jumped = (size > 5.0 * usual) & (size / steps > _FASTEST[unit]) & adjacent
+    unit_word = "" if unit == "1" else f" {unit}"
+    rows = []
+    if np.any(jumped):
+        index = int(np.argmax(np.where(jumped, size, 0.0)))
+        count = int(np.sum(jumped))
+        largest = f"{size[index]:.3g}{unit_word} at {time[index]:.2f} s"
+        text = f"{count} jumps, the largest {largest}"
         rows.append(
             Row(
                 "values",
                 name,
-                "warn" if np.mean(far) < 0.02 else "bad",
+                "warn" if np.mean(jumped) < 0.02 else "bad",
                 text,
-                {"jumps": int(np.sum(far))},
+                {"jumps": int(np.sum(jumped))},
             )
         )
-    return rows + _jumps_across(name, values, time, np.flatnonzero(~near)) if unit == "m" else rows
+    return (
+        rows + _jumps_across(name, values, time, np.flatnonzero(~adjacent)) if unit == "m" else rows
+    )
 
 
 def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray) -> list[Row]:
@@ -302,7 +313,8 @@ def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndar
     """
     off = []
     for i in gaps:
-        before, after = slice(max(i - 8, 0), i + 1), slice(i + 1, i + 10)
+        before = slice(max(i - 8, 0), i + 1)
+        after = slice(i + 1, i + 10)
         if min(len(time[before]), len(time[after])) < 5:
             continue
         expected = [
@@ -312,20 +324,20 @@ def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndar
                 (after, 0.5 * (time[i] + time[i + 1])),
             )
         ]
-        apart, width = (
-            float(np.linalg.norm(expected[1] - expected[0])),
-            float(time[i + 1] - time[i]),
-        )
-        if apart > 0.05 + 0.25 * _HARDEST * width**2:
-            off.append((apart, float(time[i]), width))
+        distance = float(np.linalg.norm(expected[1] - expected[0]))
+        width = float(time[i + 1] - time[i])
+        if distance > 0.05 + 0.25 * _HARDEST * width**2:
+            off.append((distance, float(time[i]), width))
     if not off:
         return []
-    apart, at, width = max(off)
+    distance, instant, width = max(off)
     text = (
-        f"{len(off)} jumps across gaps, the largest {apart:.3g} m over the {width:.2f} s from"
-        f" {at:.2f} s: another origin or body?"
+        f"{len(off)} jumps across gaps, the largest {distance:.3g} m over the {width:.2f} s from"
+        f" {instant:.2f} s: another origin or body?"
     )
-    return [Row("values", name, "warn", text, {"jumps_across_gaps": len(off), "largest_m": apart})]
+    return [
+        Row("values", name, "warn", text, {"jumps_across_gaps": len(off), "largest_m": distance})
+    ]
 
 
 def _noise(name: str, channel: Channel) -> list[Row]:
@@ -342,5 +354,5 @@ def _noise(name: str, channel: Channel) -> list[Row]:
 
 def notes_of(log: FlightLog, name: str) -> dict:
     """Return the reader's notes on a channel."""
-    found = log.meta.get("ingest", {})
-    return found.get(name, {}) if isinstance(found, dict) else {}
+    notes = log.meta.get("ingest", {})
+    return notes.get(name, {}) if isinstance(notes, dict) else {}

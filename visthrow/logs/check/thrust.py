@@ -6,7 +6,7 @@ import numpy as np
 
 from visthrow.logs.check import relations
 from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, usable
-from visthrow.logs.check.rows import NOTHING, Known, Row
+from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import FlightLog
 
 INPUTS = (
@@ -48,24 +48,26 @@ IDLE_SPEED, IDLE_SHARE = 100.0, 0.12  # a vehicle whose rotors stay below has no
 _UNEVEN = 0.4
 
 
-def look(log: FlightLog, known: Known = NOTHING) -> list[Row]:
+def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> list[Row]:
     """Return the findings about thrust and rotors in one flight."""
-    return [*_force(log, known), *_rotors(log), *_turning(log)]
+    return [*_force(log, vehicle), *_rotors(log), *_turning(log)]
 
 
-def thrust_of(log: FlightLog, known: Known = NOTHING) -> tuple[str, np.ndarray, np.ndarray] | None:
+def thrust_of(
+    log: FlightLog, vehicle: KnownVehicle = NOTHING
+) -> tuple[str, np.ndarray, np.ndarray] | None:
     """Return what a log says of its collective thrust.
 
     Returns channel, times [s] and thrust, shape (N, 1), in newtons where channel or map say so;
     None where it says nothing."""
-    name = known.thrust_input or next((name for name in INPUTS if name in log), "")
+    name = vehicle.thrust_input or next((name for name in INPUTS if name in log), "")
     if name not in log or np.sum(log[name].valid) < 50:
         return None
     time, values = log[name].samples()
     if name == "command":
         values = values[:, :1]
-    if known.thrust_map is not None and name == known.thrust_input:
-        values = sum(c * values**i for i, c in enumerate(known.thrust_map))
+    if vehicle.thrust_map is not None and name == vehicle.thrust_input:
+        values = sum(c * values**i for i, c in enumerate(vehicle.thrust_map))
     elif name == "motor_speed":
         values = values**2
     return name, time, np.sum(values, axis=1, keepdims=True)
@@ -73,82 +75,82 @@ def thrust_of(log: FlightLog, known: Known = NOTHING) -> tuple[str, np.ndarray, 
 
 def follows(log: FlightLog, name: str) -> float | None:
     """Return how well the measured force follows an input, as a correlation; None where unknown."""
-    told = thrust_of(log, Known(thrust_input=name))
-    if told is None or np.median(told[2]) <= 0.0:
+    thrust = thrust_of(log, KnownVehicle(thrust_input=name))
+    if thrust is None or np.median(thrust[2]) <= 0.0:
         return None
-    found = [c for felt in ("acc_b", "path") if (c := _correlations(log, *told[1:], felt))]
+    correlations = [c for felt in ("acc_b", "path") if (c := _correlations(log, *thrust[1:], felt))]
     motors = (_DELAYS > -0.005) & (_DELAYS < _LATEST)
-    return max((float(np.max(curve[motors])) for curve, _ in found), default=None)
+    return max((float(np.max(curve[motors])) for curve, _ in correlations), default=None)
 
 
-def mass_of(log: FlightLog, known: Known = NOTHING) -> float | None:
+def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
     """Return the mass that the thrust carries by the accelerometer, in flight [kg]; None where the
     log does not tell.
     """
-    told = thrust_of(log, known)
-    newtons = told is not None and (
-        known.thrust_map is not None or told[0] in ("command", "thrust_command")
+    thrust_signal = thrust_of(log, vehicle)
+    newtons = thrust_signal is not None and (
+        vehicle.thrust_map is not None or thrust_signal[0] in ("command", "thrust_command")
     )
     if not newtons or "acc_b" not in log or np.sum(log["acc_b"].valid) < 50:
         return None
-    _, time, thrust = told
+    _, time, thrust = thrust_signal
     acc = relations.on_grid(*log["acc_b"].samples(), time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
     if "attached" in log and np.any(
         carries := log["attached"].hold(time) > 0.5
     ):  # without its payload it is another mass
         flies &= carries
-    mass = (
-        float(np.mean(thrust[flies]) / np.mean(acc[flies]))
-        if np.any(flies) and np.mean(acc[flies]) > 0.0
-        else 0.0
-    )
+    if np.any(flies) and np.mean(acc[flies]) > 0.0:
+        mass = float(np.mean(thrust[flies]) / np.mean(acc[flies]))
+    else:
+        mass = 0.0
     return mass if mass > 0.0 else None
 
 
-def _force(log: FlightLog, known: Known) -> list[Row]:
+def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     """Hold the thrust against the force along body z, by the accelerometer and by the path:
     vibration spoils the one, a draught none.
     """
-    told = thrust_of(log, known)
-    if told is None or np.median(told[2]) <= 0.0:
+    thrust = thrust_of(log, vehicle)
+    if thrust is None or np.median(thrust[2]) <= 0.0:
         return []
-    name, time, asked = told
-    mass = mass_of(log, known)
-    rows = [_weight(mass, known, f"{name}, acc_b")] if mass is not None else []
-    found = [
+    name, time, command = thrust
+    mass = mass_of(log, vehicle)
+    rows = [_weight(mass, vehicle, f"{name}, acc_b")] if mass is not None else []
+    correlations = [
         (felt, *c)
         for felt in ("acc_b", "path")
-        if (c := _correlations(log, time, asked, felt)) is not None
+        if (c := _correlations(log, time, command, felt)) is not None
     ]
-    if not found:
+    if not correlations:
         return rows
-    felt, curve, against = max(found, key=lambda of: np.max(of[1]))
+    felt, curve, against = max(correlations, key=lambda correlation: np.max(correlation[1]))
     motors = (_DELAYS > -0.005) & (_DELAYS < _LATEST)
-    own, best = float(np.max(curve[motors])), float(np.max(curve))
+    peak = float(np.max(curve[motors]))
+    best = float(np.max(curve))
     delay = float(_DELAYS[np.argmax(np.where(motors, curve, -1.0))])
-    figures = {"correlation": own, "delay_s": delay, "nats_against": against, "felt_by": felt}
-    text, topic, verdict = (
-        f"the force follows the thrust {1e3 * delay:.0f} ms later, correlation {own:.2f}",
-        "delay",
-        "ok",
-    )
-    if best > max(_FOLLOWS, own + _CLEARER):
+    figures = {"correlation": peak, "delay_s": delay, "nats_against": against, "felt_by": felt}
+    text = f"the force follows the thrust {1e3 * delay:.0f} ms later, correlation {peak:.2f}"
+    topic = "delay"
+    verdict = "ok"
+    if best > max(_FOLLOWS, peak + _CLEARER):
         delay = float(_DELAYS[np.argmax(curve)])
         way = "late" if delay < _MOTORS else "early"
-        verdict, figures["delay_s"] = "bad", delay
+        verdict = "bad"
+        figures["delay_s"] = delay
         text = (
             f"the force follows the thrust by {1e3 * delay:+.0f} ms (correlation {best:.2f}, not"
-            f" {own:.2f}), motors by 0 to 120 ms: "
+            f" {peak:.2f}), motors by 0 to 120 ms: "
         )
         text += (
             f"the stream of the thrust is about {1e3 * abs(delay - _MOTORS):.0f} ms {way}; add"
             f" {delay - _MOTORS:+.2f} s to its time"
         )
-    elif own < _FOLLOWS:
-        topic, verdict = "frames", "bad" if against > _AGAINST else "warn"
+    elif peak < _FOLLOWS:
+        topic = "frames"
+        verdict = "bad" if against > _AGAINST else "warn"
         text = (
-            f"the force does not follow the thrust (best correlation {own:.2f}; none at all"
+            f"the force does not follow the thrust (best correlation {peak:.2f}; none at all"
             f" explains it {against:.0f} nats better): "
         )
         text += "thrust of another flight, another channel" + (
@@ -162,9 +164,11 @@ def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
     the path.
     """
     if felt == "acc_b":
-        time, force_b = (
-            log["acc_b"].samples() if "acc_b" in log else (np.empty(0), np.empty((0, 3)))
-        )
+        if "acc_b" in log:
+            time, force_b = log["acc_b"].samples()
+        else:
+            time = np.empty(0)
+            force_b = np.empty((0, 3))
         return time, force_b[:, 2:3]
     path = next((n for n in ("vel_w", "pos_w") if n in log), None)
     if path is None or "quat_wb" not in log:
@@ -177,7 +181,7 @@ def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _correlations(
-    log: FlightLog, time: np.ndarray, asked: np.ndarray, felt: str
+    log: FlightLog, time: np.ndarray, command: np.ndarray, felt: str
 ) -> tuple[np.ndarray, float] | None:
     """Correlation of force and thrust in flight at each delay, and the nats by which no thrust
     explains the force better.
@@ -187,28 +191,31 @@ def _correlations(
     force = _along_z(log, felt)
     if force is None or len(force[0]) < 50:
         return None
-    flies = time[asked[:, 0] > 0.6 * np.median(asked[asked > 0.2 * np.max(asked)])]
-    start, end = max(flies[0] + 0.5, force[0][0] + 0.3), min(flies[-1] - 0.5, force[0][-1] - 0.5)
+    flies = time[command[:, 0] > 0.6 * np.median(command[command > 0.2 * np.max(command)])]
+    start = max(flies[0] + 0.5, force[0][0] + 0.3)
+    end = min(flies[-1] - 0.5, force[0][-1] - 0.5)
     grid = np.arange(start, end, 0.01)
     if len(grid) < 200:
         return None
-    x = relations.mean_over(time, asked, grid, _SPAN)[:, 0]
+    x = relations.mean_over(time, command, grid, _SPAN)[:, 0]
     y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
-    x, varies = x / np.mean(x) - 1.0, y / np.mean(y, axis=1, keepdims=True) - 1.0
+    x = x / np.mean(x) - 1.0
+    varies = y / np.mean(y, axis=1, keepdims=True) - 1.0
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
         return None
     curve = varies @ x / (len(x) * np.std(x) * np.std(varies, axis=1))
-    at = int(np.argmax(np.where((_DELAYS > -0.005) & (_DELAYS < _LATEST), curve, -1.0)))
+    best = int(np.argmax(np.where((_DELAYS > -0.005) & (_DELAYS < _LATEST), curve, -1.0)))
     independent = float(np.ptp(grid)) / (2.0 * _SPAN)
-    return curve, float(0.5 * independent * np.log(np.var(varies[at] - x) / np.var(varies[at])))
+    return curve, float(0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best])))
 
 
-def _weight(mass: float, known: Known, both: str) -> Row:
+def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
     """Thrust over force against the mass that the model knows."""
-    if not known.mass:
-        return Row("thrust", both, "ok", f"thrust over force {mass:.4g} kg", {"mass_kg": mass})
-    off, ratio = float(np.log(mass / known.mass)), mass / known.mass
-    text = f"thrust over force {mass:.4g} kg, {ratio:.3g} times the model's {known.mass:.4g} kg"
+    if not vehicle.mass:
+        return Row("thrust", channels, "ok", f"thrust over force {mass:.4g} kg", {"mass_kg": mass})
+    off = float(np.log(mass / vehicle.mass))
+    ratio = mass / vehicle.mass
+    text = f"thrust over force {mass:.4g} kg, {ratio:.3g} times the model's {vehicle.mass:.4g} kg"
     if abs(off) > MASS_BAD:
         sizes = {f"in {unit}": size for unit, size in UNITS.items()} | {
             "the model's mass is in g": 1e3
@@ -220,13 +227,17 @@ def _weight(mass: float, known: Known, both: str) -> Row:
                 " another unit"
             )
         return Row(
-            "units", both, "bad", f"{text}: {words}", {"mass_kg": mass, "model_kg": known.mass}
+            "units",
+            channels,
+            "bad",
+            f"{text}: {words}",
+            {"mass_kg": mass, "model_kg": vehicle.mass},
         )
     verdict = "warn" if abs(off) > _MASS_WARN else "ok"
     text += (
         ": the thrust map is of another vehicle, battery or channel" if verdict == "warn" else ""
     )
-    return Row("thrust", both, verdict, text, {"mass_kg": mass, "model_kg": known.mass})
+    return Row("thrust", channels, verdict, text, {"mass_kg": mass, "model_kg": vehicle.mass})
 
 
 def _rotors(log: FlightLog) -> list[Row]:
@@ -242,17 +253,17 @@ def _rotors(log: FlightLog) -> list[Row]:
             IDLE_SPEED if name == "motor_speed" else IDLE_SHARE
         ):
             continue
-        each = np.median(values[flies], axis=0)
+        medians = np.median(values[flies], axis=0)
         for i, rotor in enumerate(NAMES):
-            others = float(np.median(np.delete(each, i)))
-            ratio = float(each[i] / others) if others > 0.0 else 1.0
+            typical = float(np.median(np.delete(medians, i)))
+            ratio = float(medians[i] / typical) if typical > 0.0 else 1.0
             if abs(np.log(max(ratio, 1e-3))) < _UNEVEN:
                 continue
             text = f"{rotor} reads {ratio:.2f} of the others in flight: "
             if ratio < 0.02:
                 text += "its sensor is dead, or the rotor stands"
             else:
-                near = next(
+                twin = next(
                     (
                         w
                         for f, w in ((0.5, "half"), (2.0, "twice"))
@@ -261,7 +272,7 @@ def _rotors(log: FlightLog) -> list[Row]:
                     "",
                 )
                 text += (
-                    f"{near + ': ' if near else ''}no trim explains it; a sensor (pole pairs, a"
+                    f"{twin + ': ' if twin else ''}no trim explains it; a sensor (pole pairs, a"
                     " lost wire), or the rotor"
                 )
             rows.append(Row("thrust", name, "bad", text, {"rotor": i, "ratio": ratio}))
@@ -273,7 +284,8 @@ def _turning(log: FlightLog) -> list[Row]:
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), None)
     if name is None or "rate_b" not in log or log[name].values.shape[1:] != (4,):
         return []
-    (time_m, motors), (time_w, rate) = log[name].samples(), log["rate_b"].samples()
+    (time_m, motors) = log[name].samples()
+    (time_w, rate) = log["rate_b"].samples()
     if not usable(time_w, rate, MOVES) or len(time_m) < 50:
         return []
     time_d, turning = relations.derivative(time_w, rate, 0.03)
@@ -288,24 +300,25 @@ def _turning(log: FlightLog) -> list[Row]:
         return []
     rows = []
     for axis, word in enumerate(("roll", "pitch")):
-        found = relations.relate(
+        relation = relations.relate(
             time_m, torque[:, axis : axis + 1], time_d, turning[:, axis : axis + 1], 0.2
         )
-        if found is None or found.axes_correlation < 0.2:
+        if relation is None or relation.axes_correlation < 0.2:
             continue
-        both, figures = (
-            f"{name}, rate_b",
-            {
-                "correlation": found.correlation,
-                "delay_s": found.delay,
-            },
+        channels = f"{name}, rate_b"
+        figures = {
+            "correlation": relation.correlation,
+            "delay_s": relation.delay,
+        }
+        wrong = (
+            relation.axes.startswith("-")
+            and relation.axes_correlation > relation.correlation + CLEARLY
         )
-        wrong = found.axes.startswith("-") and found.axes_correlation > found.correlation + CLEARLY
         text = (
-            f"{word} turns {'against' if wrong else 'with'} the motors, {1e3 * found.delay:.1f} ms"
-            " later"
+            f"{word} turns {'against' if wrong else 'with'} the motors,"
+            f" {1e3 * relation.delay:.1f} ms later"
         )
-        text += f", correlation {found.axes_correlation if wrong else found.correlation:.2f}"
+        text += f", correlation {relation.axes_correlation if wrong else relation.correlation:.2f}"
         text += ": order of the motors, or a sign" if wrong else ""
-        rows.append(Row("frames", both, "bad" if wrong else "ok", text, figures))
+        rows.append(Row("frames", channels, "bad" if wrong else "ok", text, figures))
     return rows

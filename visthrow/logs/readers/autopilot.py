@@ -50,12 +50,13 @@ def _t(
     good: str = "",
     only: tuple[Range, ...] = (),
     axes: str = NED,
-    **more,
+    **options,
 ) -> Tap:
     """A tap; of those to one channel the first that is there is used. ``good``: flags that are 1
     where a sample is valid, or quality, which is 0 or more.
     """
-    columns, turned = tuple(fields.split()), kind != "vector"
+    columns = tuple(fields.split())
+    turned = kind != "vector"
     order = "wxyz" if kind == "quaternion" else "xyzw"
     conditions = tuple(RANGES.get(flag, (flag, 1.0, math.inf)) for flag in good.split())
     entry = ChannelMap(
@@ -66,7 +67,7 @@ def _t(
         order,
         axes=axes if turned or len(columns) == 3 else "",
         body_axes=NED if turned else "",
-        **more,
+        **options,
     )
     return Tap(message, entry, conditions, only)
 
@@ -213,7 +214,8 @@ RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "z", "vxy", "vz")) + (
 )
 """Fields that count jumps of an estimate to another origin."""
 
-SWEEP, SWEEP_AXES = ("SIDS", "SIDD"), 7
+SWEEP = ("SIDS", "SIDD")
+SWEEP_AXES = 7
 """Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it
 sweeps rates of roll, pitch, yaw.
 """
@@ -232,26 +234,26 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
     Raises LogError: it cannot be read, or holds nothing of a vehicle's motion.
     """
     reader, taps = READERS[Path(path).suffix.lower()]
-    known = {tap.message for tap in taps}
-    asked = {message for states in FLYING.values() for message, *_ in states}
-    found = reader(path, known | asked | set(SWEEP))
-    vehicle = vehicle_of(found)
-    _join_escs(found)
+    tapped = {tap.message for tap in taps}
+    state_messages = {message for states in FLYING.values() for message, *_ in states}
+    log = reader(path, tapped | state_messages | set(SWEEP))
+    vehicle = vehicle_of(log)
+    _join_escs(log)
     channels: dict[str, Channel] = {}
     notes: dict[str, dict] = {}
-    left_out = list(found.meta.pop("left_out", []))
+    left_out = list(log.meta.pop("left_out", []))
     for tap in taps:
         if tap.entry.name not in channels:
-            made = _channel(tap, found, vehicle, str(path), left_out)
-            if made is not None:
-                channels[tap.entry.name], notes[tap.entry.name] = made
-    left_out += _of_other_kinds(found, taps)
-    _add_sweep(channels, notes, found)
+            signal = _channel(tap, log, vehicle, str(path), left_out)
+            if signal is not None:
+                channels[tap.entry.name], notes[tap.entry.name] = signal
+    left_out += _of_other_kinds(log, taps)
+    _add_sweep(channels, notes, log)
     if not channels:
         raise LogError(
-            f"{path}: no message of a vehicle's motion in it; known: {', '.join(sorted(known))}"
+            f"{path}: no message of a vehicle's motion in it; known: {', '.join(sorted(tapped))}"
         )
-    if (flying := _flying(found)) is not None:
+    if (flying := _flying(log)) is not None:
         channels["flying"] = flying
     starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
     if not starts or not math.isfinite(min(starts)):
@@ -260,19 +262,19 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
     channels = {
         name: replace(channel, time=channel.time - start) for name, channel in channels.items()
     }
-    meta = {"source": str(path), "start": start, "kind": found.kind, "ingest": notes, **found.meta}
+    meta = {"source": str(path), "start": start, "kind": log.kind, "ingest": notes, **log.meta}
     meta |= {"vehicle": vehicle.kind, "left_out": list(dict.fromkeys(left_out))}
     return FlightLog(channels, meta)
 
 
 def _channel(
-    tap: Tap, found: Messages, vehicle: Vehicle, source: str, left_out: list[str]
+    tap: Tap, log: Messages, vehicle: Vehicle, source: str, left_out: list[str]
 ) -> tuple[Channel, dict] | None:
     """Channel of a tap and notes on it; None where the log has none of its fields."""
     columns = tap.entry.columns
     if "{0}" in "".join(columns):
         if not vehicle.motors:
-            if found.first(tap.message) is not None:
+            if log.first(tap.message) is not None:
                 left_out.append(
                     f"{tap.message}: of a {vehicle.kind}, whose motors are not those of a"
                     " quadrotor X"
@@ -283,7 +285,7 @@ def _channel(
         columns = tuple(
             column.replace("+", "").format(*(n + first for n in numbers)) for column in columns
         )
-    chosen = _moving(found.instances(tap.message), columns, tap)
+    chosen = _moving(log.instances(tap.message), columns, tap)
     if chosen is None:
         return None
     number, fields = chosen
@@ -295,24 +297,24 @@ def _channel(
     entry = replace(tap.entry, columns=columns)
     with np.errstate(invalid="ignore"):  # damaged floats
         values = np.column_stack([fields[column] for column in columns]).astype(float)
-    bad = ~_within(fields, tap.good)
+    bad = ~_in_range(fields, tap.good)
     channel, notes = make_channel(np.asarray(fields["time"], float), values, entry, source, bad)
     notes |= {"clock": "autopilot", "message": tap.message, "instance": number}
     if np.any(bad):
-        notes["flagged"] = ", ".join(of[0] for of in tap.good if of[0] in fields)
+        notes["flagged"] = ", ".join(range_[0] for range_ in tap.good if range_[0] in fields)
     resets = [int(np.sum(np.diff(fields[name]) != 0)) for name in RESETS if name in fields]
     if sum(resets):
         notes["resets"] = sum(resets)
     return channel, notes
 
 
-def _within(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
+def _in_range(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
     """Whether each row has all of these fields, as far as it has them, in their range."""
     good = np.ones(len(fields["time"]), bool)
-    for name, least, largest in ranges:
+    for name, lowest, largest in ranges:
         if name in fields:
             value = np.asarray(fields[name], float)
-            good &= (value >= least) & (value <= largest)
+            good &= (value >= lowest) & (value <= largest)
     return good
 
 
@@ -320,28 +322,34 @@ def _moving(
     instances: dict[int, Fields], columns: tuple[str, ...], tap: Tap
 ) -> tuple[int, Fields] | None:
     """Return the first instance of a message with these columns that moves, else the first."""
-    found = []
+    candidates = []
     for number, fields in instances.items():
         if all(column in fields for column in columns):
-            rows = _within(fields, tap.only)
+            rows = _in_range(fields, tap.only)
             if np.any(rows):
-                found.append((number, {name: values[rows] for name, values in fields.items()}))
-    moving = [of for of in found if any(np.ptp(np.nan_to_num(of[1][c])) > 0.0 for c in columns)]
-    return next(iter([*moving, *found]), None)
+                candidates.append((number, {name: values[rows] for name, values in fields.items()}))
+    moving = [
+        instance
+        for instance in candidates
+        if any(np.ptp(np.nan_to_num(instance[1][c])) > 0.0 for c in columns)
+    ]
+    return next(iter([*moving, *candidates]), None)
 
 
-def _of_other_kinds(found: Messages, taps: tuple[Tap, ...]) -> list[str]:
+def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> list[str]:
     """Messages of which every row is of a kind that no tap takes."""
-    said = []
+    notes = []
     for message in dict.fromkeys(tap.message for tap in taps if tap.only):
         ranges = {tap.only[0] for tap in taps if tap.message == message}
-        fields = found.first(message)
-        if fields is not None and not any(np.any(_within(fields, (of,))) for of in ranges):
+        fields = log.first(message)
+        if fields is not None and not any(
+            np.any(_in_range(fields, (range_,))) for range_ in ranges
+        ):
             name = next(iter(ranges))[0]
-            came = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
-            known = ", ".join(f"{least:g}" for _, least, _ in sorted(ranges))
-            said.append(f"{message}: its {name} is {came}; those that are read: {known}")
-    return said
+            received = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
+            accepted = ", ".join(f"{lowest:g}" for _, lowest, _ in sorted(ranges))
+            notes.append(f"{message}: its {name} is {received}; those that are read: {accepted}")
+    return notes
 
 
 def _moving_motors(fields: Fields, pattern: str) -> int:
@@ -352,50 +360,52 @@ def _moving_motors(fields: Fields, pattern: str) -> int:
     return sum(np.ptp(np.nan_to_num(fields[name])) > 0.0 for name in names if name in fields)
 
 
-def _join_escs(found: Messages) -> None:
+def _join_escs(log: Messages) -> None:
     """Speeds of ArduPilot's ESC messages, one an instance, on the stamps of the first, in place."""
-    escs = {i: of for i, of in found.instances("ESC").items() if "RPM" in of}
+    escs = {i: instance for i, instance in log.instances("ESC").items() if "RPM" in instance}
     if not escs:
         return
     time = next(iter(escs.values()))["time"]
-    speeds = {f"RPM[{i}]": np.interp(time, of["time"], of["RPM"]) for i, of in escs.items()}
-    found.fields["ESC", min(escs)] = {"time": time, **speeds}
+    speeds = {
+        f"RPM[{i}]": np.interp(time, instance["time"], instance["RPM"])
+        for i, instance in escs.items()
+    }
+    log.fields["ESC", min(escs)] = {"time": time, **speeds}
 
 
-def _flying(found: Messages) -> Channel | None:
+def _flying(log: Messages) -> Channel | None:
     """Whether the vehicle is armed and in the air; None where the log does not say."""
     signals = []
-    for message, field, least, largest in FLYING[found.kind]:
-        fields = found.first(message)
+    for message, field, lowest, largest in FLYING[log.kind]:
+        fields = log.first(message)
         if fields is not None and field in fields:
             order = np.argsort(fields["time"], kind="stable")
             signals.append(
-                (fields["time"][order], _within(fields, ((field, least, largest),))[order])
+                (fields["time"][order], _in_range(fields, ((field, lowest, largest),))[order])
             )
     if not signals:
         return None
     time = np.unique(np.concatenate([time for time, _ in signals]))
     flying = np.ones(len(time), bool)
-    for at, good in signals:
-        flying &= good[np.maximum(np.searchsorted(at, time, side="right") - 1, 0)]
+    for times, good in signals:
+        flying &= good[np.maximum(np.searchsorted(times, time, side="right") - 1, 0)]
     return Channel(time, flying, "bool", "none")
 
 
-def _add_sweep(channels: dict, notes: dict, found: Messages) -> None:
+def _add_sweep(channels: dict, notes: dict, log: Messages) -> None:
     """Add a sweep of ArduPilot's SYSTEMID to the commanded rate of its axis, which the log tells
     without it.
     """
-    started, sweep, rates = (
-        found.first(SWEEP[0]),
-        found.first(SWEEP[1]),
-        channels.get("rate_setpoint_b"),
-    )
+    started = log.first(SWEEP[0])
+    sweep = log.first(SWEEP[1])
+    rates = channels.get("rate_setpoint_b")
     if started is None or sweep is None or rates is None:
         return
     axis = int(np.asarray(started["Ax"])[-1]) - SWEEP_AXES
     if not 0 <= axis < 3:
         return
-    time, size = np.asarray(sweep["time"], float), np.radians(np.asarray(sweep["Targ"], float))
+    time = np.asarray(sweep["time"], float)
+    size = np.radians(np.asarray(sweep["Targ"], float))
     added = np.interp(rates.time, time, size, left=0.0, right=0.0) * (1.0 if axis == 0 else -1.0)
     values = rates.values.copy()
     values[:, axis] += added

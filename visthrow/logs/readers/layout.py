@@ -81,7 +81,8 @@ def layout_of(text: str, name: str = "") -> Layout:
     blank = mark == " "
     counted_lines = counted(io.StringIO(text, newline=""), len(text), name)
     reader = csv.reader(counted_lines, delimiter=mark, skipinitialspace=blank)
-    rows, empty_before = [], []
+    rows = []
+    empty_before = []
     last = 0
     for cells in reader:
         cells = [cell.strip() for cell in cells]
@@ -96,12 +97,13 @@ def layout_of(text: str, name: str = "") -> Layout:
         return Layout(rows[0][1] if rows else [], [], False)
     width = widths.most_common(1)[0][0]
     good = [_holds_numbers(cells) for _, cells in rows]
-    fits = [len(cells) == width and of for (_, cells), of in zip(rows, good)]
+    fits = [len(cells) == width and valid for (_, cells), valid in zip(rows, good)]
     # identifiers above the numbers are numbers too: three lines of them, or all that there are
     start = next(
         (i for i in range(len(rows)) if fits[i] and all(good[i : i + 3])), fits.index(True)
     )
-    head, body = rows[:start], rows[start:]
+    head = rows[:start]
+    body = rows[start:]
     cut = max((i + 1 for i in range(len(head)) if empty_before[i + 1]), default=0)
     if cut == len(head):
         cut = 0  # the empty line stands between the names and the numbers
@@ -120,7 +122,7 @@ def layout_of(text: str, name: str = "") -> Layout:
 def _separator(lines: list[str]) -> str:
     """The mark that cuts most lines into the same number of cells, most of them numbers."""
     sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
-    best, found = 0.0, ","
+    best, separator = 0.0, ","
     for mark in MARKS:
         cells = [next(csv.reader([line.strip()], delimiter=mark)) for line in sample]
         if mark == " ":
@@ -132,8 +134,9 @@ def _separator(lines: list[str]) -> str:
         numbers = sum(map(is_number, whole)) / max(len(whole), 1)
         score = numbers * count / len(cells) + 1e-3 * (mark == ";")
         if score > best + 1e-6:
-            best, found = score, mark
-    return found
+            best = score
+            separator = mark
+    return separator
 
 
 def _holds_numbers(cells: list[str]) -> bool:
@@ -162,7 +165,9 @@ def _sorted_head(
     head: list[tuple[int, list[str]]], cut: int, width: int
 ) -> tuple[list[list[str]], dict[str, str], float]:
     """Lines above the numbers: those that name columns, the settings, and the rate."""
-    named, settings, rate = [], {}, 0.0
+    named = []
+    settings = {}
+    rate = 0.0
     for i, (_, cells) in enumerate(head):
         if cells[0].startswith(("#", "%")):
             cells = [cells[0].lstrip("#% "), *cells[1:]]
@@ -208,16 +213,16 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
     final = next(
         (r for r in reversed(named) if not all(unit_of(c) is not None for c in r if c)), named[-1]
     )
-    for i, of in enumerate(parts):
+    for i, part in enumerate(parts):
         own = final[i]
-        name = own if _FRAME.fullmatch(own) or i == 0 else ".".join(of)
+        name = own if _FRAME.fullmatch(own) or i == 0 else ".".join(part)
         names.append(
             _joined(name.replace(":", ".") if len(named) > 1 else name, own, units[i], settings)
         )
     return _prefixed(names) if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings else names
 
 
-def _joined(name: str, own: str, unit: str, settings: dict[str, str]) -> str:
+def _joined(name: str, last: str, unit: str, settings: dict[str, str]) -> str:
     """A name with its unit; a subject that bears the name of its body is named once."""
     parts = name.split(".")
     name = ".".join(p for i, p in enumerate(parts) if i == 0 or p != parts[i - 1])
@@ -234,22 +239,23 @@ def _joined(name: str, own: str, unit: str, settings: dict[str, str]) -> str:
 
 def _prefixed(names: list[str]) -> list[str]:
     """Qualisys' columns: the body's name stands before its first, and its lengths are in mm."""
-    found, body = [], ""
+    joined = []
+    body = ""
     for name in names:
         head, _, tail = name.rpartition(" ")
         if head and tail in ("X", "Y", "Z"):
-            body, name = head, tail
+            body = head
+            name = tail
         if body and not _FRAME.fullmatch(name):
-            unit = (
-                "mm"
-                if name in ("X", "Y", "Z")
-                else "deg"
-                if name in ("Roll", "Pitch", "Yaw")
-                else ""
-            )
+            if name in ("X", "Y", "Z"):
+                unit = "mm"
+            elif name in ("Roll", "Pitch", "Yaw"):
+                unit = "deg"
+            else:
+                unit = ""
             name = f"{body}.{name}" + (f" [{unit}]" if unit else "")
-        found.append(name)
-    return found
+        joined.append(name)
+    return joined
 
 
 def _marker_names(width: int, settings: dict[str, str]) -> list[str]:

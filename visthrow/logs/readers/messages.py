@@ -59,9 +59,7 @@ class Messages:
     def instances(self, name: str) -> dict[int, Fields]:
         """Return the message of each instance, the lowest first."""
         return {
-            number: self.fields[known, number]
-            for known, number in sorted(self.fields)
-            if known == name
+            number: self.fields[key, number] for key, number in sorted(self.fields) if key == name
         }
 
     @property
@@ -70,43 +68,49 @@ class Messages:
         return sorted({name for name, _ in self.fields})
 
 
-def read_ulog(path: str | Path, wanted: Collection[str]) -> Messages:
+def read_ulog(path: str | Path, names: Collection[str]) -> Messages:
     """Read topics of PX4's ``.ulg``; the time is ``timestamp_sample`` where it is known.
 
     Raises LogError: pyulog is not installed, or the file is no ULog.
     """
     ulog = load_extra("pyulog", "logs", f"{path}: a PX4 log", LogError)
     with _parsing(path, "a PX4 log (.ulg)"):
-        log = ulog.ULog(Forward(Path(path).read_bytes()), list(wanted))
-    found = Messages(Path(path), "ulog")
+        log = ulog.ULog(Forward(Path(path).read_bytes()), list(names))
+    messages = Messages(Path(path), "ulog")
     for data in log.data_list:
         if "timestamp" in data.data:
             arrival = data.data["timestamp"] * 1e-6
             sample = data.data.get("timestamp_sample")
             time = arrival if sample is None else np.where(sample > 0, sample * 1e-6, arrival)
-            found.fields[data.name, data.multi_id] = {**data.data, "time": time, "arrival": arrival}
+            messages.fields[data.name, data.multi_id] = {
+                **data.data,
+                "time": time,
+                "arrival": arrival,
+            }
     drops = [(drop.timestamp * 1e-6, drop.duration * 1e-3) for drop in log.dropouts]
-    found.meta = {"dropouts": drops, "damaged": bool(log.file_corruption)}
-    found.parameters = {str(name): float(x) for name, x in log.initial_parameters.items()}
-    return found
+    messages.meta = {"dropouts": drops, "damaged": bool(log.file_corruption)}
+    messages.parameters = {str(name): float(x) for name, x in log.initial_parameters.items()}
+    return messages
 
 
-def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
+def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:
     """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement.
 
     Raises LogError: the file is no DataFlash log.
     """
     from pymavlink.DFReader import DFReader_binary
 
-    columns, firmware, nan = _Columns(), "", math.nan
+    columns = _Columns()
+    firmware = ""
+    nan = math.nan
     with _parsing(path, "an ArduPilot dataflash log (.BIN)") as complaints:
         with Path(path).open("rb") as file:
             head = file.read(2)
         if head != _HEAD:
             raise LogError(f"it begins with {head.hex(' ') or 'nothing'}, not a3 95")
         log = DFReader_binary(str(path))
-        known = {fmt.name for fmt in log.formats.values()} & {*wanted, "MSG"}
-        while known and (message := _next(log, list(known), columns)) is not None:
+        available = {fmt.name for fmt in log.formats.values()} & {*names, "MSG"}
+        while available and (message := _next_message(log, list(available), columns)) is not None:
             row = message.to_dict()
             instance = next((row[name] for name in _INSTANCE if isinstance(row.get(name), int)), 0)
             text = str(row.get("Message", ""))
@@ -124,17 +128,17 @@ def read_dataflash(path: str | Path, wanted: Collection[str]) -> Messages:
     return Messages(Path(path), "dataflash", columns.arrays(), meta, parameters)
 
 
-def _next(log: Any, wanted: list[str], columns: "_Columns") -> Any:
+def _next_message(log: Any, names: list[str], columns: "_Columns") -> Any:
     """Return the next message; None at the end, and where the reader fails after it gave some."""
     try:
-        return log.recv_match(type=wanted)
+        return log.recv_match(type=names)
     except Exception:  # pymavlink raises whatever struct, mmap and itself raise
         if not columns.rows:
             raise
         return None
 
 
-def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
+def read_telemetry(path: str | Path, names: Collection[str]) -> Messages:
     """Read messages of a ``.tlog``, of the first sender of each, on one clock.
 
     The time is the sender's stamp. Senders count from their boot or from 1970, and some messages
@@ -143,16 +147,18 @@ def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
 
     Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
-    columns, sender, used = _Columns(), {}, 0
-    others: Counter[str] = Counter()
+    columns = _Columns()
+    sender = {}
+    used = 0
+    unread: Counter[str] = Counter()
     for arrival, message in telemetry(path):
         name = message.get_type()
         used += 8 + len(message.get_msgbuf())
-        if name not in wanted:
+        if name not in names:
             continue
         whose = (message.get_srcSystem(), message.get_srcComponent())
         if sender.setdefault(name, whose) != whose:
-            others[f"{name} of system {whose[0]}, component {whose[1]}"] += 1
+            unread[f"{name} of system {whose[0]}, component {whose[1]}"] += 1
             continue
         row = message.to_dict()
         boot = row.get("time_boot_ms")
@@ -162,7 +168,7 @@ def read_telemetry(path: str | Path, wanted: Collection[str]) -> Messages:
     fields = columns.arrays()
     _share_clock(fields)
     meta = {"damaged": used < Path(path).stat().st_size}
-    meta["left_out"] = [f"{count} {what}: of another sender" for what, count in others.items()]
+    meta["left_out"] = [f"{count} {what}: of another sender" for what, count in unread.items()]
     return Messages(Path(path), "telemetry", fields, meta)
 
 
@@ -172,17 +178,19 @@ OTHER_CLOCK = 1.0
 
 def _share_clock(fields: dict[tuple[str, int], Fields]) -> None:
     """Move stamps of messages onto one clock, in place: that of those that count from boot."""
-    delays = {key: float(np.min(of["arrival"] - of["time"])) for key, of in fields.items()}
-    booted = [delays[key] for key, of in fields.items() if "time_boot_ms" in of]
+    delays = {
+        key: float(np.min(series["arrival"] - series["time"])) for key, series in fields.items()
+    }
+    booted = [delays[key] for key, series in fields.items() if "time_boot_ms" in series]
     stamped = [
         delay
         for key, delay in delays.items()
         if np.any(fields[key]["arrival"] != fields[key]["time"])
     ]
     reference = float(np.median(booted or stamped or [0.0]))
-    for key, of in fields.items():
+    for key, series in fields.items():
         if abs(delays[key] - reference) > OTHER_CLOCK:
-            of["time"] = of["time"] + delays[key] - reference
+            series["time"] = series["time"] + delays[key] - reference
 
 
 def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
@@ -196,35 +204,42 @@ def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
         data = Path(path).read_bytes()
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}; expected a .tlog") from error
-    decoder, at, count = mav.MAVLink(None), 0, 0
-    while at + 8 < len(data):
-        length = _mavlink_length(data, at + 8)
+    decoder = mav.MAVLink(None)
+    position = 0
+    count = 0
+    while position + 8 < len(data):
+        length = _mavlink_length(data, position + 8)
         try:
-            message = decoder.decode(bytearray(data[at + 8 : at + 8 + length])) if length else None
+            message = (
+                decoder.decode(bytearray(data[position + 8 : position + 8 + length]))
+                if length
+                else None
+            )
         except Exception:  # of a damaged message, pymavlink raises whatever it stumbles over
             message = None
         if (
             message is None or message.get_msgId() < 0
         ):  # an unknown one, whose checksum is not known either
-            at += 1  # look for the next message
+            position += 1  # look for the next message
             continue
-        yield struct.unpack_from(">Q", data, at)[0] * 1e-6, message
-        at, count = at + 8 + length, count + 1
+        yield struct.unpack_from(">Q", data, position)[0] * 1e-6, message
+        position = position + 8 + length
+        count = count + 1
     if not count:
         raise LogError(
             f"{path}: {len(data)} bytes without a single MAVLink message; expected a .tlog"
         )
 
 
-def _mavlink_length(data: bytes, at: int) -> int:
+def _mavlink_length(data: bytes, position: int) -> int:
     """Return the length of the message that begins at a place; 0 where none does, or it is cut
     short.
     """
-    head = data[at : at + 3]
+    head = data[position : position + 3]
     if len(head) < 3 or head[0] not in (0xFE, 0xFD):
         return 0
     length = head[1] + 8 if head[0] == 0xFE else head[1] + 12 + 13 * (head[2] & 1)
-    return length if at + length <= len(data) else 0
+    return length if position + length <= len(data) else 0
 
 
 class _Columns:
@@ -289,20 +304,20 @@ def _parsing(path: str | Path, what: str) -> Iterator[list[str]]:
 
     Some of them print a line a damaged byte, and past Python. Raises LogError: instead of any other
     exception."""
-    said: list[str] = []
+    output: list[str] = []
     heard = io.StringIO()
     try:
         with tempfile.TemporaryFile() as file:
-            kept = os.dup(_STDERR)
+            saved = os.dup(_STDERR)
             os.dup2(file.fileno(), _STDERR)
             try:
                 with redirect_stdout(heard), redirect_stderr(heard):
-                    yield said
+                    yield output
             finally:
-                os.dup2(kept, _STDERR)
-                os.close(kept)
+                os.dup2(saved, _STDERR)
+                os.close(saved)
                 file.seek(0)
-                said += [
+                output += [
                     *heard.getvalue().splitlines(),
                     *file.read().decode(errors="replace").splitlines(),
                 ]

@@ -41,7 +41,8 @@ def read_recording(path: Path) -> Table:
     """
     reader, what = READERS.get(path.suffix.lower(), (_card, "a recording"))
     if path.is_dir():
-        reader, what = _bag, "a folder of a ROS 2 bag"
+        reader = _bag
+        what = "a folder of a ROS 2 bag"
     try:
         table = reader(path)
     except LogError:
@@ -82,14 +83,17 @@ def _card(path: Path) -> Table:
             f"{path}: version {version} of a Crazyflie's card; versions 1 and 2 are known"
         )
     stamp, unit = ("<HI", 1e-3) if version == 1 else ("<HQ", 1e-6)
-    at, events = 5, {}
+    position = 5
+    events = {}
     for _ in range(kinds):
-        number, at = struct.unpack_from("<H", data, at)[0], at + 2
-        name, at = _word(data, at)
-        count, at = struct.unpack_from("<H", data, at)[0], at + 2
+        number = struct.unpack_from("<H", data, position)[0]
+        position = position + 2
+        name, position = _word(data, position)
+        count = struct.unpack_from("<H", data, position)[0]
+        position = position + 2
         fields = []
         for _ in range(count):
-            field, at = _word(data, at)
+            field, position = _word(data, position)
             fields.append((field[:-3], field[-2]))
         if not all(kind in _CARD_TYPES for _, kind in fields):
             raise LogError(
@@ -102,14 +106,16 @@ def _card(path: Path) -> Table:
             "<" + "".join(kind for _, kind in fields),
             [],
         )
-    while at + struct.calcsize(stamp) <= len(data) - 4:
-        number, time = struct.unpack_from(stamp, data, at)
+    while position + struct.calcsize(stamp) <= len(data) - 4:
+        number, time = struct.unpack_from(stamp, data, position)
         if number not in events:
-            raise LogError(f"{path}: event {number} near byte {at} was not announced; damaged")
+            raise LogError(
+                f"{path}: event {number} near byte {position} was not announced; damaged"
+            )
         _, _, form, rows = events[number]
-        at += struct.calcsize(stamp)
-        rows.append((time * unit, *struct.unpack_from(form, data, at)))
-        at += struct.calcsize(form)
+        position += struct.calcsize(stamp)
+        rows.append((time * unit, *struct.unpack_from(form, data, position)))
+        position += struct.calcsize(form)
     start = min((rows[0][0] for *_, rows in events.values() if rows), default=0.0)
     table: Table = {}
     for name, fields, _, rows in events.values():
@@ -120,9 +126,9 @@ def _card(path: Path) -> Table:
     return table
 
 
-def _word(data: bytes, at: int) -> tuple[str, int]:
-    end = data.index(b"\x00", at)
-    return data[at:end].decode(), end + 1
+def _word(data: bytes, position: int) -> tuple[str, int]:
+    end = data.index(b"\x00", position)
+    return data[position:end].decode(), end + 1
 
 
 def _matlab(path: Path) -> Table:
@@ -137,16 +143,16 @@ def _matlab(path: Path) -> Table:
 
 def _hdf5(path: Path) -> Table:
     h5py = load_extra("h5py", "recordings", f"{path}: an HDF5 file", LogError)
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
 
     def note(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
-            found[name] = item
+            arrays[name] = item
 
     with h5py.File(path) as file:
         file.visititems(note)
-        require_room(path, sum(item.nbytes for item in found.values()), LogError)
-        return _flat({name: item[()] for name, item in found.items()})
+        require_room(path, sum(item.nbytes for item in arrays.values()), LogError)
+        return _flat({name: item[()] for name, item in arrays.items()})
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
@@ -206,7 +212,8 @@ def _mcap(path: Path) -> Table:
     summary = reader.get_summary()
     chunks = summary.chunk_indexes if summary is not None else []
     require_room(path, sum(chunk.uncompressed_size for chunk in chunks), LogError)
-    topics, encodings = Topics(), set()
+    topics = Topics()
+    encodings = set()
     for _, channel, message in reader.iter_messages():
         encodings.add(channel.message_encoding)
         if channel.message_encoding not in ("cdr", "ros1"):
@@ -253,17 +260,19 @@ class Topics:
             self._left_out[topic] = f"{label}: cannot be decoded: {error!r}"[:200]
             return
         heads = ("header.stamp", "stamp", "timestamp")
-        stamp = next((at for head in heads if (at := _stamp(row, head))), 0.0)
+        stamp = next((stamp_ for head in heads if (stamp_ := _stamp(row, head))), 0.0)
         row = {"time": stamp or arrival, "arrival": arrival} | row
         self._rows.setdefault(topic, []).append(row)
 
     def table(self) -> Columns:
         """Columns of all topics; a field that is missing in some messages is blank there."""
-        start = min((row["time"] for of in self._rows.values() for row in of), default=0.0)
+        start = min(
+            (row["time"] for messages in self._rows.values() for row in messages), default=0.0
+        )
         table = Columns()
-        for topic, of in self._rows.items():
-            for name in dict.fromkeys(name for row in of for name in row):
-                values = np.array([row.get(name, np.nan) for row in of])
+        for topic, messages in self._rows.items():
+            for name in dict.fromkeys(name for row in messages for name in row):
+                values = np.array([row.get(name, np.nan) for row in messages])
                 clock = name in ("time", "arrival")
                 table[f"{topic}:{name}"] = values - start if clock else values
         table.left_out = list(self._left_out.values())
@@ -274,10 +283,8 @@ class Topics:
 
 def _stamp(row: dict[str, float], head: str) -> float:
     """Seconds of a ROS stamp; 0 where the message has none."""
-    whole, part = (
-        row.get(f"{head}.sec", row.get(f"{head}.secs", 0.0)),
-        row.get(f"{head}.nanosec", row.get(f"{head}.nsecs", 0.0)),
-    )
+    whole = row.get(f"{head}.sec", row.get(f"{head}.secs", 0.0))
+    part = row.get(f"{head}.nanosec", row.get(f"{head}.nsecs", 0.0))
     return whole + 1e-9 * part
 
 
@@ -286,11 +293,11 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
     if isinstance(value, (bool, int, float, np.integer, np.floating)):
         yield name, float(value)
     elif isinstance(value, dict):
-        for key, of in value.items():
-            yield from _numbers(of, f"{name}.{key}" if name else key)
+        for key, item in value.items():
+            yield from _numbers(item, f"{name}.{key}" if name else key)
     elif isinstance(value, (list, tuple, np.ndarray)) and len(value) <= WIDEST:
-        for i, of in enumerate(value):
-            yield from _numbers(of, f"{name}[{i}]")
+        for i, item in enumerate(value):
+            yield from _numbers(item, f"{name}[{i}]")
     elif hasattr(value, "__dataclass_fields__"):
         for key in value.__dataclass_fields__:
             if not key.startswith("__"):
@@ -310,7 +317,9 @@ def _c3d(path: Path) -> Table:
     if not frames or not labels:
         raise LogError(f"{path}: a C3D file without markers")
     numbers = np.array([number for number, _ in frames], dtype=float)
-    points = np.array([of for _, of in frames])  # x, y, z, residual: below 0 where it is hidden
+    points = np.array(
+        [frame for _, frame in frames]
+    )  # x, y, z, residual: below 0 where it is hidden
     hidden = points[:, :, 3] < 0.0
     table = Columns({"time [s]": (numbers - numbers[0]) / reader.point_rate})
     for i, label in enumerate(labels):

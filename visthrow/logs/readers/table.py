@@ -78,7 +78,8 @@ def read_table(path: str | Path) -> Columns:
         raise LogError(
             f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
         ) from error
-    header, body = layout.names, layout.rows
+    header = layout.names
+    body = layout.rows
     if len(header) < 2:
         raise LogError(f"{path}: no header line with the columns' names; expected a CSV table")
     if body and len(body[-1][1]) < len(header):  # cut short while it was written
@@ -152,11 +153,10 @@ def _parquet(path: Path) -> Table:
     columns = {}
     for name in table.column_names:
         values = table[name].to_numpy(zero_copy_only=False)
-        columns[name] = (
-            values.astype(np.float64)
-            if values.dtype.kind in "bifu"
-            else _column(tuple(map(_text, values)))
-        )
+        if values.dtype.kind in "bifu":
+            columns[name] = values.astype(np.float64)
+        else:
+            columns[name] = _column(tuple(map(_text, values)))
     if not columns or not table.num_rows:
         raise LogError(f"{path}: a parquet table without rows")
     return columns
@@ -290,7 +290,8 @@ def make_channel(
     rows, notes = _stamped(time)
     blank = np.all(np.isnan(values[rows]), axis=1)  # such a row is of another channel
     notes["blank"] = int(np.sum(blank))
-    time, values = time[rows[~blank]], values[rows[~blank]]
+    time = time[rows[~blank]]
+    values = values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
     valid &= ~lost_rows(time, values)
     if bad is not None:
@@ -299,7 +300,9 @@ def make_channel(
     if entry.held and len(values):
         fresh = _changed(values)
         notes["held"] = int(np.sum(~fresh))
-        time, values, valid = time[fresh], values[fresh], valid[fresh]
+        time = time[fresh]
+        values = values[fresh]
+        valid = valid[fresh]
     values = _converted(np.where(valid[:, None], values, 0.0), entry, factor)
     if entry.kind != "vector":
         unit = "1"
@@ -360,8 +363,8 @@ def lost_rows(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     ends = np.flatnonzero(zero & ~np.append(zero[1:], False))
     lost = np.zeros(len(values), bool)
     for start, end in zip(starts, ends):
-        beside = [i for i in (start - 1, end + 1) if 0 <= i < len(size)]
-        lost[start : end + 1] = all(size[i] > 10.0 * usual for i in beside)
+        neighbours = [i for i in (start - 1, end + 1) if 0 <= i < len(size)]
+        lost[start : end + 1] = all(size[i] > 10.0 * usual for i in neighbours)
     return lost
 
 
@@ -408,17 +411,19 @@ def log_of_export(table: Table, path: Path) -> FlightLog:
 
     Raises LogError: columns of one channel do not fit together.
     """
-    time, found, channels = _numbers(table, "time [s]", str(path)), {}, {}
+    time = _numbers(table, "time [s]", str(path))
+    read = {}
+    channels = {}
     for column in table:
         match = _EXPORTED.fullmatch(column)
         if column != "time [s]":
             index = tuple(map(int, match["index"].split(","))) if match["index"] else ()
             place = match["unit"], match["frame"] or "none"
-            found.setdefault(match["name"], (place, {}))[1][index] = _numbers(
+            read.setdefault(match["name"], (place, {}))[1][index] = _numbers(
                 table, column, str(path)
             )
     try:
-        for name, (place, cells) in found.items():
+        for name, (place, cells) in read.items():
             spec = STANDARD_CHANNELS.get(name)
             unit, frame = (
                 place if spec is None else (spec.unit, spec.frame)
@@ -431,10 +436,10 @@ def log_of_export(table: Table, path: Path) -> FlightLog:
             values = np.full((len(time), *shape), np.nan)
             for index, column in cells.items():
                 values[(slice(None), *index)] = column
-            there = np.all(
+            present = np.all(
                 np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1
             )  # not where it is NaN
-            channels[name] = Channel(time[there], values[there], unit, frame)
+            channels[name] = Channel(time[present], values[present], unit, frame)
         return FlightLog(channels, {"source": str(path), **_metadata(path)})
     except LogError as error:
         raise LogError(f"{path}: {error}") from error

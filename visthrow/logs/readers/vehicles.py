@@ -69,63 +69,63 @@ class Vehicle:
         return self.kind in ("", *ROTORS.values())
 
 
-def vehicle_of(found: Messages) -> Vehicle:
+def vehicle_of(log: Messages) -> Vehicle:
     """Say which vehicle a log is of."""
-    reader = {"ulog": _of_px4, "dataflash": _of_ardupilot}.get(found.kind, _of_heartbeat)
-    return reader(found)
+    reader = {"ulog": _of_px4, "dataflash": _of_ardupilot}.get(log.kind, _of_heartbeat)
+    return reader(log)
 
 
-def _of_px4(found: Messages) -> Vehicle:
-    known = found.parameters
-    status = found.first("vehicle_status") or {}
+def _of_px4(log: Messages) -> Vehicle:
+    parameters = log.parameters
+    status = log.first("vehicle_status") or {}
     if "is_vtol" in status and max(status["is_vtol"], default=0) > 0:
         return Vehicle("VTOL", (), ())
-    kind = PX4_AIRFRAMES.get(int(known.get("CA_AIRFRAME", 0)), "")
-    kind = kind or MAV_TYPES.get(int(known.get("MAV_TYPE", 0)), "")
-    count = int(known.get("CA_ROTOR_COUNT", 0))
+    kind = PX4_AIRFRAMES.get(int(parameters.get("CA_AIRFRAME", 0)), "")
+    kind = kind or MAV_TYPES.get(int(parameters.get("MAV_TYPE", 0)), "")
+    count = int(parameters.get("CA_ROTOR_COUNT", 0))
     if count and kind in ("", QUADROTOR):
         kind = ROTORS.get(count, f"vehicle of {count} rotors")
-    number = int(known.get("SYS_AUTOSTART", 0))
+    number = int(parameters.get("SYS_AUTOSTART", 0))
     for first, last, name in PX4_AUTOSTART:
         kind = kind or (name if first <= number < last else "")
     if kind not in ("", QUADROTOR):
         return Vehicle(kind, (), ())
-    motors = _by_place(known) if kind and "CA_ROTOR0_PX" in known else X
+    motors = _by_place(parameters) if kind and "CA_ROTOR0_PX" in parameters else X
     if (kind and not motors) or 5000 <= number < 6000:
         return Vehicle(f"{QUADROTOR} that is no X", (), ())
     return Vehicle(kind, motors, motors)
 
 
-def _by_place(known: Mapping[str, float]) -> tuple[int, ...]:
+def _by_place(parameters: Mapping[str, float]) -> tuple[int, ...]:
     """Motors by where they sit; () where each quarter has not one."""
     corners: dict[tuple[bool, bool], int] = {}
     for i in range(4):
-        ahead, right = (known.get(f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XY")
-        if abs(ahead) > 0.2 * abs(right) and abs(right) > 0.2 * abs(ahead):
-            corners[ahead > 0.0, right > 0.0] = i
+        forward, right = (parameters.get(f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XY")
+        if abs(forward) > 0.2 * abs(right) and abs(right) > 0.2 * abs(forward):
+            corners[forward > 0.0, right > 0.0] = i
     places = [(True, False), (True, True), (False, False), (False, True)]
     return tuple(corners[place] for place in places) if len(corners) == 4 else ()
 
 
-def _of_ardupilot(found: Messages) -> Vehicle:
-    known = found.parameters
-    words = str(found.meta.get("firmware", "")).split()
+def _of_ardupilot(log: Messages) -> Vehicle:
+    parameters = log.parameters
+    words = str(log.meta.get("firmware", "")).split()
     kind = ARDUPILOT_VEHICLES.get(words[0] if words else "", "")
-    if kind == "plane" and known.get("Q_ENABLE", 0.0) > 0.0:
+    if kind == "plane" and parameters.get("Q_ENABLE", 0.0) > 0.0:
         kind = "VTOL"
-    kind = kind or ARDUPILOT_CLASSES.get(int(known.get("FRAME_CLASS", 0)), "")
+    kind = kind or ARDUPILOT_CLASSES.get(int(parameters.get("FRAME_CLASS", 0)), "")
     if kind not in ("", QUADROTOR):
         return Vehicle(kind, (), ())
-    motors = ARDUPILOT_X.get(int(known.get("FRAME_TYPE", 1)), ())
+    motors = ARDUPILOT_X.get(int(parameters.get("FRAME_TYPE", 1)), ())
     if not motors:
         return Vehicle(f"{QUADROTOR} that is no X", (), ())
-    functions = {int(known.get(f"SERVO{n}_FUNCTION", 0)): n - 1 for n in range(32, 0, -1)}
+    functions = {int(parameters.get(f"SERVO{n}_FUNCTION", 0)): n - 1 for n in range(32, 0, -1)}
     outputs = tuple(functions.get(ARDUPILOT_MOTOR1 + motor, motor) for motor in motors)
     return Vehicle(kind, motors, outputs)
 
 
-def _of_heartbeat(found: Messages) -> Vehicle:
-    beat = found.first("HEARTBEAT") or {}
+def _of_heartbeat(log: Messages) -> Vehicle:
+    beat = log.first("HEARTBEAT") or {}
     kinds = {MAV_TYPES[int(t)] for t in beat.get("type", ()) if int(t) in MAV_TYPES}
     if len(kinds) != 1 or QUADROTOR in kinds:
         return Vehicle(QUADROTOR if kinds else "")

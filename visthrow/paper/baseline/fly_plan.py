@@ -85,19 +85,20 @@ def random_starts(plan: ThrowPlan, count: int, seed: int) -> np.ndarray:
     What varies between throws: position and velocity of the payload, direction and rate of the
     cable, attitude. The vehicle's mass, the cable's length and the battery, which vary in training
     too, are the model's own here."""
-    start, rng = pilots_hover(), np.random.default_rng(seed)
+    start = pilots_hover()
+    rng = np.random.default_rng(seed)
 
-    def drawn(spread) -> np.ndarray:
+    def sample(spread) -> np.ndarray:
         return np.asarray(spread) * rng.uniform(-1.0, 1.0, (count, 3))
 
     state, _ = pm.hover(plan.model, np.tile(plan.path.coefficients[0, 0], (count, 1)))
-    state[:, pm.POS] += drawn(start.position)
-    state[:, pm.VEL] += drawn(start.velocity)
-    state[:, pm.DIR] += np.tan(math.radians(start.cable_angle_deg)) * drawn([1.0, 1.0, 0.0])
+    state[:, pm.POS] += sample(start.position)
+    state[:, pm.VEL] += sample(start.velocity)
+    state[:, pm.DIR] += np.tan(math.radians(start.cable_angle_deg)) * sample([1.0, 1.0, 0.0])
     state[:, pm.DIR] /= np.linalg.norm(state[:, pm.DIR], axis=1, keepdims=True)
-    rate = math.radians(start.cable_rate_deg) * drawn([1.0, 1.0, 1.0])
+    rate = math.radians(start.cable_rate_deg) * sample([1.0, 1.0, 1.0])
     state[:, pm.RATE] = rate - (rate * state[:, pm.DIR]).sum(1, keepdims=True) * state[:, pm.DIR]
-    state[:, 12:15] = 0.5 * np.radians(drawn(start.attitude_deg))
+    state[:, 12:15] = 0.5 * np.radians(sample(start.attitude_deg))
     state[:, pm.QUAT] /= np.linalg.norm(state[:, pm.QUAT], axis=1, keepdims=True)
     return state
 
@@ -112,11 +113,14 @@ def fly_pendulum(
     falls short. The release comes at the plan's time, within a control period if need be."""
     params = MPCParams()
     controller = MPC(plan.model, params)
-    steps, horizon = math.ceil(plan.path.duration / params.period - 1e-6), params.stages
+    steps = math.ceil(plan.path.duration / params.period - 1e-6)
+    horizon = params.stages
     last = plan.path.duration - (steps - 1) * params.period
     reference = plan.reference(0.0, params.period, steps + horizon)
     state = random_starts(plan, count, seed)
-    good, tracking, times = np.ones(count, bool), np.zeros(count), []
+    good = np.ones(count, bool)
+    tracking = np.zeros(count)
+    times = []
     smoothness = np.full(count, np.nan)
     for e in range(count):
         controller.reset()
@@ -201,16 +205,16 @@ def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
         raise ConfigError(
             f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}"
         )
-    vehicle, told = experiment.vehicle, experiment.task.observation.latency
+    vehicle = experiment.vehicle
+    latency = experiment.task.observation.latency
     motors = vehicle.motor.time_constant if vehicle.motor.kind == "first_order" else 0.0
-    setpoint = (
-        vehicle.controller.setpoint_time_constant
-        if vehicle.controller.kind == "betaflight"
-        else 0.0
-    )
+    if vehicle.controller.kind == "betaflight":
+        setpoint = vehicle.controller.setpoint_time_constant
+    else:
+        setpoint = 0.0
     effect = vehicle.queue.delay + setpoint + motors
-    across = (float(np.mean(told)), effect) if compensation in ("delay", "both") else (0.0, 0.0)
-    return Delays(*across, experiment.release.lag if compensation in ("release", "both") else 0.0)
+    means = (float(np.mean(latency)), effect) if compensation in ("delay", "both") else (0.0, 0.0)
+    return Delays(*means, experiment.release.lag if compensation in ("release", "both") else 0.0)
 
 
 def look_ahead(
@@ -241,7 +245,8 @@ def _started(
     """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m],
     shape (3,).
     """
-    task, start = experiment.task, pilots_hover()
+    task = experiment.task
+    start = pilots_hover()
     if name == "hybrid":
         plant = HybridPlant(
             experiment, count, seed, device, task.noise, task.observation.latency, start
@@ -263,7 +268,10 @@ class Controllers(Pilots):
         """Begin in hover, with the experiment's limits, mount and release; commands come each
         period [s].
         """
-        self.plan, self.delays, self.period, action = plan, delays, period, experiment.task.action
+        self.plan = plan
+        self.delays = delays
+        self.period = period
+        action = experiment.task.action
         self.params = MPCParams(
             period=period, max_thrust=action.max_thrust, max_rate=action.max_rate
         )
@@ -278,17 +286,19 @@ class Controllers(Pilots):
         self._estimate: np.ndarray | None = None
         self._period = 0
 
-    def decide(self, flight: Flight, seen: Snapshot, held: np.ndarray) -> Decision:
+    def decide(self, flight: Flight, snapshot: Snapshot, latched: np.ndarray) -> Decision:
         """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has
         failed, and is held.
         """
-        command, k, n = held.copy(), self._period, self.params.stages
+        command = latched.copy()
+        k = self._period
+        n = self.params.stages
         sent = np.stack(
             [*flight.commands[: -SENT - 1 : -1], *[self._hover] * (SENT - len(flight.commands))]
         )
         span = self.delays.measurement + self.delays.command
         state = look_ahead(
-            self.plan.model, self._estimated(seen, sent, span), sent, self.period, span
+            self.plan.model, self._estimated(snapshot, sent, span), sent, self.period, span
         )
         reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
         for e in np.flatnonzero(flight.flown):
@@ -302,19 +312,19 @@ class Controllers(Pilots):
             command, np.full(len(command), k >= self.latch), _normalised(self.params, command)
         )
 
-    def _estimated(self, seen: Snapshot, sent: np.ndarray, span: float) -> np.ndarray:
+    def _estimated(self, snapshot: Snapshot, sent: np.ndarray, span: float) -> np.ndarray:
         """State now: the model's prediction from the period before, corrected by what
         is measured.
         """
-        measured = pendulum_state(seen, np.array(self.experiment.rope.mount))
+        measured = pendulum_state(snapshot, np.array(self.experiment.rope.mount))
         if self._estimate is None:
             self._estimate = measured
-        then = look_ahead(
+        predicted = look_ahead(
             self.plan.model, self._estimate, sent, self.period, span + self.period, span
         )
-        side = np.sign((then[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
+        side = np.sign((predicted[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
         measured[:, pm.QUAT] *= side
-        estimate = then + TRUST * (measured - then)
+        estimate = predicted + TRUST * (measured - predicted)
         for part in (pm.DIR, pm.QUAT):
             estimate[:, part] /= np.linalg.norm(estimate[:, part], axis=1, keepdims=True)
         direction = estimate[:, pm.DIR]
@@ -329,26 +339,30 @@ class _Tracking(Scores):
     def __init__(self, pilots: Controllers) -> None:
         super().__init__(pilots)
         count = len(pilots.goal_w)
-        self.pilots, self.separated = pilots, np.full((2, count, 3), np.nan)
-        self._sum, self._due, self._period = np.zeros(count), np.zeros(count), 0
+        self.pilots = pilots
+        self.separated = np.full((2, count, 3), np.nan)
+        self._sum = np.zeros(count)
+        self._due = np.zeros(count)
+        self._period = 0
 
-    def after(self, flight: Flight, seen: Snapshot, sent: Decision) -> None:
-        super().after(flight, seen, sent)
+    def after(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
+        super().after(flight, snapshot, sent)
         if sent.action is None:
             return
-        now, path = flight.now, self.pilots.plan.path
+        current = flight.now
+        path = self.pilots.plan.path
         self._period += 1
         elapsed = self._period * flight.plant.period
-        due = now.attached & (elapsed <= path.duration)
-        self._sum += due * ((now.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2).sum(
-            1
-        )
+        due = current.attached & (elapsed <= path.duration)
+        self._sum += due * (
+            (current.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2
+        ).sum(1)
         self._due += due
-        for e in np.flatnonzero(seen.attached & ~now.attached):
-            back = flight.plant.time - flight.plant.landing.separation_time[e]
-            vel = now.payload_vel_w[e] + np.array([0.0, 0.0, GRAVITY * back])
+        for e in np.flatnonzero(snapshot.attached & ~current.attached):
+            since = flight.plant.time - flight.plant.landing.separation_time[e]
+            vel = current.payload_vel_w[e] + np.array([0.0, 0.0, GRAVITY * since])
             self.separated[:, e] = (
-                now.payload_pos_w[e] - back * 0.5 * (vel + now.payload_vel_w[e]),
+                current.payload_pos_w[e] - since * 0.5 * (vel + current.payload_vel_w[e]),
                 vel,
             )
 

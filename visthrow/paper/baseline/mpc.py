@@ -69,19 +69,18 @@ class MPC:
         """
         import piqp
 
-        self.model, self.params = model, params or MPCParams()
+        self.model = model
+        self.params = params or MPCParams()
         n = self.params.stages
         size = n * WIDTH + STATES
         weights = np.concatenate([self.params.state_weights, self.params.input_weights])
         self._weights = np.concatenate([np.tile(weights, n), self.params.state_weights])
         self._rows_columns()
-        free, last, most = (
-            np.full(STATES, np.inf),
-            np.full(STATES, np.inf),
-            np.array(self.params.max_rate),
-        )
-        low = np.concatenate([*[np.r_[-free, self.params.min_thrust, -most]] * n, -last])
-        high = np.concatenate([*[np.r_[free, self.params.max_thrust, most]] * n, last])
+        free = np.full(STATES, np.inf)
+        last = np.full(STATES, np.inf)
+        limit = np.array(self.params.max_rate)
+        low = np.concatenate([*[np.r_[-free, self.params.min_thrust, -limit]] * n, -last])
+        high = np.concatenate([*[np.r_[free, self.params.max_thrust, limit]] * n, last])
         self._bounds = low, high
         self._solver = piqp.SparseSolver()
         settings = self._solver.settings
@@ -101,13 +100,16 @@ class MPC:
         """Pattern of the constraints: stage k's rows hold -[A B] of stage k and 1 of stage k + 1;
         the first rows x_0.
         """
-        n, eye = self.params.stages, np.arange(STATES)
-        row, column = [eye], [eye]
+        n = self.params.stages
+        eye = np.arange(STATES)
+        row = [eye]
+        column = [eye]
         for k in range(n):
             block = np.meshgrid(eye + (k + 1) * STATES, np.arange(WIDTH) + k * WIDTH, indexing="ij")
             row += [block[0].ravel(), eye + (k + 1) * STATES]
             column += [block[1].ravel(), eye + (k + 1) * WIDTH]
-        row, column = np.concatenate(row), np.concatenate(column)
+        row = np.concatenate(row)
+        column = np.concatenate(column)
         self._order = np.lexsort((row, column))
         shape = ((n + 1) * STATES, n * WIDTH + STATES)
         count = np.bincount(column, minlength=shape[1])
@@ -142,7 +144,8 @@ class MPC:
                 f" ({n}, 4)"
             )
         if self._states is None:
-            self._states, self._inputs = target.copy(), effort.copy()
+            self._states = target.copy()
+            self._inputs = effort.copy()
         state, *target = _same_side(
             np.vstack([state, target]), np.vstack([self._states[:1], self._states])
         )
@@ -159,10 +162,8 @@ class MPC:
         wanted = np.concatenate([np.concatenate([target[:n], effort], axis=1).ravel(), target[n]])
         solution = self._solve(-self._weights * wanted, np.concatenate([state, free.ravel()]))
         stages = solution[: n * WIDTH].reshape(n, WIDTH)
-        states, inputs = (
-            np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]]),
-            stages[:, STATES:],
-        )
+        states = np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]])
+        inputs = stages[:, STATES:]
         command = inputs[0].copy()
         self._move_on(states, inputs)
         self.step_time = time.perf_counter() - began
@@ -200,9 +201,9 @@ class MPC:
             self._states[:, part] /= np.linalg.norm(self._states[:, part], axis=1, keepdims=True)
 
 
-def _same_side(target: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _same_side(target: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Quaternions with the signs of others': q and -q are one attitude."""
     target = target.copy()
-    sign = np.sign((target[:, QUAT] * near[:, QUAT]).sum(1))
+    sign = np.sign((target[:, QUAT] * reference[:, QUAT]).sum(1))
     target[:, QUAT] *= np.where(sign == 0.0, 1.0, sign)[:, None]
     return target

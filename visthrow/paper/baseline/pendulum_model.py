@@ -55,7 +55,8 @@ class Pendulum:
 
 def pendulum_of(plant: PlantParams) -> Pendulum:
     """Pendulum of a plant: half of the rope's mass at each of its ends, as in a finite element."""
-    rope, half = plant.rope, 0.5 * plant.rope.rope_mass
+    rope = plant.rope
+    half = 0.5 * plant.rope.rope_mass
     return Pendulum(
         plant.vehicle.body.mass + half, rope.payload_mass + half, rope.length + rope.payload_offset
     )
@@ -67,20 +68,24 @@ def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.nd
     """
     qx, qy, qz, wx, wy, wz, x, y, z, w = state[6:]
     thrust, p, q, r = control
-    bx, by, bz = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
-    along = thrust * (qx * bx + qy * by + qz * bz)
+    bx = 2.0 * (x * z + w * y)
+    thrust_y = 2.0 * (y * z - w * x)
+    bz = 1.0 - 2.0 * (x * x + y * y)
+    tension_ = thrust * (qx * bx + qy * thrust_y + qz * bz)
     inward = model.vehicle_mass * model.length * (wx * wx + wy * wy + wz * wz)
-    pull = (along - inward) / (model.vehicle_mass + model.payload_mass)
+    pull = (tension_ - inward) / (model.vehicle_mass + model.payload_mass)
     turn = -thrust / (model.vehicle_mass * model.length)
     out = np.empty_like(state)
     out[0:3] = state[3:6]
-    out[3], out[4], out[5] = pull * qx, pull * qy, pull * qz - GRAVITY
-    out[6], out[7], out[8] = wy * qz - wz * qy, wz * qx - wx * qz, wx * qy - wy * qx
-    out[9], out[10], out[11] = (
-        turn * (qy * bz - qz * by),
-        turn * (qz * bx - qx * bz),
-        turn * (qx * by - qy * bx),
-    )
+    out[3] = pull * qx
+    out[4] = pull * qy
+    out[5] = pull * qz - GRAVITY
+    out[6] = wy * qz - wz * qy
+    out[7] = wz * qx - wx * qz
+    out[8] = wx * qy - wy * qx
+    out[9] = turn * (qy * bz - qz * thrust_y)
+    out[10] = turn * (qz * bx - qx * bz)
+    out[11] = turn * (qx * thrust_y - qy * bx)
     out[12] = 0.5 * (w * p + y * r - z * q)
     out[13] = 0.5 * (w * q + z * p - x * r)
     out[14] = 0.5 * (w * r + x * q - y * p)
@@ -114,7 +119,8 @@ def step(
     Raises ValueError: arrays of other widths.
     """
     state, control = _checked(state, control)
-    columns, inputs = np.moveaxis(state, -1, 0), np.moveaxis(control, -1, 0)
+    columns = np.moveaxis(state, -1, 0)
+    inputs = np.moveaxis(control, -1, 0)
     for _ in range(substeps):
         columns = _advance(model, columns, inputs, period / substeps)
     return np.moveaxis(columns, 0, -1)
@@ -131,9 +137,10 @@ def linearise(
     Source: Squire and Trapp, "Using complex variables to estimate derivatives of real functions",
     SIAM Review 1998."""
     state, control = _checked(state, control)
-    both = np.concatenate([state.T, control.T])  # (20, K)
-    count, width = both.shape[1], STATES + INPUTS
-    lifted = np.repeat(both[:, None, :], width, axis=1).astype(complex)  # (20, direction, K)
+    stacked = np.concatenate([state.T, control.T])  # (20, K)
+    count = stacked.shape[1]
+    width = STATES + INPUTS
+    lifted = np.repeat(stacked[:, None, :], width, axis=1).astype(complex)  # (20, direction, K)
     index = np.arange(width)
     lifted[index, index] += 1j * _TINY
     flat = lifted.reshape(width, width * count)
@@ -153,7 +160,8 @@ def tension(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarr
 
 def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position [m] and velocity [m/s] of the vehicle, shape (..., 3) each."""
-    direction, rate = state[..., DIR], state[..., RATE]
+    direction = state[..., DIR]
+    rate = state[..., RATE]
     return state[..., POS] - model.length * direction, state[..., VEL] - model.length * np.cross(
         rate, direction
     )
@@ -165,14 +173,17 @@ def hover(model: Pendulum, payload_w: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """
     payload_w = np.asarray(payload_w, dtype=float)
     state = np.zeros((*payload_w.shape[:-1], STATES))
-    state[..., POS], state[..., 8], state[..., 15] = payload_w, -1.0, 1.0
+    state[..., POS] = payload_w
+    state[..., 8] = -1.0
+    state[..., 15] = 1.0
     control = np.zeros((*payload_w.shape[:-1], INPUTS))
     control[..., 0] = model.weight
     return state, control
 
 
 def _checked(state: np.ndarray, control: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    state, control = np.asarray(state, dtype=float), np.asarray(control, dtype=float)
+    state = np.asarray(state, dtype=float)
+    control = np.asarray(control, dtype=float)
     if (
         state.shape[-1:] != (STATES,)
         or control.shape[-1:] != (INPUTS,)

@@ -16,27 +16,26 @@ def throw_baseline(args: argparse.Namespace) -> list[Entry]:
     """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each
     compensation.
     """
-    rows, how = (
-        thrower.rows([args.plant]),
-        {
-            "config_name": args.config or "state",
-            "overrides": args.overrides,
-        },
-    )
+    rows = thrower.rows([args.plant])
+    how = {
+        "config_name": args.config or "state",
+        "overrides": args.overrides,
+    }
     sets = [
         thrower.units(*row, target, args.throws, args.seed, **how)
         for row in rows
         for target in args.targets
     ]
     with tempfile.TemporaryDirectory() as folder:
-        found = thrower.flown(sets, folder, status)
+        flights = thrower.flown(sets, folder, status)
     status("")
     throws = [
-        Throws(of.unit["target"], **{field: of.columns[field] for field in FIELDS}) for of in found
+        Throws(flight.unit["target"], **{field: flight.columns[field] for field in FIELDS})
+        for flight in flights
     ]
-    each = len(args.targets)
-    layouts = ("TO+MPC" if plant == thrower.OWN else "" for plant, _ in rows)
+    targets = len(args.targets)
+    layouts = ("TO+MPC" if plant == thrower.IDEAL else "" for plant, _ in rows)
     return [
-        Entry(thrower.title_of(*row), layout, throws[i * each : (i + 1) * each])
+        Entry(thrower.title_of(*row), layout, throws[i * targets : (i + 1) * targets])
         for i, (row, layout) in enumerate(zip(rows, layouts))
     ]

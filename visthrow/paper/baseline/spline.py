@@ -40,7 +40,9 @@ class PlanError(VisthrowError):
     """A trajectory that cannot be planned."""
 
 
-LONGEST, SHORTEST, COARSE = (2.4, 1.8, 1.4, 1.1, 0.9), 0.4, 0.1
+LONGEST = (2.4, 1.8, 1.4, 1.1, 0.9)
+SHORTEST = 0.4
+COARSE = 0.1
 """Durations that are tried first: several starts, the shortest, the step [s].
 
 The best result is taken.
@@ -116,12 +118,14 @@ class Spline:
         shape (T, 2 or more derivatives, 3).
         """
         time = np.atleast_1d(np.asarray(time, dtype=float))
-        inside = np.clip(time, 0.0, self.duration)
+        clipped = np.clip(time, 0.0, self.duration)
         starts = np.concatenate([[0.0], np.cumsum(self.times)])
-        segment = np.clip(np.searchsorted(starts, inside, side="right") - 1, 0, len(self.times) - 1)
-        local = inside - starts[segment]
+        segment = np.clip(
+            np.searchsorted(starts, clipped, side="right") - 1, 0, len(self.times) - 1
+        )
+        local = clipped - starts[segment]
         out = np.einsum("tdk,tkc->tdc", _rows(local, derivatives), self.coefficients[segment])
-        past = (time - inside)[:, None]
+        past = (time - clipped)[:, None]
         out[:, 0] += past * out[:, 1]
         out[:, 2:][past[:, 0] > 0.0] = 0.0
         return out
@@ -129,7 +133,8 @@ class Spline:
 
 def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
     """Derivatives of the monomials t^0 to t^7 at times, shape (T, derivatives, 8)."""
-    n, k = np.arange(derivatives)[:, None], np.arange(ORDER)
+    n = np.arange(derivatives)[:, None]
+    k = np.arange(ORDER)
     return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
 
 
@@ -155,19 +160,25 @@ def _coefficients(
 
     Waypoints (B, 3, D), times (B, 4); returns (B, 4, 8, D).
     """
-    size, count = SEGMENTS * ORDER, len(times)
-    matrix, right = np.zeros((count, size, size)), np.zeros((count, size, len(start)))
-    matrix[:, :SMOOTH, :ORDER], right[:, 0] = BEGINS, start
+    size = SEGMENTS * ORDER
+    count = len(times)
+    matrix = np.zeros((count, size, size))
+    right = np.zeros((count, size, len(start)))
+    matrix[:, :SMOOTH, :ORDER] = BEGINS
+    right[:, 0] = start
     row = SMOOTH
     for i in range(SEGMENTS - 1):
-        here, there = slice(i * ORDER, (i + 1) * ORDER), slice((i + 1) * ORDER, (i + 2) * ORDER)
-        matrix[:, row, here], right[:, row] = ENDS[0], waypoints[:, i]
-        matrix[:, row + 1 : row + 1 + SMOOTH, here] = ENDS
+        left_ = slice(i * ORDER, (i + 1) * ORDER)
+        right_ = slice((i + 1) * ORDER, (i + 2) * ORDER)
+        matrix[:, row, left_] = ENDS[0]
+        right[:, row] = waypoints[:, i]
+        matrix[:, row + 1 : row + 1 + SMOOTH, left_] = ENDS
         ratio = (times[:, i] / times[:, i + 1])[:, None] ** np.arange(SMOOTH)
-        matrix[:, row + 1 : row + 1 + SMOOTH, there] = -ratio[:, :, None] * BEGINS
+        matrix[:, row + 1 : row + 1 + SMOOTH, right_] = -ratio[:, :, None] * BEGINS
         row += 1 + SMOOTH
     matrix[:, row:, -ORDER:] = ENDS[:END]
-    right[:, row], right[:, row + 1] = end, velocity * times[:, -1:]
+    right[:, row] = end
+    right[:, row + 1] = velocity * times[:, -1:]
     return np.linalg.solve(matrix, right).reshape(count, SEGMENTS, ORDER, -1)
 
 
@@ -238,18 +249,19 @@ def optimise(
         tick: period and offset [s]: the duration is the offset and a whole number of periods, so
             that a controller of that period can release at its end.
     """
-    along = np.array([*velocity_w[:2], 0.0])
-    speed = float(np.linalg.norm(along))
+    heading = np.array([*velocity_w[:2], 0.0])
+    speed = float(np.linalg.norm(heading))
     if not speed > 1e-6:
         raise PlanError(f"release velocity {velocity_w}; expected a horizontal part")
-    basis = np.stack([along / speed, [0.0, 0.0, 1.0]])  # (2, 3)
+    basis = np.stack([heading / speed, [0.0, 0.0, 1.0]])  # (2, 3)
     aside = np.linalg.norm((end_w - start_w) - basis.T @ (basis @ (end_w - start_w)))
     if not aside < 1e-6:
         raise PlanError(
             f"the release lies {aside:g} m beside the plane of start and velocity; expected it"
             " within"
         )
-    begin, velocity = np.array([0.0, start_w[2]]), basis @ velocity_w
+    begin = np.array([0.0, start_w[2]])
+    velocity = basis @ velocity_w
     end = basis @ (end_w - start_w) + begin
 
     def build(x: np.ndarray, total: float) -> tuple[np.ndarray, np.ndarray]:
@@ -281,17 +293,17 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
 
     def improve(x: np.ndarray, total: float) -> tuple[np.ndarray, float]:
         def slope(x: np.ndarray) -> np.ndarray:
-            near = objective(x + DIFFERENCE * np.vstack([0.0 * x, np.eye(len(x))]), total)
-            return (near[1:] - near[0]).T / DIFFERENCE
+            shifted = objective(x + DIFFERENCE * np.vstack([0.0 * x, np.eye(len(x))]), total)
+            return (shifted[1:] - shifted[0]).T / DIFFERENCE
 
-        found = least_squares(
+        solution = least_squares(
             lambda x: objective(x[None], total)[0], x, slope, method="lm", max_nfev=EVALUATIONS
         )
-        return found.x, float((objective(found.x[None], total, DENSE) ** 2).sum())
+        return solution.x, float((objective(solution.x[None], total, DENSE) ** 2).sum())
 
     blank = np.zeros(3 * (SEGMENTS - 1))
     tried = (_descend(improve, blank, np.arange(top, SHORTEST, -COARSE)) for top in LONGEST)
-    best = min(tried, key=lambda found: found[0])
+    best = min(tried, key=lambda solution: solution[0])
     return _descend(
         improve, best[2], _ticks(best[1] + COARSE, max(best[1] - COARSE, SHORTEST), *tick)
     )
@@ -315,7 +327,8 @@ def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, 
 
 def _ticks(high: float, low: float, period: float, offset: float) -> np.ndarray:
     """Offset plus whole periods between two durations, falling."""
-    first, last = np.floor((high - offset) / period + 1e-6), np.ceil((low - offset) / period - 1e-6)
+    first = np.floor((high - offset) / period + 1e-6)
+    last = np.ceil((low - offset) / period - 1e-6)
     return offset + period * np.arange(first, last - 1, -1)
 
 
@@ -324,7 +337,9 @@ def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float
     total time [s].
     """
     right = np.zeros((ORDER, len(begin)))
-    right[0], right[4], right[5] = begin, end, velocity * total
+    right[0] = begin
+    right[4] = end
+    right[5] = velocity * total
     unit = np.linalg.solve(np.concatenate([BEGINS[:4], ENDS[:4]]), right)
     return _rows(np.arange(1, SEGMENTS) / SEGMENTS, 1)[:, 0] @ unit
 
@@ -350,7 +365,10 @@ def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.nd
     quat, spin = _unit(
         half, np.column_stack([-turn[:, 1], turn[:, 0], 0.0 * turn[:, 0], turn[:, 2]])
     )
-    v, w, dv, dw = quat[:, :3], quat[:, 3:], spin[:, :3], spin[:, 3:]
+    v = quat[:, :3]
+    w = quat[:, 3:]
+    dv = spin[:, :3]
+    dw = spin[:, 3:]
     rates = 2.0 * (w * dv - dw * v - np.cross(v, dv))
     state = np.concatenate(
         [chain[0], chain[1], direction, np.cross(direction, first), quat], axis=1
@@ -367,9 +385,9 @@ def _thrust(
     _, _, acc, jerk, snap, crackle = chain
     unit = _unit(acc + up, jerk, snap, crackle)
     direction, first, second, third = (-x for x in unit)
-    both = model.vehicle_mass + model.payload_mass
-    force = both * (acc + up) - model.vehicle_mass * model.length * second
-    return force, both * jerk - model.vehicle_mass * model.length * third, direction, first
+    mass = model.vehicle_mass + model.payload_mass
+    force = mass * (acc + up) - model.vehicle_mass * model.length * second
+    return force, mass * jerk - model.vehicle_mass * model.length * third, direction, first
 
 
 def _unit(*chain: np.ndarray) -> list[np.ndarray]:
@@ -384,8 +402,8 @@ def _unit(*chain: np.ndarray) -> list[np.ndarray]:
     out = [chain[0] / norm[0]]
     for k in range(1, len(chain)):
         norm.append(sum(math.comb(k - 1, i) * dot(out[k - 1 - i], chain[i + 1]) for i in range(k)))
-        rest = chain[k]
+        remainder = chain[k]
         for j in (*range(k - 1, 0, -1), k):
-            rest = rest - math.comb(k, j) * norm[j] * out[k - j]
-        out.append(rest / norm[0])
+            remainder = remainder - math.comb(k, j) * norm[j] * out[k - j]
+        out.append(remainder / norm[0])
     return out

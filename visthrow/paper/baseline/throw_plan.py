@@ -35,8 +35,8 @@ def fall_time(pos_z: np.ndarray, vel_z: np.ndarray, landing_height: float) -> np
     """Time to landing [s] from a height [m] and an upward velocity [m/s]; NaN where the height is
     never passed.
     """
-    inside = np.asarray(vel_z) ** 2 + 2.0 * GRAVITY * (np.asarray(pos_z) - landing_height)
-    return (vel_z + np.sqrt(np.where(inside < 0.0, np.nan, inside))) / GRAVITY
+    radicand = np.asarray(vel_z) ** 2 + 2.0 * GRAVITY * (np.asarray(pos_z) - landing_height)
+    return (vel_z + np.sqrt(np.where(radicand < 0.0, np.nan, radicand))) / GRAVITY
 
 
 def landing_point(
@@ -70,9 +70,9 @@ def default_release(target: float) -> tuple[float, float]:
     """Height [m] and speed [m/s] of the shipped policy's release at a target [m], between the
     measured ones linear.
     """
-    known = sorted(POLICY_RELEASES)
+    names = sorted(POLICY_RELEASES)
     return tuple(
-        float(np.interp(target, known, [POLICY_RELEASES[x][i] for x in known])) for i in range(2)
+        float(np.interp(target, names, [POLICY_RELEASES[x][i] for x in names])) for i in range(2)
     )
 
 
@@ -98,8 +98,8 @@ def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[floa
     from visthrow.throws.recorded import fly
 
     goal = np.array([target, 0.0, 0.0])
-    seen = [read_release(fly(loaded, goal, "hybrid", seed + i)) for i in range(throws)]
-    return tuple(float(x) for x in np.mean(seen, axis=0))
+    releases = [read_release(fly(loaded, goal, "hybrid", seed + i)) for i in range(throws)]
+    return tuple(float(x) for x in np.mean(releases, axis=0))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
 from visthrow.training import device
 
-OWN = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
+IDEAL = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
     "pendulum"
 )
 
@@ -41,7 +41,7 @@ BOUNDS = (
 
 def title_of(plant: str, compensation: str) -> str:
     """Return a row's name, with plant and condition."""
-    return "TO+MPC, own model (ideal)" if plant == OWN else f"TO+MPC, {MADE_UP[compensation]}"
+    return "TO+MPC, own model (ideal)" if plant == IDEAL else f"TO+MPC, {MADE_UP[compensation]}"
 
 
 def unit(
@@ -63,7 +63,7 @@ def unit(
     """Unit of so many throws with the baseline at a target [m] along x.
 
     Args:
-        plant: :data:`OWN`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the
+        plant: :data:`IDEAL`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the
             number of the batch.
         compensation: of :data:`~visthrow.paper.baseline.fly_plan.COMPENSATIONS`; "none" in the
             own model.
@@ -101,7 +101,7 @@ def units(
     plant: str, compensation: str, target: float, throws: int, seed: int = 0, **how: Any
 ) -> list[dict[str, Any]]:
     """:func:`unit`, cut into the batches in which reference plants are flown."""
-    if plant in (OWN, "hybrid"):
+    if plant in (IDEAL, "hybrid"):
         return [unit(plant, compensation, target, throws, seed, **how)]
     return [
         unit(plant, compensation, target, size, seed, batch=i, **how) for i, size in batches(throws)
@@ -138,22 +138,23 @@ def plan_of(
     )
 
 
-def fly_unit(wanted: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def fly_unit(unit: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Plan and fly a unit; returns columns of the throws, and the planned duration [s] and times of
     the controller's steps [ms].
     """
-    experiment = _experiment(wanted["config"], tuple(wanted["overrides"]))
+    experiment = _experiment(unit["config"], tuple(unit["overrides"]))
     plan = plan_of(
-        experiment, *(wanted[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds"))
+        experiment, *(unit[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds"))
     )
-    count, seed = wanted["throws"], wanted["seed"]
-    if wanted["plant"] == OWN:
+    count = unit["throws"]
+    seed = unit["seed"]
+    if unit["plant"] == IDEAL:
         flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
     else:
-        delays = delays_of(experiment, wanted["compensation"])
-        where = device.resolve("auto") if wanted["plant"] == "hybrid" else "cpu"
+        delays = delays_of(experiment, unit["compensation"])
+        where = device.resolve("auto") if unit["plant"] == "hybrid" else "cpu"
         flown = fly_plant(
-            plan, wanted["plant"], experiment, delays, count, seed, wanted["batch"], where
+            plan, unit["plant"], experiment, delays, count, seed, unit["batch"], where
         )
     columns = columns_of(flown)
     columns.pop("step_times", None)  # as many as throws by chance
@@ -169,7 +170,7 @@ def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
     """Plant and compensation of a table's rows: the own model, and each plant under each
     compensation.
     """
-    return [(OWN, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
+    return [(IDEAL, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
 
 
 def flown(

@@ -103,31 +103,34 @@ def run(args: argparse.Namespace) -> int:
     compare.check(args.targets, args.throws)
     for plant in args.plants:
         known_plant(plant)
-    out, bounds = Path(args.out), thrower.BOUNDS[args.payload_bounds]
+    out = Path(args.out)
+    bounds = thrower.BOUNDS[args.payload_bounds]
     writable(out)
     if args.quick:
-        args.throws, args.plants = min(args.throws, 2), []
-    by_target, swept = (
-        list(_by_target(args, bounds)),
-        ([] if args.no_sweep else list(_swept(args, bounds))),
-    )
-    found = thrower.flown(by_target + swept, out / "throws", status)
-    rows, front = found[: len(by_target)], found[len(by_target) :]
-    made = [Section("baseline", "By target", (trade.by_target(rows),))]
+        args.throws = min(args.throws, 2)
+        args.plants = []
+    by_target = list(_by_target(args, bounds))
+    swept = [] if args.no_sweep else list(_swept(args, bounds))
+    flights = thrower.flown(by_target + swept, out / "throws", status)
+    rows = flights[: len(by_target)]
+    front = flights[len(by_target) :]
+    document = [Section("baseline", "By target", (trade.by_target(rows),))]
     if swept:
         policies = [_thrown(name, args) for name in args.policies]
-        kinds = [(thrower.OWN, "none"), *((plant, "both") for plant in args.plants)]
-        shown = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
+        kinds = [(thrower.IDEAL, "none"), *((plant, "both") for plant in args.plants)]
+        panels = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
         names = [result.unit["policy"] for result in policies]
-        made.append(trade.front_section(result_set.ResultSet((*front, *policies)), shown, names))
-        found += policies
+        document.append(
+            trade.front_section(result_set.ResultSet((*front, *policies)), panels, names)
+        )
+        flights += policies
     status("")
     title = TITLE.format(throws=args.throws, bounds=bounds)
-    print(page.markdown_of(title, NOTE, made))
-    for path in page.write(out, title, NOTE, made):
+    print(page.markdown_of(title, NOTE, document))
+    for path in page.write(out, title, NOTE, document):
         print(path)
     if args.json:
-        results.pack(found, args.json)
+        results.pack(flights, args.json)
     return 0
 
 
@@ -163,7 +166,7 @@ def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any
     for speed in speeds:
         for w_t, rho in weights:
             for plant, made_up in [
-                (thrower.OWN, "none"),
+                (thrower.IDEAL, "none"),
                 *((plant, "both") for plant in args.plants),
             ]:
                 how = {"speed": speed, "w_t": w_t, "rho": rho, **_how(args, bounds)}
@@ -188,7 +191,8 @@ def _thrown(name: str, args: argparse.Namespace) -> Any:
     from visthrow.throws import results
     from visthrow.throws.loading import load_policy
 
-    loaded, count = load_policy(name), 10 if args.quick else POLICY_THROWS
+    loaded = load_policy(name)
+    count = 10 if args.quick else POLICY_THROWS
     ((flown,),) = throw_hybrid([loaded], [FRONT_TARGET], count, "cpu", args.seed)
     layout = loaded.policy.contract["observation"]["layout"]
     unit = results.policy_unit(loaded.name, "", layout, "hybrid", FRONT_TARGET, count, args.seed)

@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
     begin = time.perf_counter()
     if args.jobs is not None and args.jobs < 1:
         raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
-    out, jobs = Path(args.out), args.jobs or device.cores()
+    out = Path(args.out)
+    jobs = args.jobs or device.cores()
     records = _records(args.records) if args.records else RECORDS
     folders = [_folder(name) for name in args.results]
     writable(out)
@@ -94,10 +95,10 @@ def _records(name: str) -> Path:
     from visthrow.paper.report.result_set import PARTS
 
     if not any((Path(name) / part).is_dir() for part in PARTS):
-        came = "none of these in it" if Path(name).is_dir() else "no such folder"
+        actual = "none of these in it" if Path(name).is_dir() else "no such folder"
         raise StorageError(
-            f"--records {name}: {came}; expected a folder of {', '.join(PARTS)}, as 'visthrow sweep"
-            " collect' makes it"
+            f"--records {name}: {actual}; expected a folder of {', '.join(PARTS)},"
+            " as 'visthrow sweep collect' makes it"
         )
     return Path(name)
 
@@ -106,9 +107,9 @@ def _folder(name: str) -> Path:
     """Folder or file of results of throws. Raises StorageError: there is none."""
     path = Path(name)
     if not path.is_file() and not any(path.glob("*.json")):
-        came = "no *.json in it" if path.is_dir() else "no such folder"
+        actual = "no *.json in it" if path.is_dir() else "no such folder"
         raise StorageError(
-            f"--results {name}: {came}; expected one with results of throws, as runs/sweep/throws"
+            f"--results {name}: {actual}; expected one with results of throws, as runs/sweep/throws"
         )
     return path
 
@@ -125,7 +126,8 @@ def quick(out: Path, jobs: int) -> None:
     from visthrow.paper.sweep.work_units import load_list
     from visthrow.throws import results
 
-    folder, changes = out / "quick", ()
+    folder = out / "quick"
+    changes = ()
     if find_spec("mujoco") is None:
         changes = NO_REFERENCE
         _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
@@ -151,11 +153,11 @@ def quick(out: Path, jobs: int) -> None:
 def quick_units() -> list[dict]:
     """Few throws of the baseline, for a look within minutes."""
     from visthrow.paper.baseline.front import FRONT_TARGET
-    from visthrow.paper.baseline.thrower import OWN, unit
+    from visthrow.paper.baseline.thrower import IDEAL, unit
     from visthrow.task.measurement import TARGETS
 
-    own = [unit(OWN, "none", target, 5) for target in TARGETS]
-    return own + [
+    units = [unit(IDEAL, "none", target, 5) for target in TARGETS]
+    return units + [
         unit("hybrid", compensation, FRONT_TARGET, 10) for compensation in ("both", "delay")
     ]
 
@@ -182,7 +184,7 @@ def sections(thrown) -> list:
     from visthrow.paper.report import ablations, beyond, gap, throws, trade
     from visthrow.view.parts import Text
 
-    made = [
+    chapters = [
         throws.throws_section(thrown),
         throws.vision_section(thrown),
         ablations.section(thrown),
@@ -201,7 +203,7 @@ def sections(thrown) -> list:
                 *(Text(p, "why") for p in thrown.findings.get(s.name, "").split("\n\n") if p),
             ),
         )
-        for s in made
+        for s in chapters
     ]
 
 
@@ -211,8 +213,6 @@ def summary(thrown) -> str:
     from visthrow.view.parts import Grid
 
     grids = [part for part in throws_section(thrown).parts if isinstance(part, Grid)]
-    return (
-        grids[0].markdown() + "\n"
-        if grids
-        else "no throws of the shipped policies are recorded; see --quick\n"
-    )
+    if grids:
+        return grids[0].markdown() + "\n"
+    return "no throws of the shipped policies are recorded; see --quick\n"

@@ -86,7 +86,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.action == "run" and args.minutes is not None and args.minutes <= 0:
         raise ConfigError(f"--minutes {args.minutes:g}; expected more than 0")
-    work, out = load_list(args.list, tuple(args.overrides)), Path(args.out)
+    work = load_list(args.list, tuple(args.overrides))
+    out = Path(args.out)
     if args.action == "status":
         lines, done = record.status(work, out)
         print("\n".join(lines))
@@ -103,7 +104,9 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     from visthrow.paper.sweep.pool import Local, ProcessPool
     from visthrow.training import device
 
-    changes, jobs, begin = tuple(args.overrides), args.jobs or device.cores(), time.monotonic()
+    changes = tuple(args.overrides)
+    jobs = args.jobs or device.cores()
+    begin = time.monotonic()
 
     def say(text: str) -> None:
         print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)

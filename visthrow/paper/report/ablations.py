@@ -61,10 +61,14 @@ def section(thrown: ResultSet) -> Section:
         " there are several trainings (seeds). The paper's ratios come from five throws a variant"
         " of a real vehicle."
     )
-    grids, picture, marks, missing, said = [], None, [], [], []
+    grids = []
+    picture = None
+    marks = []
+    missing = []
+    sentences = []
     for layout in ("state", "vision"):
         for plant in PLANTS:
-            rows = _rows(thrown, layout, plant, marks, missing, said)
+            rows = _rows(thrown, layout, plant, marks, missing, sentences)
             if rows:
                 head = (
                     "configuration",
@@ -91,14 +95,14 @@ def section(thrown: ResultSet) -> Section:
             for layout in SHORT_LAYOUT
             for plant in PLANTS
         ]
-        drawn = figures.marks(
+        chart = figures.marks(
             marks, "mean landing error over the full model's", series, zero=1.0, log=True
         )
         text = (
             "Error ratio to the full model with 95 % intervals; at 1 the component does not matter."
         )
-        picture = Picture("ablations", drawn, text)
-    findings = (Text(text, "finding") for text in said)
+        picture = Picture("ablations", chart, text)
+    findings = (Text(text, "finding") for text in sentences)
     title = "What each component of the simulator is worth"
     return parts.section(
         "ablations", title, lead, picture, *grids, _scatter(thrown), *findings, missing=missing
@@ -106,7 +110,7 @@ def section(thrown: ResultSet) -> Section:
 
 
 def _rows(
-    thrown: ResultSet, layout: str, plant: str, marks: list, missing: list, said: list
+    thrown: ResultSet, layout: str, plant: str, marks: list, missing: list, sentences: list
 ) -> list[tuple[str, ...]]:
     full = thrown.seeds(layout, "full", plant, TARGET, {})
     if not full:
@@ -125,7 +129,7 @@ def _rows(
         paper = paper_ratio(variant) if not series else None
         marks.append(figures.Mark(TITLES[variant], ratio, series, paper))
         if layout == "state" and plant == PLANTS[0]:
-            said.append(_said(variant, ratio, trainings))
+            sentences.append(_sentence(variant, ratio, trainings))
     return rows
 
 
@@ -135,18 +139,21 @@ def paper_ratio(variant: str) -> st.Interval | None:
     """
     if variant not in PAPER_ABLATIONS:
         return None
-    (mean, std), (full, full_std) = PAPER_ABLATIONS[variant][:2], PAPER_ABLATIONS["full"][:2]
+    (mean, std) = PAPER_ABLATIONS[variant][:2]
+    (full, full_std) = PAPER_ABLATIONS["full"][:2]
     relative = math.hypot(
         std / mean / math.sqrt(PAPER_THROWS), full_std / full / math.sqrt(PAPER_FULL_THROWS)
     )
-    ratio, half = mean / full, 1.96 * relative * mean / full
+    ratio = mean / full
+    half = 1.96 * relative * mean / full
     return st.Interval(ratio, ratio - half, ratio + half, "throws")
 
 
 def _row(variant: str, trainings: list[Result], full: list[Result]) -> tuple[str, ...]:
-    paper, bias = paper_ratio(variant), st.bias([r.miss for r in trainings])
+    paper = paper_ratio(variant)
+    bias = st.bias([r.miss for r in trainings])
     ratio = "1" if variant == "full" else st.ratio(errors(trainings), errors(full)).text(2)
-    along, lateral = (of.text(sign=True) for of in (bias.along, bias.lateral))
+    axial, lateral = (part.text(sign=True) for part in (bias.along, bias.lateral))
     return (
         TITLES[variant],
         str(len(trainings)),
@@ -157,40 +164,41 @@ def _row(variant: str, trainings: list[Result], full: list[Result]) -> tuple[str
         "-" if paper is None or variant == "full" else paper.text(1),
         f"{bias.scatter:.3f}",
         f"{st.mean([r.of('duration') for r in trainings]).value:.3f}",
-        along,
+        axial,
         lateral,
         bias.direction,
         PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else "-",
     )
 
 
-def _said(variant: str, ratio: st.Interval, trainings: list[Result]) -> str:
+def _sentence(variant: str, ratio: st.Interval, trainings: list[Result]) -> str:
     """One sentence: whether the component matters here as the paper says."""
     paper = paper_ratio(variant)
     head = f"**{TITLES[variant]}**: {ratio.text(2)} times the full model's error"
     if 1.0 in ratio:
         verdict = "no effect shows"
     else:
-        verdict = (
-            "the component matters"
-            if ratio.value > 1.0
-            else "leaving it out did not harm, it helped"
-        )
-    apart = paper is not None and (paper.low > ratio.high or paper.high < ratio.low)
-    agree = "apart from ours" if apart else "the intervals overlap"
-    beside = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
+        if ratio.value > 1.0:
+            verdict = "the component matters"
+        else:
+            verdict = "leaving it out did not harm, it helped"
+    distinct = paper is not None and (paper.low > ratio.high or paper.high < ratio.low)
+    agree = "apart from ours" if distinct else "the intervals overlap"
+    comparison = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
     words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
     bias = st.bias([r.miss for r in trainings])
     signs = f" Bias here: {bias.direction}, {100 * bias.share:.0f} % of the mean square miss"
     signs += f"; the paper's throws: {words}." if words else "."
-    seeds = (
-        "" if len(trainings) > 1 else " One training: the interval covers throws, not trainings."
-    )
-    return f"{head}: {verdict}{beside}.{signs}{seeds}"
+    if len(trainings) > 1:
+        seeds = ""
+    else:
+        seeds = " One training: the interval covers throws, not trainings."
+    return f"{head}: {verdict}{comparison}.{signs}{seeds}"
 
 
 def _scatter(thrown: ResultSet) -> Picture | None:
-    plant, panels = PLANTS[0], []
+    plant = PLANTS[0]
+    panels = []
     for variant in ("full", *PAPER_FOUR, *FURTHER):
         trainings = thrown.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
         if trainings:

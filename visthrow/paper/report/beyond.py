@@ -39,7 +39,9 @@ def section(thrown: ResultSet) -> Section:
         "Each is a switch of the task's config, off by default. Policies trained with it stand"
         " beside those trained without."
     )
-    rows, missing, table = [], [], None
+    rows = []
+    missing = []
+    table = None
     moving = _moving(thrown, missing)
     for variant in VARIANTS[1:]:
         found = thrown.matching(kind="policy", variant=variant)
@@ -47,7 +49,7 @@ def section(thrown: ResultSet) -> Section:
             missing.append(TITLES[variant])
         rows += _rows(found)
     rows += _rows(
-        [r for r in thrown.matching(kind="policy") if r.unit["policy"] in SHIPPED and _beyond(r)]
+        [r for r in thrown.matching(kind="policy") if r.unit["policy"] in SHIPPED and _is_beyond(r)]
     )
     if rows:
         head = (
@@ -68,7 +70,7 @@ def section(thrown: ResultSet) -> Section:
     )
 
 
-def _beyond(result: Result) -> bool:
+def _is_beyond(result: Result) -> bool:
     """Whether a shipped policy's throws belong to the table: more than camera or noise was changed,
     or it was far.
     """
@@ -86,10 +88,8 @@ def _rows(found: list[Result]) -> list[tuple[str, ...]]:
     ):
         unit = r.unit
         error = st.mean(r.of("error")).text() if r.good.any() else "-"
-        trained, changes = (
-            TITLES.get(unit["variant"], unit["variant"]),
-            _changes(unit["departures"]),
-        )
+        trained = TITLES.get(unit["variant"], unit["variant"])
+        changes = _changes(unit["departures"])
         rows.append(
             (
                 unit["policy"],
@@ -144,14 +144,16 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
     names = sorted({r.unit["policy"] for r in thrown.matching(kind="policy", variant="moving")})
     if not names:
         missing.append(TITLES["moving"])
-    lines, rows = [], []
+    lines = []
+    rows = []
     for plant in ("hybrid", "reference-realistic"):
         for policy, points in _speeds(thrown, [*names, *SHIPPED], plant).items():
             if policy in SHIPPED and plant == "hybrid":
-                still = thrown.shipped(policy, plant, TARGET)
-                points = (
-                    [(0.0, still), *points] if still is not None and points[0][0] > 0.0 else points
-                )
+                reference = thrown.shipped(policy, plant, TARGET)
+                if reference is not None and points[0][0] > 0.0:
+                    points = [(0.0, reference), *points]
+                else:
+                    points = points
             if plant == "hybrid" and len(points) > 1:
                 label = f"{policy}, {TITLES['full']}" if policy in SHIPPED else policy
                 lines.append(
@@ -193,18 +195,22 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
 
 def _bars(thrown: ResultSet) -> list[str]:
     """Return each requirement and whether it was reached."""
-    said = []
+    sentences = []
     for policy, points in _speeds(
         thrown, sorted({r.unit["policy"] for r in thrown.matching(variant="moving")}), "hybrid"
     ).items():
         for speed, r in points:
             if speed == 0.5:
-                said.append(_judged(f"{policy} at targets that move at 0.5 m/s", r, MOVING_BAR))
+                sentences.append(
+                    _judged(f"{policy} at targets that move at 0.5 m/s", r, MOVING_BAR)
+                )
     for r in thrown.matching(
         kind="policy", variant="payload", plant="hybrid", target=TARGET, departures={}
     ):
-        said.append(_judged(f"{r.unit['policy']} with varied payload and cable", r, PAYLOAD_BAR))
-    return said
+        sentences.append(
+            _judged(f"{r.unit['policy']} with varied payload and cable", r, PAYLOAD_BAR)
+        )
+    return sentences
 
 
 def _judged(what: str, r: Result, bar: float) -> str:
@@ -231,7 +237,8 @@ def training_section(thrown: ResultSet) -> Section:
         " its row names."
     )
     groups: dict[str, list[np.ndarray]] = {}
-    rows, picture = [], None
+    rows = []
+    picture = None
     for run in thrown.runs:
         curve = np.array(
             [point for point in run.get("curve", []) if None not in point], dtype=float
@@ -290,26 +297,26 @@ def origin_section(thrown: ResultSet) -> Section:
     """A row for each command and commit that made throws, and seeds."""
     groups: dict[tuple[str, ...], list] = defaultdict(list)
     for r in thrown.results:
-        made = r.provenance
+        origin = r.provenance
         groups[
             (
-                made.get("command", "-").split(" (")[0],
-                str(made.get("commit", "-"))[:12],
+                origin.get("command", "-").split(" (")[0],
+                str(origin.get("commit", "-"))[:12],
                 SHORT[r.unit["plant"]],
             )
         ].append(r)
     rows = []
-    for (command, commit, plant), found in sorted(groups.items()):
-        times = sorted(str(r.provenance.get("time", "-"))[:10] for r in found)
-        seeds = ", ".join(sorted({str(r.unit["seed"]) for r in found}))
-        seconds = sum(r.provenance.get("seconds", 0.0) for r in found)
-        throws = sum(len(r.good) for r in found)
+    for (command, commit, plant), records in sorted(groups.items()):
+        times = sorted(str(r.provenance.get("time", "-"))[:10] for r in records)
+        seeds = ", ".join(sorted({str(r.unit["seed"]) for r in records}))
+        seconds = sum(r.provenance.get("seconds", 0.0) for r in records)
+        throws = sum(len(r.good) for r in records)
         rows.append(
             (
                 command,
                 commit,
                 plant,
-                str(len(found)),
+                str(len(records)),
                 str(throws),
                 seeds,
                 times[0] if times[0] == times[-1] else f"{times[0]} to {times[-1]}",
@@ -323,9 +330,8 @@ def origin_section(thrown: ResultSet) -> Section:
         " and count against 'landed'."
     )
     head = ("command", "commit", "plant", "sets", "throws", "seeds", "made on", "seconds of work")
-    table = (
-        Grid("Throws behind this page", head, tuple(rows), heads=3)
-        if rows
-        else Text("No throws are recorded.", "missing")
-    )
+    if rows:
+        table = Grid("Throws behind this page", head, tuple(rows), heads=3)
+    else:
+        table = Text("No throws are recorded.", "missing")
     return parts.section("origin", "Where the figures come from", lead, table)

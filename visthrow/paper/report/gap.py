@@ -94,7 +94,9 @@ TRAINED = {
 
 def section(thrown: ResultSet) -> Section:
     """Curves, what stands behind them, and the trainings."""
-    panels, rows, missing = [], [], []
+    panels = []
+    rows = []
+    missing = []
     for sweep in SWEEPS:
         lines = []
         for series, policy in enumerate(SHIPPED[::-1]):
@@ -141,33 +143,34 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> list[tuple[float, 
         for value, r in thrown.by_departure(policy, sweep.key, PLANT, TARGET)
         if r.good.any()
     }
-    own = thrown.shipped(policy, PLANT, TARGET)
-    if own is not None and points:
-        points[sweep.own] = own
+    nominal = thrown.shipped(policy, PLANT, TARGET)
+    if nominal is not None and points:
+        points[sweep.own] = nominal
     return sorted(points.items())
 
 
 def _line(
     sweep: GapSweep, policy: str, points: list[tuple[float, Result]], series: int
 ) -> figures.Line:
-    own = next((i for i, (value, _) in enumerate(points) if value == sweep.own), None)
+    nominal = next((i for i, (value, _) in enumerate(points) if value == sweep.own), None)
     intervals = [st.mean(r.of("error")) for _, r in points]
-    return figures.Line(f"{policy} policy", [value for value, _ in points], intervals, series, own)
+    return figures.Line(
+        f"{policy} policy", [value for value, _ in points], intervals, series, nominal
+    )
 
 
 def _rows(
     sweep: GapSweep, policy: str, points: list[tuple[float, Result]]
 ) -> list[tuple[str, ...]]:
-    own = dict(points).get(sweep.own)
+    nominal = dict(points).get(sweep.own)
     rows = []
     for value, r in points:
-        added = (
-            "its own"
-            if r is own
-            else "-"
-            if own is None
-            else st.difference(errors([r]), errors([own])).text(sign=True)
-        )
+        if r is nominal:
+            added = "its own"
+        elif nominal is None:
+            added = "-"
+        else:
+            added = st.difference(errors([r]), errors([nominal])).text(sign=True)
         rows.append(
             (
                 f"{sweep.title}, {sweep.xlabel}",
@@ -186,26 +189,28 @@ def _trained(thrown: ResultSet, missing: list[str]) -> list:
     """Vision policies that were trained with other sight, each in its own simulator and on the
     reference plant.
     """
-    marks, rows, plants = [], [], ("hybrid", "reference-realistic")
+    marks = []
+    rows = []
+    plants = ("hybrid", "reference-realistic")
     for series, plant in enumerate(plants):
         full = thrown.seeds("vision", "full", plant, TARGET, {})
         for variant, title in TRAINED.items():
-            own = (
+            nominal = (
                 {} if plant == "hybrid" else ANY
             )  # a reference plant is what it is, whatever the training had
-            found = (
-                full if variant == "full" else thrown.seeds("vision", variant, plant, TARGET, own)
-            )
+            if variant == "full":
+                found = full
+            else:
+                found = thrown.seeds("vision", variant, plant, TARGET, nominal)
             if not found:
                 missing.append(f"trained with {title} ({SHORT[plant]})")
                 continue
             error = st.mean(errors(found))
             marks.append(figures.Mark(title, error, series))
-            ratio = (
-                "-"
-                if variant == "full" or not full
-                else st.ratio(errors(found), errors(full)).text(2)
-            )
+            if variant == "full" or not full:
+                ratio = "-"
+            else:
+                ratio = st.ratio(errors(found), errors(full)).text(2)
             rows.append((title, SHORT[plant], str(len(found)), landed(*found), error.text(), ratio))
     if not rows:
         return []

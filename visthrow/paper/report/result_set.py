@@ -45,15 +45,15 @@ class ResultSet:
 
         What is None does not matter, nor do departures, with which the throws were flown, that are
         :data:`ANY`."""
-        wanted = {
+        conditions = {
             "layout": layout,
             "variant": variant,
             "policy": policy,
             "departures": None if departures is ANY else departures,
         }
-        wanted = {name: value for name, value in wanted.items() if value is not None}
+        conditions = {name: value for name, value in conditions.items() if value is not None}
         best: dict[str, Result] = {}
-        for result in self.matching(kind="policy", plant=plant, target=target, **wanted):
+        for result in self.matching(kind="policy", plant=plant, target=target, **conditions):
             name = result.unit["policy"]
             if name not in best or result.unit["throws"] > best[name].unit["throws"]:
                 best[name] = result
@@ -79,12 +79,12 @@ class ResultSet:
             if result.unit["policy"] not in SHIPPED and result.good.any()
         ]
 
-    def matching(self, **wanted: Any) -> list[Result]:
+    def matching(self, **conditions: Any) -> list[Result]:
         """Results whose unit has these entries."""
         return [
             r
             for r in self.results
-            if all(r.unit.get(name) == value for name, value in wanted.items())
+            if all(r.unit.get(name) == value for name, value in conditions.items())
         ]
 
     def by_departure(

@@ -25,16 +25,17 @@ def throws_section(thrown: ResultSet) -> Section:
     """Landing error and duration of the shipped policies on every plant, the paper's
     beside them.
     """
-    rows, missing = [], []
+    rows = []
+    missing = []
     for name in SHIPPED:
         for target in TARGETS:
             for plant in PLANTS:
-                found = thrown.shipped(name, plant, target)
-                if found is None:
+                result = thrown.shipped(name, plant, target)
+                if result is None:
                     if wanted_there(plant, target):
                         missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
                     continue
-                rows.append(_row(name, target, plant, found))
+                rows.append(_row(name, target, plant, result))
     lead = Text(
         "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and"
         " 2.5 m (`vision`): for the first 2.5 m is out of distribution. The training simulator has"
@@ -52,9 +53,10 @@ def throws_section(thrown: ResultSet) -> Section:
         "bias along / left [m]",
         "the paper's vehicle: error [m], duration [s]",
     )
-    table = (
-        Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3) if rows else None
-    )
+    if rows:
+        table = Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3)
+    else:
+        table = None
     return section(
         "throws",
         "What the policies do",
@@ -73,17 +75,17 @@ def wanted_there(plant: str, target: float) -> bool:
     return plant != "reference" or target == FRONT_TARGET
 
 
-def _row(name: str, target: float, plant: str, found: Result) -> tuple[str, ...]:
-    head = (name, f"{target:.1f}", SHORT[plant], str(len(found.good)), landed(found))
+def _row(name: str, target: float, plant: str, result: Result) -> tuple[str, ...]:
+    head = (name, f"{target:.1f}", SHORT[plant], str(len(result.good)), landed(result))
     paper = of_paper(name, target)
-    if not found.good.any():
+    if not result.good.any():
         return (*head, "-", "-", "-", "-", paper)
-    bias = st.bias(found.miss)
+    bias = st.bias(result.miss)
     return (
         *head,
-        st.mean(found.of("error")).text(),
-        f"{found.of('error').std():.3f}",
-        f"{found.of('duration').mean():.3f}",
+        st.mean(result.of("error")).text(),
+        f"{result.of('error').std():.3f}",
+        f"{result.of('duration').mean():.3f}",
         f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}",
         paper,
     )
@@ -112,7 +114,9 @@ def _scatter(thrown: ResultSet) -> Picture | None:
 
 def vision_section(thrown: ResultSet) -> Section:
     """Return the mean landing error of vision minus state, at each target on each plant."""
-    rows, marks, missing = [], [], []
+    rows = []
+    marks = []
+    missing = []
     for i, plant in enumerate(PLANTS):
         for target in TARGETS:
             pair = _groups(thrown, plant, target)
@@ -123,21 +127,20 @@ def vision_section(thrown: ResultSet) -> Section:
             (vision, state), runs = pair
             gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
             paper = _paper(target)
-            beside = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
+            comparison = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
             rows.append(
                 (
                     SHORT[plant],
                     f"{target:.1f}",
                     runs,
                     gap.text(sign=True),
-                    _said(gap),
+                    _sentence(gap),
                     faster.text(sign=True),
-                    beside,
+                    comparison,
                 )
             )
-            marks.append(
-                figures.Mark(f"{target:.1f} m", gap, i, None if paper is None or i else paper[0])
-            )
+            reference = None if paper is None or i else paper[0]
+            marks.append(figures.Mark(f"{target:.1f} m", gap, i, reference))
     parts = [
         Text(
             "Vision minus state: positive means that vision lands further off. Where several"
@@ -156,16 +159,9 @@ def vision_section(thrown: ResultSet) -> Section:
             "duration: vision - state [s]",
             "the paper's: error [m], duration [s]",
         )
-        picture = figures.marks(
-            marks,
-            "landing error, vision minus state [m]",
-            [SHORT[plant] for plant in PLANTS],
-            zero=0.0,
-        )
-        text = (
-            "Difference of mean landing errors with 95 % intervals; left of the line vision lands"
-            " nearer."
-        )
+        axis = "landing error, vision minus state [m]"
+        picture = figures.marks(marks, axis, [SHORT[plant] for plant in PLANTS], zero=0.0)
+        text = "Difference of mean landing errors with 95 % intervals; left: vision lands nearer."
         parts += [Grid("Vision against state", head, tuple(rows)), Picture("vision", picture, text)]
     return section(
         "vision", "Vision against state", *parts, missing=missing, head="Not thrown by both"
@@ -203,14 +199,16 @@ def _paper(target: float) -> tuple[st.Interval, float] | None:
     """The paper's differences: errors [m] with a normal interval from its deviations, ten throws
     each, and durations [s].
     """
-    vision, state = PAPER.get(("vision", target)), PAPER.get(("state", target))
+    vision = PAPER.get(("vision", target))
+    state = PAPER.get(("state", target))
     if vision is None or state is None:
         return None
-    gap, half = vision[0] - state[0], 1.96 * math.hypot(vision[1], state[1]) / math.sqrt(10.0)
+    gap = vision[0] - state[0]
+    half = 1.96 * math.hypot(vision[1], state[1]) / math.sqrt(10.0)
     return st.Interval(gap, gap - half, gap + half, "throws"), vision[2] - state[2]
 
 
-def _said(gap: st.Interval) -> str:
+def _sentence(gap: st.Interval) -> str:
     if 0.0 in gap:
         return "no difference shows"
     return "vision further off" if gap.value > 0.0 else "vision nearer"

@@ -25,7 +25,7 @@ KINDS = (("both", BOUNDS[0]), ("both", BOUNDS[1]), ("delay", BOUNDS[0]))
 PANELS = (
     (
         "own model\n(policies: training simulator)",
-        thrower.OWN,
+        thrower.IDEAL,
         (("none", BOUNDS[0]), ("none", BOUNDS[1])),
         "hybrid",
     ),
@@ -40,16 +40,17 @@ first is the paper's comparison.
 def _default(result: Result) -> bool:
     """Whether speed and weights are those of the throws by target."""
     unit = result.unit
-    wanted = thrower.unit(unit["plant"], unit["compensation"], unit["target"], 1)
-    return all(unit[name] == wanted[name] for name in ("speed", "w_t", "rho", "bounds"))
+    default = thrower.unit(unit["plant"], unit["compensation"], unit["target"], 1)
+    return all(unit[name] == default[name] for name in ("speed", "w_t", "rho", "bounds"))
 
 
 def baseline_section(thrown: ResultSet) -> Section:
     """Throws of the baseline by target, plant and compensation, broken down as in the paper."""
-    rows, missing = [], []
+    rows = []
+    missing = []
     for target in TARGETS:
-        for plant in (thrower.OWN, "hybrid", "reference-realistic"):
-            for compensation in ("none",) if plant == thrower.OWN else thrower.MADE_UP:
+        for plant in (thrower.IDEAL, "hybrid", "reference-realistic"):
+            for compensation in ("none",) if plant == thrower.IDEAL else thrower.MADE_UP:
                 best = _best(thrown, plant, target, compensation)
                 if best:
                     rows.append(best)
@@ -83,9 +84,9 @@ def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Re
 
 
 def _of_baseline(
-    thrown: ResultSet, plant: str, target: float = FRONT_TARGET, **wanted: str
+    thrown: ResultSet, plant: str, target: float = FRONT_TARGET, **conditions: str
 ) -> list[Result]:
-    return thrown.matching(kind="baseline", plant=plant, target=target, **wanted)
+    return thrown.matching(kind="baseline", plant=plant, target=target, **conditions)
 
 
 def by_target(results: Sequence[Result]) -> Grid:
@@ -112,12 +113,12 @@ def by_target(results: Sequence[Result]) -> Grid:
 
 def _row(result: Result) -> tuple[str, ...]:
     unit = result.unit
-    own = unit["plant"] == thrower.OWN
-    paper = of_paper("TO+MPC", unit["target"]) if own else "-"
+    ideal = unit["plant"] == thrower.IDEAL
+    paper = of_paper("TO+MPC", unit["target"]) if ideal else "-"
     head = (
         f"{unit['target']:.1f}",
         SHORT[unit["plant"]],
-        "-" if own else thrower.MADE_UP[unit["compensation"]],
+        "-" if ideal else thrower.MADE_UP[unit["compensation"]],
         str(len(result.good)),
         landed(result, digits=0),
     )
@@ -148,7 +149,8 @@ def _steps() -> list[Grid | Text]:
         ]
     grids = []
     for record in records:
-        cpu, (table,) = record["provenance"]["processors"]["cpu"], record["tables"]
+        cpu = record["provenance"]["processors"]["cpu"]
+        (table,) = record["tables"]
         note = f"{measurements.made_by(record)}. {record['notes'][0]}"
         rows = tuple(map(tuple, table["rows"]))
         grids.append(
@@ -167,13 +169,11 @@ def _bar(thrown: ResultSet) -> str:
     """Own-model errors and durations against the paper's: within 40 % of them, or better."""
     words = []
     for target in TARGETS:
-        best = _best(thrown, thrower.OWN, target, "none")
+        best = _best(thrown, thrower.IDEAL, target, "none")
         if best and best.good.any():
-            error, duration, paper = (
-                best.of("error").mean(),
-                best.of("duration").mean(),
-                PAPER[("TO+MPC", target)],
-            )
+            error = best.of("error").mean()
+            duration = best.of("duration").mean()
+            paper = PAPER[("TO+MPC", target)]
             words.append(
                 f"{target:g} m: error {error / paper[0]:.2f} and duration {duration / paper[2]:.2f}"
                 " times the paper's"
@@ -187,24 +187,29 @@ def front_section(
     """The sweep on each plant, as in :data:`PANELS`, with the policies of these names on it, and
     who beats whom.
     """
-    panels, sentences, sums, missing, picture, table = [], [], [], [], None, None
+    panels = []
+    sentences = []
+    sums = []
+    missing = []
+    picture = None
+    table = None
     for heading, plant, kinds, policies_on in shown:
         title = SHORT[plant]
         policies = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
         policies = [
             (name, result) for name, result in policies if result is not None and result.good.any()
         ]
-        drawn = []
+        charts = []
         for compensation, bounds in kinds:
             selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
             label = f"TO+MPC, bounds on {bounds}" + (
-                "" if plant == thrower.OWN else f", {thrower.MADE_UP[compensation]}"
+                "" if plant == thrower.IDEAL else f", {thrower.MADE_UP[compensation]}"
             )
             if not selected:
                 if (plant, bounds) != ("reference-realistic", BOUNDS[1]):
                     missing.append(f"{title}, {label}")
                 continue
-            drawn.append(((compensation, bounds), selected))
+            charts.append(((compensation, bounds), selected))
             sums.append(_summed(title, label, selected))
             sentences += _verdicts(title, label, selected, policies, policies_on)
         for name, result in policies:
@@ -213,7 +218,7 @@ def front_section(
             (f"{name} policy", st.mean(r.of("duration")), st.mean(r.of("error")))
             for name, r in policies
         ]
-        crosses = _paper_points() if plant == thrower.OWN else ()
+        crosses = _paper_points() if plant == thrower.IDEAL else ()
         late = {"delay": ", release lag not made up for"}
         fronts = tuple(
             (
@@ -221,7 +226,7 @@ def front_section(
                 f"TO+MPC, bounds on {bounds}{late.get(made_up, '')}",
                 points_of(selected),
             )
-            for (made_up, bounds), selected in drawn
+            for (made_up, bounds), selected in charts
         )
         panels.append(figures.Trade(heading, fronts, tuple(stars), crosses))
     lead = Text(
@@ -258,7 +263,7 @@ def front_section(
             " follows e_v."
         )
         table = Grid("Fronts in figures", head, tuple(sums), note, heads=2)
-    made = (
+    caption = (
         lead,
         picture,
         table,
@@ -266,7 +271,7 @@ def front_section(
         _breakdown(thrown),
     )
     return parts.section(
-        "front", "Agility against accuracy", *made, missing=missing, head="Not swept"
+        "front", "Agility against accuracy", *caption, missing=missing, head="Not swept"
     )
 
 
@@ -315,7 +320,8 @@ def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
 
 
 def _summed(title: str, label: str, selected: Sequence[Result]) -> tuple[str, ...]:
-    points, volume = points_of(selected), hypervolume(selected)
+    points = points_of(selected)
+    volume = hypervolume(selected)
     if volume is None:
         return (title, label, str(len(selected)), "0", "-", "-", "-", "-")
     good = [r for r in selected if r.good.all()]
@@ -360,31 +366,32 @@ def _verdicts(
     """Whether the paper's claim holds: no setting as accurate and as fast, and at each setting's
     accuracy the policy faster.
     """
-    points, sentences = points_of(selected), []
+    points = points_of(selected)
+    sentences = []
     for name, result in policies:
-        own = np.array([result.of("duration").mean(), result.of("error").mean()])
+        point = np.array([result.of("duration").mean(), result.of("error").mean()])
         head = (
             f"**{title}**, {label} against the {name} policy on the {SHORT[policies_on]}"
-            f" ({own[0]:.3f} s, {own[1]:.3f} m): "
+            f" ({point[0]:.3f} s, {point[1]:.3f} m): "
         )
         if not len(points):
             sentences.append(head + f"none of {_count(selected)} landed all its throws.")
             continue
-        beating = points[np.all(points <= own, axis=1)]
-        faster, nearer = points[points[:, 0] < own[0]], points[points[:, 1] < own[1]]
+        beating = points[np.all(points <= point, axis=1)]
+        faster = points[points[:, 0] < point[0]]
+        nearer = points[points[:, 1] < point[1]]
         if len(beating):
             best = beating[np.argmin(beating[:, 0])]
             claim = f"{len(beating)} of {_count(points)} as accurate and as fast at once"
             claim += f", the fastest with {best[0]:.3f} s and {best[1]:.3f} m"
         else:
             claim = "no setting is both as accurate and as fast"
-        speed = (
-            "the policy is faster than every setting"
-            if not len(faster)
-            else f"faster than the policy: {_count(faster)}"
-        )
+        if not len(faster):
+            speed = "the policy is faster than every setting"
+        else:
+            speed = f"faster than the policy: {_count(faster)}"
         accuracy = f"more accurate: {len(nearer)} of {_count(points)}" + (
-            f", the fastest of which takes {nearer[:, 0].min() / own[0]:.2f} times as long"
+            f", the fastest of which takes {nearer[:, 0].min() / point[0]:.2f} times as long"
             if len(nearer)
             else ""
         )
@@ -398,7 +405,7 @@ def _count(points: Sequence) -> str:
 
 def _breakdown(thrown: ResultSet) -> Grid | None:
     """The paper's table of settings, and ours of the own model."""
-    selected = _swept(_of_baseline(thrown, thrower.OWN))
+    selected = _swept(_of_baseline(thrown, thrower.IDEAL))
     if not selected:
         return None
     rows = [

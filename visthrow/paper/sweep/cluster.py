@@ -23,7 +23,9 @@ class ClusterJob:
     """One submitted task."""
 
     def __init__(self, job: Any, task: str, lost: Counter[str]) -> None:
-        self._job, self._task, self._lost = job, task, lost
+        self._job = job
+        self._task = task
+        self._lost = lost
 
     def poll(self) -> int | None:
         from submitit.core.utils import FailedJobError, UncompletedJobError

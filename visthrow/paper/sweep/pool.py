@@ -86,17 +86,13 @@ class Local:
         if device.startswith(
             "cuda"
         ):  # the process sees its own GPU alone, and puts no context on the others
-            seen = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
+            visible = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
             index = int(device.removeprefix("cuda:"))
-            words, environment = (
-                [*words, "--device", "cuda:0"],
-                {VISIBLE: seen[index] if seen else str(index)},
-            )
+            words = [*words, "--device", "cuda:0"]
+            environment = {VISIBLE: visible[index] if visible else str(index)}
         else:
-            words, environment = (
-                [*words, "--device", device],
-                (dict.fromkeys(THREADS, "1") if not task.gpu else {}),
-            )
+            words = [*words, "--device", device]
+            environment = dict.fromkeys(THREADS, "1") if not task.gpu else {}
         words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
         for change in self.changes:
             words += ["--set", change]
@@ -117,21 +113,23 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
     be done are added to ``done``.
     """
 
-    def left(unit: ResultSource | ThrowUnit) -> bool:
+    def remaining(unit: ResultSource | ThrowUnit) -> bool:
         if unit.id not in done and unit.done(out):
             done.add(unit.id)
         return unit.id not in done
 
     for source in work.sources:
         units = work.throws.get(source.id, ())
-        untrained = bool(source.config) and left(source)
+        untrained = bool(source.config) and remaining(source)
         mine = [
-            unit.id for unit in units if unit.params.plant == "hybrid" and (untrained or left(unit))
+            unit.id
+            for unit in units
+            if unit.params.plant == "hybrid" and (untrained or remaining(unit))
         ]
         if untrained or mine:
             yield Task(source.id, (*([source.id] if untrained else []), *mine), gpu=True)
         for unit in () if untrained else units:
-            if unit.params.plant != "hybrid" and left(unit):
+            if unit.params.plant != "hybrid" and remaining(unit):
                 yield Task(unit.id, (unit.id,), gpu=False)
 
 
@@ -145,8 +143,13 @@ class ProcessPool:
     def __init__(
         self, work: SweepWork, out: Path, starter: Any, say: Callable[[str], None]
     ) -> None:
-        self.work, self.out, self.starter, self.say = work, out, starter, say
-        self.outcome, self._done, self._todo = Outcome(), set(), []
+        self.work = work
+        self.out = out
+        self.starter = starter
+        self.say = say
+        self.outcome = Outcome()
+        self._done = set()
+        self._todo = []
         self._running: dict[str, tuple[Task, str, Any]] = {}
         self._wait: dict[str, float] = {}  # task -> time before which it is not tried again
 
@@ -156,11 +159,11 @@ class ProcessPool:
         self._todo = list(tasks(self.work, self.out, self._done))
         try:
             while self._todo or self._running:
-                left = None if deadline is None else (deadline - time.monotonic()) / 60.0
-                if left is not None and left <= 0.0:
+                remaining = None if deadline is None else (deadline - time.monotonic()) / 60.0
+                if remaining is not None and remaining <= 0.0:
                     self.outcome.stopped = True
                     break
-                self._fill(left)
+                self._fill(remaining)
                 time.sleep(POLL)
                 if self._reap():
                     self._todo = list(tasks(self.work, self.out, self._done))
@@ -171,26 +174,26 @@ class ProcessPool:
             self._stop()
         return self.outcome
 
-    def _fill(self, left: float | None) -> None:
+    def _fill(self, remaining: float | None) -> None:
         """Start what there is room for."""
-        now = time.monotonic()
+        time_ = time.monotonic()
         used = [device for _, device, _ in self._running.values()]
         free = [device for device in self.starter.devices if device not in used]
         cores = self.starter.jobs - used.count("cpu core")
         for task in self._todo:
-            if task.name in self._running or self._wait.get(task.name, 0.0) > now:
+            if task.name in self._running or self._wait.get(task.name, 0.0) > time_:
                 continue
             if task.gpu and free:
-                self._start(task, free.pop(0), left)
+                self._start(task, free.pop(0), remaining)
             elif not task.gpu and cores > 0:
-                self._start(task, "cpu core", left)
+                self._start(task, "cpu core", remaining)
                 cores -= 1
             if not free and cores <= 0:
                 break
 
-    def _start(self, task: Task, slot: str, left: float | None) -> None:
+    def _start(self, task: Task, slot: str, remaining: float | None) -> None:
         device = "cpu" if slot == "cpu core" else slot
-        self._running[task.name] = (task, slot, self.starter.start(task, device, left))
+        self._running[task.name] = (task, slot, self.starter.start(task, device, remaining))
         if task.gpu:
             self.say(f"{task.name} begins on {device}")
 
@@ -233,6 +236,6 @@ class ProcessPool:
 
 def last_line(log: Path) -> str:
     """Return the last line of what a task printed."""
-    return (
-        log.read_text(errors="replace").strip().rpartition("\n")[2].strip() if log.exists() else ""
-    )
+    if log.exists():
+        return log.read_text(errors="replace").strip().rpartition("\n")[2].strip()
+    return ""

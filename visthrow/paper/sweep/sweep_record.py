@@ -25,19 +25,21 @@ CURVE_POINTS = 60  # points of a run's learning curve in the record
 
 def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
     """A line a run, a last one with the sum, and whether all is done."""
-    lines, seconds, left = [], 0.0, 0
+    lines = []
+    seconds = 0.0
+    remaining = 0
     width = max(len(source.name) for source in work.sources)
     for source in work.sources:
         units = work.throws.get(source.id, ())
         thrown = sum(unit.done(out) for unit in units)
         state, spent = _state(source, out)
         seconds += spent
-        left += (not source.done(out)) + len(units) - thrown
+        remaining += (not source.done(out)) + len(units) - thrown
         lines.append(f"{source.name:{width}}  {state:44}  throws {thrown}/{len(units)}")
     lines.append(
-        f"{len(work.sources)} runs, {seconds / 60:.1f} minutes of training, {left} units left"
+        f"{len(work.sources)} runs, {seconds / 60:.1f} minutes of training, {remaining} units left"
     )
-    return lines, left == 0
+    return lines, remaining == 0
 
 
 def _state(source: ResultSource, out: Path) -> tuple[str, float]:
@@ -65,10 +67,8 @@ def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
 
     Of two results for the same question, older and newer weights or config, the one that is here
     counts. Raises StorageError: nothing is done, and nothing stands there."""
-    training, throws = (
-        records / "training" / f"{work.name}.json",
-        records / "throws" / f"{work.name}.json",
-    )
+    training = records / "training" / f"{work.name}.json"
+    throws = records / "throws" / f"{work.name}.json"
     runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {
         source.name: _run(source, out)
         for source in work.sources
@@ -88,13 +88,13 @@ def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
         (run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]]
     )
     results.write_line(training, {"runs": listed})
-    kept = {_question(result): result for result in results.load_all([throws]).values()}
+    recorded = {_question(result): result for result in results.load_all([throws]).values()}
     for units in work.throws.values():
         for unit in units:
             if unit.done(out):
                 path = throws_folder(out) / f"{results.key_of(unit.unit(out))}.json"
-                kept |= {_question(result): result for result in results.load(path)}
-    results.pack(kept.values(), throws)
+                recorded |= {_question(result): result for result in results.load(path)}
+    results.pack(recorded.values(), throws)
     return [training, throws]
 
 
@@ -129,11 +129,13 @@ def _final(source: ResultSource, out: Path) -> dict[str, float | None]:
 
 def _run(source: ResultSource, out: Path) -> dict[str, Any]:
     """A finished training for the record."""
-    rows, summary = _progress(source, out), _summary(source, out)
+    rows = _progress(source, out)
+    summary = _summary(source, out)
     experiment = source.experiment()
     per_iteration = experiment.samples
     step = max(len(rows) // CURVE_POINTS, 1)
-    curve, seconds = [], 0.0
+    curve = []
+    seconds = 0.0
     for i, row in enumerate(rows, 1):
         seconds += float(row["rollout_s"]) + float(row["learning_s"])
         if i % step == 0:

@@ -73,17 +73,20 @@ def work(work: SweepWork, out: Path, ids: Sequence[str], device: str, minutes: f
 
     Returns 0; 130 where a training was stopped before its end; 75 where another process had the
     unit."""
-    begin, status = time.monotonic(), 0
+    begin = time.monotonic()
+    status = 0
     throws = {unit.id: unit for units in work.throws.values() for unit in units}
     for name in ids:
-        left = None if minutes is None else max(minutes - (time.monotonic() - begin) / 60, 0.01)
+        remaining = (
+            None if minutes is None else max(minutes - (time.monotonic() - begin) / 60, 0.01)
+        )
         unit = throws.get(name) or work.source(name)
         try:
             with locked(lock_of(out, name)):
                 if unit.done(out):
                     continue
                 if isinstance(unit, ResultSource):
-                    status = train(unit, out, device, left, work.checkpoint_every)
+                    status = train(unit, out, device, remaining, work.checkpoint_every)
                 elif unit.source.done(out):
                     fly(unit, out, device)
         except BusyError as error:
@@ -107,7 +110,7 @@ def train(
     resume = (folder / CHECKPOINT).is_file()
     if folder.exists() and not resume:  # killed before its first checkpoint
         shutil.rmtree(folder)
-    asked = session.Options(
+    options = session.Options(
         source.config,
         source.seed,
         str(folder),
@@ -117,10 +120,11 @@ def train(
         device=device,
         overrides=source.changes,
     )
-    start, began = time.perf_counter(), datetime.now(UTC).isoformat(timespec="seconds")
+    start = time.perf_counter()
+    began = datetime.now(UTC).isoformat(timespec="seconds")
     status = 1
     try:
-        status = session.run(asked)
+        status = session.run(options)
         status = status if status or source.done(out) else EXIT_STOPPED  # by the clock
     finally:
         piece = {

@@ -99,10 +99,11 @@ class ThrowUnit:
 
     def unit(self, out: Path) -> dict[str, Any]:
         """Return the key of :mod:`visthrow.throws.results`; the policy must exist."""
-        source, params = self.source, self.params
+        source = self.source
+        params = self.params
         path = source.policy(out)
-        own, flown = self.experiments(out)
-        layout = own["task"]["observation"]["layout"]
+        nominal, flown = self.experiments(out)
+        layout = nominal["task"]["observation"]["layout"]
         run, seed = (source.config, source.seed) if source.config else (layout, None)
         unit = results.policy_unit(
             source.name,
@@ -115,7 +116,7 @@ class ThrowUnit:
             run=Path(run).stem,
             variant=variant_of(run),
             train_seed=seed,
-            departures=differences(own, flown),
+            departures=differences(nominal, flown),
         )
         return unit if self.batch is None else {**unit, "batch": self.batch}
 
@@ -124,15 +125,14 @@ class ThrowUnit:
         source = self.source
 
         def stated(name: str, changes: tuple[str, ...]) -> dict[str, Any]:
-            found = (
-                config.to_dict(_experiment(name, changes))
-                if name
-                else _shipped_config(source.policy(out), changes)
-            )
-            return {key: value for key, value in found.items() if key != "ppo"}
+            if name:
+                values = config.to_dict(_experiment(name, changes))
+            else:
+                values = _shipped_config(source.policy(out), changes)
+            return {key: value for key, value in values.items() if key != "ppo"}
 
-        own = stated(source.config, source.flown)
-        return own, stated(*self.flown_in(own["task"]["observation"]["layout"]))
+        nominal = stated(source.config, source.flown)
+        return nominal, stated(*self.flown_in(nominal["task"]["observation"]["layout"]))
 
     def flown_in(self, layout: str) -> tuple[str, tuple[str, ...]]:
         """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its
@@ -161,10 +161,10 @@ class SweepWork:
 
     def source(self, name: str) -> ResultSource:
         """The training of that id; ConfigError where the list has changed."""
-        known = {source.id: source for source in self.sources}
-        if name not in known:
-            raise ConfigError(f"no run '{name}' in the list; {suggest(name, known)}")
-        return known[name]
+        sources = {source.id: source for source in self.sources}
+        if name not in sources:
+            raise ConfigError(f"no run '{name}' in the list; {suggest(name, sources)}")
+        return sources[name]
 
 
 def throws_folder(out: Path) -> Path:
@@ -178,8 +178,8 @@ def variant_of(run: str) -> str:
     ``state_no_delay`` -> ``no_delay``.
     """
     stem = Path(run).stem
-    layout, _, rest = stem.partition("_")
-    return "full" if stem in FULL.values() else rest if layout in FULL and rest else stem
+    layout, _, variant = stem.partition("_")
+    return "full" if stem in FULL.values() else variant if layout in FULL and variant else stem
 
 
 def load_list(name: str, overrides: tuple[str, ...] = ()) -> SweepWork:
@@ -196,7 +196,8 @@ def expand(name: str, params: SweepList) -> SweepWork:
     throws: dict[str, list[ThrowUnit]] = {}
     commit = provenance.commit() if params.commit == "same" else ""
     for called, group in params.runs.items():
-        changes, mark = params.changes + group.changes, f"{called}-" if group.changes else ""
+        changes = params.changes + group.changes
+        mark = f"{called}-" if group.changes else ""
         trained = [
             _trained(item, mark, changes, seed, commit)
             for seed in group.seeds
@@ -205,14 +206,13 @@ def expand(name: str, params: SweepList) -> SweepWork:
         for source in [*(ResultSource(str(policy)) for policy in group.policies), *trained]:
             sources.setdefault(source.id, source)
             listed = throws.setdefault(source.id, [])
-            for wanted in group.throws:
-                throw = params.throws[wanted]
-                count = (
-                    throw.count
-                    if params.most_throws is None
-                    else min(throw.count, params.most_throws)
-                )
-                fresh = _throws(source, wanted, replace(throw, count=count))
+            for throws_ in group.throws:
+                throw = params.throws[throws_]
+                if params.most_throws is None:
+                    count = throw.count
+                else:
+                    count = min(throw.count, params.most_throws)
+                fresh = _throws(source, throws_, replace(throw, count=count))
                 listed.extend(unit for unit in fresh if unit not in listed)
     return SweepWork(
         name,
@@ -222,16 +222,17 @@ def expand(name: str, params: SweepList) -> SweepWork:
     )
 
 
-def differences(own: dict, flown: dict, path: str = "") -> dict[str, Any]:
+def differences(base: dict, flown: dict, path: str = "") -> dict[str, Any]:
     """Dotted key -> value flown with, wherever two configs differ."""
-    found: dict[str, Any] = {}
-    for key in sorted(own.keys() | flown.keys()):
-        before, now = own.get(key), flown.get(key)
-        if isinstance(before, dict) and isinstance(now, dict):
-            found |= differences(before, now, f"{path}{key}.")
-        elif before != now:
-            found[f"{path}{key}"] = now
-    return found
+    changed: dict[str, Any] = {}
+    for key in sorted(base.keys() | flown.keys()):
+        before = base.get(key)
+        value = flown.get(key)
+        if isinstance(before, dict) and isinstance(value, dict):
+            changed |= differences(before, value, f"{path}{key}.")
+        elif before != value:
+            changed[f"{path}{key}"] = value
+    return changed
 
 
 def _trained(

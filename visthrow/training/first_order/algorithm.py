@@ -43,17 +43,15 @@ class FirstOrder:
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        self.cfg, self.p, self._ranks = experiment, experiment.first_order, ranks
-        observation, p, on_gpu = (
-            experiment.task.observation,
-            experiment.ppo,
-            device.startswith("cuda"),
-        )
-        late, others = (
-            observation.oldest > experiment.sim.control_period,
-            experiment.task.target.moves or experiment.fleet is not None,
-        )
-        if observation.layout != "state" or late or others:
+        self.cfg = experiment
+        self.p = experiment.first_order
+        self._ranks = ranks
+        observation = experiment.task.observation
+        p = experiment.ppo
+        on_gpu = device.startswith("cuda")
+        late = observation.oldest > experiment.sim.control_period
+        unsupported = experiment.task.target.moves or experiment.fleet is not None
+        if observation.layout != "state" or late or unsupported:
             expected = (
                 'observation.layout = "state", a latency of one period at most, one vehicle and'
                 " goals that stand still"
@@ -63,13 +61,16 @@ class FirstOrder:
                 " of its policy"
             )
         lag = experiment.release.lag / experiment.sim.control_period
-        self.lag, rest = int(lag + 1e-6), max(lag - int(lag + 1e-6), 0.0)
+        self.lag = int(lag + 1e-6)
+        remainder_ = max(lag - int(lag + 1e-6), 0.0)
         if self.p.horizon < self.lag + NODES[-1]:
             raise ConfigError(
                 f"first_order.horizon is {self.p.horizon} steps; expected at least {self.lag + 2}"
                 " for a release"
             )
-        self._shares = [math.prod((rest - b) / (a - b) for b in NODES if b != a) for a in NODES]
+        self._shares = [
+            math.prod((remainder_ - b) / (a - b) for b in NODES if b != a) for a in NODES
+        ]
         blind = dataclasses.replace(
             experiment, ppo=dataclasses.replace(p, privileged=())
         )  # there is no critic
@@ -84,7 +85,8 @@ class FirstOrder:
             env.get_observations(), {"actor": ["actor"]}, "actor", act.ACTIONS, **shape
         ).to(device)
         with torch.no_grad():  # random commands give every observation a spread to start from
-            self.surrogate, last = fit(env, self.network), self.network.mlp[-1]
+            self.surrogate = fit(env, self.network)
+            last = self.network.mlp[-1]
             last.weight.mul_(0.1)  # hover with the latch at rest, whatever is seen
             last.bias.copy_(env._start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
@@ -94,14 +96,15 @@ class FirstOrder:
             course(self.p.horizon, env.num_envs, device),
         )
         self.layers = Layers(self.network, self.flights.obs)
-        self._launches, self._adapting = self._recorded(adjoint), False
+        self._launches = self._recorded(adjoint)
+        self._adapting = False
         self._schedule(0.0)
         rate = torch.tensor(self.p.learning_rate, device=device) if on_gpu else self.p.learning_rate
         self.optimizer = torch.optim.Adam(
             self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu
         )
         self.rollout, self.backward = (
-            Replayed(work) if on_gpu else work for work in (self._fly, self._back)
+            Replayed(work) if on_gpu else work for work in (self._fly, self._run_backward)
         )
 
     @property
@@ -114,11 +117,10 @@ class FirstOrder:
         share of the training.
         """
         p = self.p
-        self._width = (
-            p.adapting_width
-            if self._adapting
-            else p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
-        )
+        if self._adapting:
+            self._width = p.adapting_width
+        else:
+            self._width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
         self._latched, freed = (
             min(max((done - low) / (high - low), 0.0), 1.0) for low, high in (p.latched, p.free)
         )
@@ -129,21 +131,19 @@ class FirstOrder:
         """Fly one batch without release, on a CPU each flight until nothing that follows has a
         derivative: its latch asked twice.
         """
-        stops, asked = (
-            self._latched == 1.0 and self.env.device == "cpu",
-            torch.zeros_like(self.flights.steps),
-        )
+        stops = self._latched == 1.0 and self.env.device == "cpu"
+        requests = torch.zeros_like(self.flights.steps)
 
-        def decide(k: int, seen: Tensor) -> Tensor | None:
+        def decide(k: int, obs: Tensor) -> Tensor | None:
             before = k - (self.lag + NODES[-1] + 1)  # all that a release there depends on is known
             if stops and before >= self._first:
-                asked.add_(self.layers.action[before, :, act.COMMANDS] > self.cfg.release.threshold)
-                torch.lt(asked, 2, out=self.flights.flying)
-            return (
-                self.layers.forward(k, seen, self.flights.flying)
-                if not stops or self.flights.flying.any()
-                else None
-            )
+                requests.add_(
+                    self.layers.action[before, :, act.COMMANDS] > self.cfg.release.threshold
+                )
+                torch.lt(requests, 2, out=self.flights.flying)
+            if not stops or self.flights.flying.any():
+                return self.layers.forward(k, obs, self.flights.flying)
+            return None
 
         self.flights.fly(decide)
 
@@ -151,7 +151,9 @@ class FirstOrder:
         """Reward, landing error [m] and time to impact [s] of a release at each of the first steps,
         shape (count, E).
         """
-        p, release, flights = self.cfg.task.reward, self.cfg.release, self.flights
+        p = self.cfg.task.reward
+        release = self.cfg.release
+        flights = self.flights
         up = x.load_vel[..., 2]
         fall = (
             up
@@ -184,14 +186,13 @@ class FirstOrder:
 
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
-        task, env = self.cfg.task, self.env
-        p, bounds, rate, height, load = (
-            task.reward,
-            task.bounds,
-            x.response[1:, :, 1:],
-            x.pos[1:, :, 2],
-            x.load_pos[1:, :, 2],
-        )
+        task = self.cfg.task
+        env = self.env
+        p = task.reward
+        bounds = task.bounds
+        rate = x.response[1:, :, 1:]
+        height = x.pos[1:, :, 2]
+        load = x.load_pos[1:, :, 2]
         action = act.clip_action(x.action)
         action, before = (
             a.flatten(0, 1)
@@ -200,7 +201,7 @@ class FirstOrder:
         acting = rewards.command(p, action, env._rate_weights) + rewards.change(
             p, action, before, env._change_weights
         )
-        inside = [
+        margins = [
             height - bounds.altitude[0] - ALTITUDE,
             bounds.altitude[1] - ALTITUDE - height,
             height - load - ABOVE,
@@ -208,7 +209,7 @@ class FirstOrder:
             bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
             x.tilt[1:, :, 2] - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
         ]
-        barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in inside)
+        barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in margins)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
         return (
             moving
@@ -219,14 +220,18 @@ class FirstOrder:
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
-        p, steps, T, lag = self.cfg.task.reward, self.flights.steps, self.flights.last, self.lag
+        p = self.cfg.task.reward
+        steps = self.flights.steps
+        T = self.flights.last
+        lag = self.lag
         k, K = (
             torch.arange(T, device=steps.device)[:, None],
             T - lag - 1,
         )  # the cubic looks a step past the separation
         reward, error, fall = self._rewards_at_release(x, K)
         latch_input = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
-        smooth, cut = torch.sigmoid(latch_input / self._width), k[:K] + lag + 2 > steps
+        smooth = torch.sigmoid(latch_input / self._width)
+        cut = k[:K] + lag + 2 > steps
         hazard = (
             smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
         )  # the slope stays that of the smooth one
@@ -241,11 +246,10 @@ class FirstOrder:
             + (carried * self._carrying(x)).sum(0)
             - p.termination * survival[-1]
         )
-        done, error = (chance * ~cut).detach(), (error.square() - ROUND**2).clamp(min=0.0).sqrt()
-        duration, share = (
-            (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall,
-            done / done.sum().clamp(min=1e-6),
-        )
+        done = (chance * ~cut).detach()
+        error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
+        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall
+        share = done / done.sum().clamp(min=1e-6)
         figures = {
             "landing_error": (share * error).sum(),
             "duration": (share * duration).sum(),
@@ -257,11 +261,9 @@ class FirstOrder:
         """Derivatives of the cost of the last rollout by the actions, as the layers hold them;
         returns figures.
         """
-        f, T, states = (
-            self.flights.x,
-            self.flights.last,
-            ("pos", "vel", "load_pos", "load_vel", "response"),
-        )
+        f = self.flights.x
+        T = self.flights.last
+        states = ("pos", "vel", "load_pos", "load_vel", "response")
         tilt = ob.rotation_from_quat(f["quat"][: T + 1])[..., 2, :]  # world z in the body frame
         leaves = {name: f[name][: T + 1].clone() for name in states} | {
             "tilt": tilt,
@@ -283,13 +285,15 @@ class FirstOrder:
 
     def _recorded(self, adjoint: Course) -> list[wp.Launch]:
         """Launches of the backward kernel, a step each."""
-        env, flights, action, p = self.env, self.flights, self.cfg.task.action, Setting()
-        p.max_thrust, p.max_rate, p.history = (
-            action.max_thrust,
-            wp.vec3(*action.max_rate),
-            env.layout.history,
-        )
-        p.period, p.decay = self.cfg.sim.control_period, self.p.decay
+        env = self.env
+        flights = self.flights
+        action = self.cfg.task.action
+        p = Setting()
+        p.max_thrust = action.max_thrust
+        p.max_rate = wp.vec3(*action.max_rate)
+        p.history = env.layout.history
+        p.period = self.cfg.sim.control_period
+        p.decay = self.p.decay
         plants = {
             "mass": flights.mass,
             "load_mass": flights.load_mass,
@@ -302,20 +306,19 @@ class FirstOrder:
             wp.from_torch,
             (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action),
         )
-        given, how = (
-            (adjoint, flights.course, *remainder),
-            {
-                "device": env.device,
-                "block_dim": 64,
-                "record_cmd": True,
-            },
-        )
+        arguments = (adjoint, flights.course, *remainder)
+        how = {
+            "device": env.device,
+            "block_dim": 64,
+            "record_cmd": True,
+        }
         return [
-            wp.launch(backward, env.num_envs, [p, k, *given], **how) for k in range(self.p.horizon)
+            wp.launch(backward, env.num_envs, [p, k, *arguments], **how)
+            for k in range(self.p.horizon)
         ]
 
     @torch.no_grad()
-    def _back(self) -> None:
+    def _run_backward(self) -> None:
         """Turn derivatives of the cost by states and actions into whole derivatives by the
         actions.
         """
@@ -330,20 +333,23 @@ class FirstOrder:
 
     @torch.no_grad()
     def learn(self, done: float) -> dict[str, float]:
-        p, parameters, T = self.p, list(self.network.mlp.parameters()), self.flights.last
-        highest, lowest = (
-            (p.adapting_rate, 0.1 * p.adapting_rate)
-            if self._adapting
-            else (p.learning_rate, p.final_rate)
-        )
+        p = self.p
+        parameters = list(self.network.mlp.parameters())
+        T = self.flights.last
+        if self._adapting:
+            highest = p.adapting_rate
+            lowest = 0.1 * p.adapting_rate
+        else:
+            highest = p.learning_rate
+            lowest = p.final_rate
         rate = cosine_rate(self.optimizer, done, highest, lowest)
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
-        most = (
+        limit = (
             OUTLIER * size.kthvalue(len(size) // 2 + 1).values
         )  # a few wild flights must not outweigh the rest
         self.layers.gradients(
-            self.flights.obs[:T], self.flights.flown()[:T], (most / size).clamp(max=1.0)
+            self.flights.obs[:T], self.flights.flown()[:T], (limit / size).clamp(max=1.0)
         )
         self._ranks.average(parameters)
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)

@@ -185,28 +185,24 @@ class Layers:
     """
 
     def __init__(self, network: Network, obs: Tensor):
-        self._network, self._linear = (
-            network,
-            [layer for layer in network.mlp if isinstance(layer, nn.Linear)],
-        )
+        self._network = network
+        self._linear = [layer for layer in network.mlp if isinstance(layer, nn.Linear)]
         rooms = [
             [obs.new_zeros(*obs.shape[:2], layer.out_features) for layer in self._linear]
             for _ in range(3)
         ]
         self._inner, self._by_inner, (*self._slope, _) = rooms
         self._first = torch.zeros_like(self._linear[0].weight)  # with the normaliser's spread
-        self.action, self.by_action, self.by_seen = (
-            self._inner[-1],
-            self._by_inner[-1],
-            torch.zeros_like(obs[0]),
-        )
+        self.action = self._inner[-1]
+        self.by_action = self._by_inner[-1]
+        self.by_seen = torch.zeros_like(obs[0])
 
-    def forward(self, k: int, seen: Tensor, flying: Tensor) -> Tensor:
+    def forward(self, k: int, obs: Tensor, flying: Tensor) -> Tensor:
         """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are
         flying, shape (E,).
         """
         rows = _picked(flying)
-        x = self._network.obs_normalizer(seen[rows])
+        x = self._network.obs_normalizer(obs[rows])
         for layer, inner in zip(self._linear, self._inner):
             out = torch.addmm(layer.bias, x, layer.weight.T)
             inner[k, rows], x = out, self._network.mlp[1](out)
@@ -224,15 +220,14 @@ class Layers:
                             self._network.mlp[1](leaf := x.detach().requires_grad_()).sum(), leaf
                         )[0]
                     )
-        spread = (
-            self._network.obs_normalizer.std + self._network.obs_normalizer.eps
-            if self._network.obs_normalization
-            else 1.0
-        )
+        if self._network.obs_normalization:
+            spread = self._network.obs_normalizer.std + self._network.obs_normalizer.eps
+        else:
+            spread = 1.0
         self._first.copy_(self._linear[0].weight.detach() / spread)
         self.by_seen.zero_()
 
-    def back(self, k: int, flown: Tensor) -> None:
+    def backpropagate(self, k: int, flown: Tensor) -> None:
         """Turn derivatives by the actions of step k into those by its observations, of the flights
         that flew it, shape (E,).
         """
@@ -244,18 +239,17 @@ class Layers:
             gradient = by_inner[k, rows] = (gradient @ layer.weight).mul_(slope[k, rows])
         self.by_seen[rows] = gradient @ self._first
 
-    def gradients(self, seen: Tensor, flown: Tensor, shares: Tensor) -> None:
+    def gradients(self, obs: Tensor, flown: Tensor, shares: Tensor) -> None:
         """Give the weights their derivatives: seen, shape (T, E, D), at steps that were flown, (T,
         E); flights count by shares, (E,).
         """
         rows = _picked(flown.flatten())
-        x, shares = (
-            self._network.obs_normalizer(seen.flatten(0, 1)[rows]),
-            shares.expand(flown.shape).flatten()[rows, None],
-        )
+        x = self._network.obs_normalizer(obs.flatten(0, 1)[rows])
+        shares = shares.expand(flown.shape).flatten()[rows, None]
         for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
             gradient = by_inner.flatten(0, 1)[rows] * shares
-            layer.weight.grad, layer.bias.grad = gradient.mT @ x, gradient.sum(0)
+            layer.weight.grad = gradient.mT @ x
+            layer.bias.grad = gradient.sum(0)
             x = self._network.mlp[1](inner.flatten(0, 1)[rows])
 
 

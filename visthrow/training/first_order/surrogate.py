@@ -31,7 +31,7 @@ from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import Network
 
-EXCITED, KEPT = (
+EXCITED, RETAINED = (
     (
         0.35,
         0.5,
@@ -63,11 +63,12 @@ def course(steps: int, count: int, device: str) -> tuple[dict[str, Tensor], Cour
     """Tensors of shape (T + 1, E, 3 or 4) by the names of :class:`Course`, and the same memory for
     kernels.
     """
-    x, made = {}, Course()
+    x = {}
+    course_ = Course()
     for name, field in Course.vars.items():
         x[name] = torch.zeros(steps + 1, count, field.type.dtype._length_, device=device)
-        setattr(made, name, wp.from_torch(x[name], dtype=field.type.dtype))
-    return x, made
+        setattr(course_, name, wp.from_torch(x[name], dtype=field.type.dtype))
+    return x, course_
 
 
 class Flights:
@@ -85,18 +86,16 @@ class Flights:
     """
 
     def __init__(self, env: ThrowEnv, steps: int):
-        E, make = env.num_envs, {"device": env.device}
+        E = env.num_envs
+        make = {"device": env.device}
         self.env, (self.x, self.course), self.last = env, course(steps, E, env.device), steps
-        self.obs, self.landing = (
-            torch.zeros(steps, E, env.layout.dimension, **make),
-            torch.zeros(steps + 1, E, 2, **make),
-        )
-        self.time, self.status = (
-            torch.zeros(steps + 1, E, **make),
-            torch.zeros(steps + 1, E, dtype=torch.int32, **make),
-        )
+        self.obs = torch.zeros(steps, E, env.layout.dimension, **make)
+        self.landing = torch.zeros(steps + 1, E, 2, **make)
+        self.time = torch.zeros(steps + 1, E, **make)
+        self.status = torch.zeros(steps + 1, E, dtype=torch.int32, **make)
         self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
-        self._mask, (vehicle, rope) = wp.from_torch(self.flying), env.sim.plants()
+        self._mask = wp.from_torch(self.flying)
+        (vehicle, rope) = env.sim.plants()
         above = rope["total_mass"] - rope["payload_mass"]
         parts = (
             vehicle["body"]["mass"],
@@ -118,7 +117,10 @@ class Flights:
         """Fly from new starts under actions ``act(k, observations)``; where it has none, all
         flights are over.
         """
-        env, x, state, out = self.env, self.x, self.env.views.state, self.env.views.out
+        env = self.env
+        x = self.x
+        state = self.env.views.state
+        out = self.env.views.out
         loads = {"load_pos": out["payload_pos_w"], "load_vel": out["payload_vel_w"]}
         sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"]} | loads
         observation = env.reset()["actor"]
@@ -132,11 +134,10 @@ class Flights:
             torch.mul(
                 self._thrust, state["motor_speed"].square().sum(-1), out=x["response"][k, :, 0]
             )
-            x["response"][k, :, 1:], self.status[k] = state["rate_b"], state["status"]
-            self.landing[k], self.time[k] = (
-                env.views.foreseen["landing_w"][:, :2],
-                env.views.foreseen["time_to_impact"],
-            )
+            x["response"][k, :, 1:] = state["rate_b"]
+            self.status[k] = state["status"]
+            self.landing[k] = env.views.foreseen["landing_w"][:, :2]
+            self.time[k] = env.views.foreseen["time_to_impact"]
             self.last = k
             if k == len(self.obs):
                 break
@@ -153,13 +154,11 @@ class Flights:
             self.status[1:],
         )
         pos, rot, load_pos, status = (value.flatten(0, 1) for value in flown)
-        held, time, height = (
-            torch.zeros_like(status, dtype=torch.bool),
-            torch.zeros_like(pos[:, 0]),
-            env.cfg.release.landing_height,
-        )
+        latched = torch.zeros_like(status, dtype=torch.bool)
+        time = torch.zeros_like(pos[:, 0])
+        height = env.cfg.release.landing_height
         ends = terminations.negative(
-            env.cfg.task.bounds, pos, rot, load_pos, status, held, time, height
+            env.cfg.task.bounds, pos, rot, load_pos, status, latched, time, height
         )
         self.steps.clamp_(max=(~ends).view(len(self.obs), -1).int().cumprod(0).sum(0))
 
@@ -172,12 +171,14 @@ def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
     """
     period = env.cfg.sim.control_period
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
-    flights, parts = Flights(env, steps), []
-    spread, hover = torch.tensor(EXCITED, device=env.device), env.previous_action.clone()
+    flights = Flights(env, steps)
+    parts = []
+    spread = torch.tensor(EXCITED, device=env.device)
+    hover = env.previous_action.clone()
     swing = torch.randn_like(hover) * spread
 
-    def act(k: int, seen: Tensor) -> Tensor:
-        swing.mul_(KEPT).add_((1.0 - KEPT**2) ** 0.5 * spread * torch.randn_like(swing))
+    def act(k: int, obs: Tensor) -> Tensor:
+        swing.mul_(RETAINED).add_((1.0 - RETAINED**2) ** 0.5 * spread * torch.randn_like(swing))
         return hover + swing
 
     for _ in range(FITTED // (env.num_envs * steps) + 1):
@@ -207,9 +208,12 @@ def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]
     """Rows of the three regressions from the whole steps of flights; those of the tension count
     where the rope is taut.
     """
-    f, mass, load_mass = flights.x, flights.mass, flights.load_mass
+    f = flights.x
+    mass = flights.mass
+    load_mass = flights.load_mass
     k = torch.arange(max(lags - 1, 1), len(f["pos"]) - 1, device=mass.device)
-    rot, y = ob.rotation_from_quat(f["quat"]), f["response"]
+    rot = ob.rotation_from_quat(f["quat"])
+    y = f["response"]
     lagged = [y[k], y[k - 1], *(f["command"][k - j] for j in range(lags)), torch.ones_like(y[k])]
     thrust_w = 0.25 * (y[k, :, :1] + y[k + 1, :, :1]) * (rot[k, :, :, 2] + rot[k + 1, :, :, 2])
     drag = [
@@ -223,10 +227,8 @@ def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]
     length = arm.norm(dim=-1)
     n = arm / length[..., None]
     tension = -(n * load_force).sum(-1)
-    taut, swing = (
-        tension > TAUT * GRAVITY * load_mass,
-        (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length,
-    )
+    taut = tension > TAUT * GRAVITY * load_mass
+    swing = (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length
     rows = {
         "next": y[k + 1],
         "lagged": torch.stack(lagged, -2),

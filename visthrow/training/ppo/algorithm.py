@@ -66,7 +66,8 @@ class PPOTraining:
                 f"ppo: {p.environments} x {p.steps} samples do not divide into {p.minibatches}"
                 " minibatches"
             )
-        self.experiment, self.device = experiment, device
+        self.experiment = experiment
+        self.device = device
         self.iterations = p.iterations
         self.samples = p.environments * p.steps * ranks.world
         self.env = ThrowEnv(experiment, device, seed)

@@ -10,7 +10,9 @@ from sim.kernels import runtime  # noqa: F401  starts Warp
 
 LOWEST, HIGHEST = wp.constant(1e-5), wp.constant(1e-2)  # range of the adaptive learning rate
 
-VALUE, SURROGATE, MOVED = wp.constant(0), wp.constant(1), wp.constant(2)
+VALUE = wp.constant(0)
+SURROGATE = wp.constant(1)
+MOVED = wp.constant(2)
 """Columns of ``parts``: two losses, A squares of how far the mean moved in spreads, A derivatives
 by log spreads.
 """
@@ -96,10 +98,10 @@ def loss(
     slope = off
     if clip_value != 0 and actor_learns[0] > 0.0:
         step = value[i] - old_value[i]
-        near = old_value[i] + wp.clamp(step, -clip, clip) - returns[i]
-        if near * near > error:
-            error = near * near
-            slope = wp.where(wp.abs(step) <= clip, near, 0.0)
+        clipped_error = old_value[i] + wp.clamp(step, -clip, clip) - returns[i]
+        if clipped_error * clipped_error > error:
+            error = clipped_error * clipped_error
+            slope = wp.where(wp.abs(step) <= clip, clipped_error, 0.0)
     parts[i, VALUE] = error
     value_gradient[i] = 2.0 * value_coefficient * share * slope
 

@@ -21,7 +21,7 @@ from visthrow.onboard.policy import RSL_RL_EPS, Policy
 # or multiples
 ALIGNED = 16
 
-SEEN = (
+OBSERVED = (
     10**8
     # observations that a policy's normaliser counts for when it is taken up: about those of its
     # training, which no file tells
@@ -33,7 +33,7 @@ def normalizer_state(mean: Tensor, std: Tensor) -> dict[str, Tensor]:
     shape (D,).
     """
     state = {"_mean": mean, "_std": std, "_var": std.square()}
-    return {name: value[None] for name, value in state.items()} | {"count": torch.tensor(SEEN)}
+    return {name: value[None] for name, value in state.items()} | {"count": torch.tensor(OBSERVED)}
 
 
 class CapturableGaussian(GaussianDistribution):
@@ -150,7 +150,7 @@ def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
     One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and
     Juditsky, SIAM J. Control and Optimization 30(4), 1992."""
 
-    def moved(mean: Tensor, now: Tensor, updates: Tensor) -> Tensor:
-        return mean + (now - mean) * torch.clamp(4.0 / (updates + 4.0), min=1.0 / window)
+    def moved(mean: Tensor, current: Tensor, updates: Tensor) -> Tensor:
+        return mean + (current - mean) * torch.clamp(4.0 / (updates + 4.0), min=1.0 / window)
 
     return AveragedModel(module, avg_fn=moved)

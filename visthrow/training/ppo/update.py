@@ -41,19 +41,15 @@ class CapturedPPO(PPO):
         self.optimizer = torch.optim.Adam(
             [self._spread, *self._layers], lr=self.rate, fused=True, capturable=self._cuda
         )
-        samples, actions = (
-            storage.num_envs * storage.num_transitions_per_env,
-            storage.actions.shape[-1],
-        )
+        samples = storage.num_envs * storage.num_transitions_per_env
+        actions = storage.actions.shape[-1]
         self._minibatch = samples // self.num_mini_batches
         self._order = torch.zeros(samples, device=self.device, dtype=torch.long)
         storage.distribution_params = tuple(
             torch.zeros(storage.actions.shape, **make) for _ in range(2)
         )
-        self._old_std, self._last_value = (
-            torch.ones(actions, **make),
-            torch.zeros(storage.num_envs, **make),
-        )
+        self._old_std = torch.ones(actions, **make)
+        self._last_value = torch.zeros(storage.num_envs, **make)
         self._totals = torch.zeros(3, **make)
         self._mean_gradient = torch.zeros(self._minibatch, actions, **make)
         self._value_gradient = torch.zeros(self._minibatch, 1, **make)
@@ -64,7 +60,7 @@ class CapturedPPO(PPO):
         self._aside = torch.cuda.Stream(self.device) if self._cuda else None
 
     @contextmanager
-    def _beside(self) -> Iterator[None]:
+    def _on_side_stream(self) -> Iterator[None]:
         """Launch on a stream of its own on a GPU, after what was launched before; :meth:`join`
         waits for it.
         """
@@ -88,7 +84,7 @@ class CapturedPPO(PPO):
         observation = storage.observations[storage.step]
         for group, values in obs.items():  # one by one: copied at once they took four times as long
             observation[group].copy_(values)
-        with self._beside():
+        with self._on_side_stream():
             storage.values[storage.step].copy_(self.critic(observation).detach())
         actions = self.actor(obs, stochastic_output=True).detach()
         storage.actions[storage.step].copy_(actions)
@@ -196,16 +192,19 @@ class CapturedPPO(PPO):
         batches = list(zip(*(part.split(self._minibatch) for part in gathered)))
         self._totals.zero_()
         for _ in range(self.num_learning_epochs):
-            for seen, known, *samples in batches:
-                self._descend(seen, known, samples)
+            for actor_input, critic_input, *samples in batches:
+                self._descend(actor_input, critic_input, samples)
 
-    def _descend(self, seen: Tensor, known: Tensor, samples: list[Tensor]) -> None:
+    def _descend(self, actor_input: Tensor, critic_input: Tensor, samples: list[Tensor]) -> None:
         """One gradient step on a minibatch: the networks' inputs, and what :func:`loss.loss` reads
         of the samples.
         """
-        with self._beside():  # so are their gradients: one multiplies while the other moves memory
-            value = self.critic.output(known)
-        mean, std = self.actor.output(seen), self._std()
+        with (
+            self._on_side_stream()
+        ):  # so are their gradients: one multiplies while the other moves memory
+            value = self.critic.output(critic_input)
+        mean = self.actor.output(actor_input)
+        std = self._std()
         self.join()
         columns = [t if t.shape[-1] > 1 else t.view(-1) for t in samples]
         self._launch(

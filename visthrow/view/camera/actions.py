@@ -30,7 +30,8 @@ from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write
 from visthrow.view.camera import BOARD
 
-BLUE, YELLOW = (230, 120, 40), (60, 210, 240)
+BLUE = (230, 120, 40)
+YELLOW = (60, 210, 240)
 SAMPLES = 16  # rays a pixel of a rendered frame
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -152,7 +153,7 @@ def check(args: argparse.Namespace) -> int:
     return 0 if fits else 1
 
 
-def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tuple[bool, str]:
+def verdict(camera: CameraParams, report: BoardReport, best: BoardReport) -> tuple[bool, str]:
     """Tell whether a configured lens fits pictures of a board.
 
     What the configured lens leaves beyond the best lens is a systematic error. It is accepted where
@@ -160,23 +161,22 @@ def verdict(camera: CameraParams, given: BoardReport, best: BoardReport) -> tupl
     each episode (``noise.bias_std``).
 
     Args:
-        camera: the configuration. given: its reprojection errors. best: those of the lens
+        camera: the configuration. report: its reprojection errors. best: those of the lens
             calibrated on the same pictures.
     """
     from scipy.stats import f
 
     lens = camera.fisheye
-    views = int(np.isfinite(given.image_rms_px).sum())
-    freedom = max(2 * given.points - 8 - 6 * views, 1)
-    excess = math.sqrt(max(given.rms_px**2 - best.rms_px**2, 0.0))
+    views = int(np.isfinite(report.image_rms_px).sum())
+    freedom = max(2 * report.points - 8 - 6 * views, 1)
+    excess = math.sqrt(max(report.rms_px**2 - best.rms_px**2, 0.0))
     noise = best.rms_px * math.sqrt(8.0 * float(f.isf(SIGNIFICANT, 8, freedom)) / freedom)
     learnt = camera.noise.bias_std * math.sqrt(lens.fx * lens.fy) * Fisheye(lens).edge_radius
     limit = max(noise, learnt)
-    reason = (
-        "the bias that training draws (noise.bias_std)"
-        if learnt >= noise
-        else "what noise of the corners explains"
-    )
+    if learnt >= noise:
+        reason = "the bias that training draws (noise.bias_std)"
+    else:
+        reason = "what noise of the corners explains"
     word = "fits" if excess <= limit else "does NOT fit; calibrate anew"
     return (
         excess <= limit,
@@ -214,14 +214,16 @@ def show(args: argparse.Namespace) -> int:
             f"--hangs {args.hangs:g} below --height {args.height:g}; expected a payload above the"
             " ground [m]"
         )
-    camera, lens = KeypointCamera(params), Fisheye(params.fisheye)
-    pos_w, rot_wb = torch.tensor([0.0, 0.0, args.height]), torch.eye(3)
-    ball_w, goal_w = pos_w - torch.tensor([0.0, 0.0, args.hangs]), torch.tensor([*args.target, 0.0])
-    image = (
-        pictures_of([args.picture])[1][0]
-        if args.picture
-        else _rendered(params, pos_w, rot_wb, ball_w, goal_w)
-    )
+    camera = KeypointCamera(params)
+    lens = Fisheye(params.fisheye)
+    pos_w = torch.tensor([0.0, 0.0, args.height])
+    rot_wb = torch.eye(3)
+    ball_w = pos_w - torch.tensor([0.0, 0.0, args.hangs])
+    goal_w = torch.tensor([*args.target, 0.0])
+    if args.picture:
+        image = pictures_of([args.picture])[1][0]
+    else:
+        image = _rendered(params, pos_w, rot_wb, ball_w, goal_w)
     points, valid = keypoints(camera, pos_w[None], rot_wb[None], goal_w[None], ball_w[None])
     image_out = draw_overlay(camera, points[0], valid[0], image)
     if args.board:
@@ -250,7 +252,7 @@ def _rendered(params: CameraParams, *places: torch.Tensor) -> np.ndarray:
 
 
 def _draw_board(
-    drawn: np.ndarray, image: np.ndarray, lens: Fisheye, args: argparse.Namespace
+    canvas: np.ndarray, image: np.ndarray, lens: Fisheye, args: argparse.Namespace
 ) -> None:
     board = board_of(args.board)
     view = find_board(image, board)
@@ -262,14 +264,14 @@ def _draw_board(
     expected = reprojected(lens, view)
     for pixels, colour, size in ((view.pixels, YELLOW, 5), (expected, BLUE, 2)):
         for u, v in pixels:
-            cv2.circle(drawn, (round(u), round(v)), size, colour, 1, cv2.LINE_AA)
+            cv2.circle(canvas, (round(u), round(v)), size, colour, 1, cv2.LINE_AA)
     off = np.sqrt(np.mean(np.sum((expected - view.pixels) ** 2, axis=1)))
     print(f"corners found (yellow) and reprojected (blue): {off:.3f} px rms")
 
 
-def _straight(drawn: np.ndarray, lens: Fisheye, fov_deg: float) -> np.ndarray:
+def _straight(canvas: np.ndarray, lens: Fisheye, fov_deg: float) -> np.ndarray:
     """Rectified view of a drawn picture, BGR, uint8, square."""
     size = min(lens.params.width, lens.params.height)
-    frames = torch.from_numpy(drawn).permute(2, 0, 1)[None].float() / 255.0
+    frames = torch.from_numpy(canvas).permute(2, 0, 1)[None].float() / 255.0
     flat = rectify(frames, lens, ViewParams(size, size, fov_deg))[0].permute(1, 2, 0)
     return (flat * 255.0).round().to(torch.uint8).numpy()

@@ -8,16 +8,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-SIGNED_VB, UNSIGNED_VB, NEG_14BIT, TAG8_8SVB, TAG2_3S32, TAG8_4S16, NULL, TAG2_3SVARIABLE = (
-    0,
-    1,
-    3,
-    6,
-    7,
-    8,
-    9,
-    10,
-)
+SIGNED_VB = 0
+UNSIGNED_VB = 1
+NEG_14BIT = 3
+TAG8_8SVB = 6
+TAG2_3S32 = 7
+TAG8_4S16 = 8
+NULL = 9
+TAG2_3SVARIABLE = 10
 _GROUP = {
     TAG8_8SVB: 8,
     TAG2_3S32: 3,
@@ -41,7 +39,9 @@ class Reader:
 
     def __init__(self, data: bytes, pos: int = 0) -> None:
         """Stand at ``pos``."""
-        self.data, self.pos, self.end = data, pos, len(data)
+        self.data = data
+        self.pos = pos
+        self.end = len(data)
 
     def byte(self) -> int:
         """Next byte. Raises EndOfLog: there is none."""
@@ -107,12 +107,14 @@ def _three(one: tuple, two: tuple) -> Callable[["Reader", int], list[int]]:
 
 def _tag8_4s16(r: Reader, count: int) -> list[int]:
     """Four fields of 0, 4, 8 or 16 bits each, packed nibble to nibble."""
-    tag, values = r.byte(), []
+    tag = r.byte()
+    values = []
     pending, have = 0, 0  # bits read and not used yet
     for i in range(4):
         need = (0, 4, 8, 16)[tag >> (2 * i) & 3]
         while have < need:
-            pending, have = pending << 8 | r.byte(), have + 8
+            pending = pending << 8 | r.byte()
+            have = have + 8
         have -= need
         values.append(extend(pending >> have, need) if need else 0)
         pending &= (1 << have) - 1
@@ -139,12 +141,14 @@ def plan(
 
     ``skipped`` fields take no bytes at all (those counted up by one).
     """
-    groups, i = [], 0
+    groups = []
+    i = 0
     while i < len(encodings):
         if skipped[i]:
             i += 1
             continue
-        code, count = encodings[i], 1
+        code = encodings[i]
+        count = 1
         if code == TAG8_8SVB:
             while (
                 count < _GROUP[code] and i + count < len(encodings) and encodings[i + count] == code

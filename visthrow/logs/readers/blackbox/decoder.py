@@ -81,15 +81,16 @@ def read_blackbox(path: str | Path) -> list[BlackboxLog]:
             f"{path}: cannot be read: {error.strerror or error}; expected a blackbox file"
         ) from error
     starts = []
-    at = data.find(MARKER)
-    while at >= 0:
-        starts.append(at)
-        at = data.find(MARKER, at + 1)
+    offset = data.find(MARKER)
+    while offset >= 0:
+        starts.append(offset)
+        offset = data.find(MARKER, offset + 1)
     if not starts:
         raise LogError(
             f"{path}: no blackbox log in its {len(data)} bytes; expected '{MARKER.decode()}'"
         )
-    logs, problems = [], []
+    logs = []
+    problems = []
     for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(data)]), start=1):
         try:
             logs.append(_Decoder(data[start:end]).decode())
@@ -137,27 +138,25 @@ class _Decoder:
     def _prepare(self) -> None:
         if "I" not in self.fields or "P" not in self.fields:
             raise LogError("no definition of I and P frames in its header")
-        self.fields["P"].names, self.fields["P"].signed = (
-            self.fields["I"].names,
-            self.fields["I"].signed,
-        )
+        self.fields["P"].names = self.fields["I"].names
+        self.fields["P"].signed = self.fields["I"].signed
         if self.header.get("Data version", "2") != "2":
             raise LogError(f"data version {self.header['Data version']}; version 2 is read")
-        for kind, of in self.fields.items():
-            sizes = {len(of.names), len(of.predictor), len(of.encoding)}
+        for kind, definition in self.fields.items():
+            sizes = {len(definition.names), len(definition.predictor), len(definition.encoding)}
             if len(sizes) > 1:
                 raise LogError(
                     f"definition of {kind} frames contradicts itself: {sorted(sizes)} fields"
                 )
-            unknown = [code for code in of.encoding if code not in DECODERS]
+            unknown = [code for code in definition.encoding if code not in DECODERS]
             if unknown:
                 raise LogError(
                     f"{kind} frames use encoding {unknown[0]}; known:"
                     f" {', '.join(map(str, DECODERS))}"
                 )
         self.plans = {
-            kind: plan(of.encoding, [p == INC for p in of.predictor])
-            for kind, of in self.fields.items()
+            kind: plan(definition.encoding, [p == INC for p in definition.predictor])
+            for kind, definition in self.fields.items()
         }
         names = self.fields["I"].names
         self.at_time = names.index("time") if "time" in names else None
@@ -177,9 +176,11 @@ class _Decoder:
     def decode(self) -> BlackboxLog:
         rows: list[list[int]] = []
         log = BlackboxLog(self.header, self.fields["I"].names, np.empty((0, 0)))
-        reader, lost = self.reader, False
+        reader = self.reader
+        lost = False
         while reader.pos < reader.end and not log.complete:
-            start, kind = reader.pos, chr(reader.data[reader.pos])
+            start = reader.pos
+            kind = chr(reader.data[reader.pos])
             try:
                 frame = self._frame(kind, log)
             except EndOfLog:
@@ -188,7 +189,9 @@ class _Decoder:
                 frame = None
             if frame is None:  # look for the next frame byte by byte
                 log.corrupt += not lost
-                lost, self.history, reader.pos = True, [], start + 1
+                lost = True
+                self.history = []
+                reader.pos = start + 1
                 continue
             lost = False
             if kind != "E" and not frame:  # decoded, but rests on what was lost
@@ -212,7 +215,8 @@ class _Decoder:
             log.events.append(event)
             log.complete = event[0] == "end of log"
             if event[0] == "logging resumes":
-                self.last_iteration, self.last_time = int(event[1][0]), int(event[1][1])
+                self.last_iteration = int(event[1][0])
+                self.last_time = int(event[1][1])
             return [1]
         if kind not in self.plans:
             return None
@@ -233,15 +237,16 @@ class _Decoder:
         return values
 
     def _values(self, kind: str, base: list[list[int]]) -> list[int]:
-        of, reader = self.fields[kind], self.reader
-        values = [0] * len(of.names)
+        definition = self.fields[kind]
+        reader = self.reader
+        values = [0] * len(definition.names)
         for decoder, first, count in self.plans[kind]:
             values[first : first + count] = decoder(reader, count)[:count]
-        for i, predictor in enumerate(of.predictor):
+        for i, predictor in enumerate(definition.predictor):
             if predictor == ZERO:
                 continue
             values[i] = self._predicted(predictor, i, values, base)
-            unsigned = of.signed and i < len(of.signed) and not of.signed[i]
+            unsigned = definition.signed and i < len(definition.signed) and not definition.signed[i]
             values[i] = values[i] & 0xFFFFFFFF if unsigned else extend(values[i], 32)
         return values
 
@@ -270,8 +275,10 @@ class _Decoder:
         if self.last_iteration is None:
             return 0
         following = range(self.last_iteration + 1, self.last_iteration + 1 + self.interval)
-        kept = ((i % self.interval + self.p_num - 1) % self.p_denom < self.p_num for i in following)
-        return next((count for count, keep in enumerate(kept) if keep), self.interval)
+        logged = (
+            (i % self.interval + self.p_num - 1) % self.p_denom < self.p_num for i in following
+        )
+        return next((count for count, keep in enumerate(logged) if keep), self.interval)
 
     def _continuous(self, values: list[int], kind: str) -> bool:
         """Whether time and iteration go on; one I frame that jumps is refused, and the next one
@@ -285,7 +292,7 @@ class _Decoder:
             )  # the 32-bit clock turned over
         if self.at_iteration is not None and self.last_iteration is not None:
             steps.append((values[self.at_iteration] - self.last_iteration, _MOST_ITERATIONS))
-        if all(0 <= passed <= most for passed, most in steps):
+        if all(0 <= passed <= limit for passed, limit in steps):
             return True
         if kind == "I":
             self.last_time = self.last_iteration = None
@@ -298,8 +305,8 @@ def _event(reader: Reader) -> tuple[str, tuple[float, ...]] | None:
         return None
     if kind == 255:
         text = b"End of log"
-        found = reader.data[reader.pos : reader.pos + len(text)] == text
-        return (_EVENTS[kind], ()) if found else None
+        matches = reader.data[reader.pos : reader.pos + len(text)] == text
+        return (_EVENTS[kind], ()) if matches else None
     if kind == 13:
         function = reader.byte()
         return _EVENTS[kind], (
