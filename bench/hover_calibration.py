@@ -53,8 +53,8 @@ def in_training(
         calibrated_start(flown, found)(env)
         return (
             found,
-            env._memory["extrinsic_rotation"].cpu().numpy(),
-            env._memory["scale_error"].flatten().cpu().numpy(),
+            env.view.buffers["extrinsic_rotation"].cpu().numpy(),
+            env.view.buffers["scale_error"].flatten().cpu().numpy(),
         )
 
 

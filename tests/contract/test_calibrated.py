@@ -41,8 +41,8 @@ def test_a_hover_finds_each_camera_and_the_throw_sees_as_the_nominal_one(monkeyp
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
         calibrated_start(flown, found)(env)
         turn, scale = (
-            env._memory["extrinsic_rotation"].numpy(),
-            env._memory["scale_error"].flatten().numpy(),
+            env.view.buffers["extrinsic_rotation"].numpy(),
+            env.view.buffers["scale_error"].flatten().numpy(),
         )
         assert np.abs(turn).max() > 0.03
         assert np.abs(scale).max() > 0.01
@@ -101,8 +101,8 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
         calibrated_start(flown, found)(env)
         turn, scale = (
-            env._memory["extrinsic_rotation"].numpy(),
-            env._memory["scale_error"].flatten().numpy(),
+            env.view.buffers["extrinsic_rotation"].numpy(),
+            env.view.buffers["scale_error"].flatten().numpy(),
         )
     off = np.degrees([one.turn_b for one in found]) - np.degrees(turn)
     assert np.abs(off.mean(0)).max() < 0.025

@@ -101,7 +101,7 @@ def test_the_papers_recipe_and_nothing_else(name):
     np.testing.assert_array_equal(
         seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy()
     )
-    assert not env.pose_age.any()
+    assert not env.delay.age.any()
     assert env.views.state["charge_used"].max() < 1e-3, (
         "share of a full battery that one step may draw"
     )

@@ -118,9 +118,9 @@ def shown_by_the_environment(flown, actions: np.ndarray, policy: str, device: st
         env.views.out["payload_pos_w"].copy_(torch.from_numpy(flown["payload"][:, t]))
         fresh = torch.full((streams,), t == 0, device=device)
         previous = (
-            env._start_action.expand(streams, -1) if t == 0 else torch.from_numpy(actions[:, t - 1])
+            env.start_action.expand(streams, -1) if t == 0 else torch.from_numpy(actions[:, t - 1])
         )
-        env._memory["previous"].copy_(previous)
+        env.buffers["previous"].copy_(previous)
         out.append(env._observe(fresh)["actor"].cpu().numpy())
     return np.stack(out, axis=1)
 

@@ -52,7 +52,6 @@ KNOWN = {
     "long: visthrow.onboard.calibration.__init__",
     "long: visthrow.paper.commands.baseline_command.add_arguments",
     "long: visthrow.paper.report.trade.front_section",
-    "long: visthrow.training.env.__init__",
     "long: visthrow.view.figures.trades",
 }
 """What is still to be mended.

@@ -28,7 +28,7 @@ def experiment(name: str, *changes: str) -> Experiment:
 def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():
     torch.manual_seed(0)
     env = ThrowEnv(experiment("state_moving", "task.target.speed=[0.5,1.0]"), count=64)
-    start, velocity = env.views.goal_w.clone(), env._memory["goal_vel"].clone()
+    start, velocity = env.views.goal_w.clone(), env.goals.velocity.clone()
     speed = velocity.norm(dim=1)
     assert speed.min() >= 0.5
     assert speed.max() <= 1.0
@@ -67,7 +67,7 @@ def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
         obs, _, done, _ = env.step(hover)
         alive &= done == 0
     assert alive.sum() > 20
-    actor, velocity = obs["actor"][alive], env._memory["goal_vel"][alive]
+    actor, velocity = obs["actor"][alive], env.goals.velocity[alive]
     np.testing.assert_allclose(
         actor[:, -2:], velocity[:, :2], rtol=0.05, atol=0.01
     )  # the prior still pulls a little
@@ -82,7 +82,8 @@ def test_goals_that_stand_still_cost_nothing():
     bits.
     """
     env = ThrowEnv(experiment("state"), count=4)
-    assert not {"goal_vel", "goal_fit"} & env._memory.keys()
+    assert env.goals is None
+    assert "goal_fit" not in env.buffers
     assert env.get_observations()["critic"].shape == (4, 42)
     assert "goal_w" not in env.last
 

@@ -139,7 +139,7 @@ def reference(fo, by):
     extra = torch.zeros_like(b.layers.action, requires_grad=True)
     rots, late = (
         ob.rotation_from_quat(true.quat),
-        (b.env.pose_age / fo.cfg.sim.control_period)[:, None],
+        (b.env.delay.age / fo.cfg.sim.control_period)[:, None],
     )
     x = {
         name: getattr(true, name)[0].clone()
@@ -147,7 +147,7 @@ def reference(fo, by):
     } | {"rot": rots[0]}
     poses, responses, commands, cost = [], [], [], 0.0
     previous, history = (
-        fo.env._start_action.expand(24, -1),
+        fo.env.start_action.expand(24, -1),
         torch.zeros(24, 1 + layout.history, layout.payload),
     )
     for k in range(fo.p.horizon):
@@ -167,7 +167,7 @@ def reference(fo, by):
         previous = at(act.clip_action(b.layers.action[k]), action)
         throttle = (0.5 * (b.layers.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
         scale = torch.cat(
-            [fo.cfg.task.action.max_thrust * throttle, fo.env._max_rate.expand(24, -1)], -1
+            [fo.cfg.task.action.max_thrust * throttle, fo.env.max_rate.expand(24, -1)], -1
         )
         commands.append(action[:, :4] * scale)
         x = advance(fo, true, k, x, responses, commands)
@@ -272,7 +272,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
         "state", *QUIET, *vehicle, "task.start.tether_variants=1", "first_order.decay=1.0"
     )
     torch.manual_seed(5)
-    plan = fo.env._start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor(
+    plan = fo.env.start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor(
         [0.1, 0.25, 0.25, 0.25, 0.0]
     )
     start = fo.env.state_dict()

@@ -180,7 +180,9 @@ def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them(
     for e in range(12):
         own = drawn[e % 6 // 2]
         assert told[e].tolist() == pytest.approx(own.told, rel=1e-6)
-        assert float(env.pose_age[e]) * own.units.time <= env.cfg.task.observation.latency[1] + 1e-6
+        assert (
+            float(env.delay.age[e]) * own.units.time <= env.cfg.task.observation.latency[1] + 1e-6
+        )
     env.carry(torch.ones(12, 5))
     queued = env.views.command[:, 0]
     for e in range(12):

@@ -88,7 +88,7 @@ class FirstOrder:
             self.surrogate = fit(env, self.network)
             last = self.network.mlp[-1]
             last.weight.mul_(0.1)  # hover with the latch at rest, whatever is seen
-            last.bias.copy_(env._start_action)
+            last.bias.copy_(env.start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
         self.flights, (self.adjoint, adjoint) = (
@@ -196,10 +196,10 @@ class FirstOrder:
         action = act.clip_action(x.action)
         action, before = (
             a.flatten(0, 1)
-            for a in (action, torch.cat([env._start_action.expand_as(action[:1]), action[:-1]]))
+            for a in (action, torch.cat([env.start_action.expand_as(action[:1]), action[:-1]]))
         )
-        acting = rewards.command(p, action, env._rate_weights) + rewards.change(
-            p, action, before, env._change_weights
+        acting = rewards.command(p, action, env.rate_weights) + rewards.change(
+            p, action, before, env.change_weights
         )
         margins = [
             height - bounds.altitude[0] - ALTITUDE,
@@ -298,7 +298,7 @@ class FirstOrder:
             "mass": flights.mass,
             "load_mass": flights.load_mass,
             "mount": flights.mount,
-            "age": env.pose_age,
+            "age": env.delay.age,
         }
         for name, tensor in (self.surrogate | plants).items():
             setattr(p, name, wp.from_torch(tensor, dtype=Setting.vars[name].type.dtype))
