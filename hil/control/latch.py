@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.errors import RunError
 from hil.poses.pose import Vector
-from visthrow.onboard.hover import GRAVITY
+from visthrow.common.free_fall import GRAVITY, fall_time, free_flight
 
 LAG_TOLERANCE = 5e-3  # of the mechanism beyond the trained lag [s]
 # a payload that hangs this long after its separation is stuck, whatever the autopilot answered [s]
@@ -99,8 +99,7 @@ class PayloadFlight:
         times, points = np.array(self._times), np.array(self._points)
         last = times[-1]
         pos, vel = _parabola(times[-LANDING_POSES:] - last, points[-LANDING_POSES:])
-        drop = pos[2] - self.height
-        fall = (vel[2] + np.sqrt(max(vel[2] ** 2 + 2.0 * GRAVITY * drop, 0.0))) / GRAVITY
+        fall = fall_time(pos[2] - self.height, vel[2])
         point = pos + fall * vel
         point[2] = self.height
         time = float(last + fall)
@@ -135,8 +134,7 @@ def separation(
         return None
     x, v = _parabola(times[free] - expected, points[free])
     lead = times - expected
-    fall = x + lead[:, None] * v
-    distance = np.linalg.norm(points + 0.5 * GRAVITY_UP * lead[:, None] ** 2 - fall, axis=1)
+    distance = np.linalg.norm(points - free_flight(x, v, lead[:, None]), axis=1)
     bent = (lead > -BEND_TIME) & (lead < FALL_START) & (distance > BEND)
     if np.count_nonzero(bent) < 3:
         return None
@@ -144,7 +142,7 @@ def separation(
     if not slope < 0.0 or not -BEND_TIME < -offset / slope < BEND_TIME:
         return None
     root = -offset / slope
-    point = x + root * v - 0.5 * GRAVITY_UP * root * root
+    point = free_flight(x, v, root)
     return float(expected + root), tuple(point.tolist())
 
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import correlate, correlation_lags
 
-from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
+from visthrow.common.free_fall import GRAVITY
 from visthrow.logs.check import relations
 from visthrow.logs.flightlog import FlightLog
 

@@ -31,8 +31,8 @@ from camera.keypoints import (
 )
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams
-from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import VisthrowError
+from visthrow.common.free_fall import GRAVITY
 from visthrow.onboard.observations import rotation_from_quat
 
 STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}

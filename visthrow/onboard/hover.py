@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.common.constants import GRAVITY
+from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
 
 

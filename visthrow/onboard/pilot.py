@@ -18,8 +18,8 @@ from camera.keypoints import KeypointCamera
 from camera.keypoints import keypoints as seen_keypoints
 from camera.params import CameraParams
 from visthrow import config
-from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import PolicyError
+from visthrow.common.free_fall import GRAVITY
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob

@@ -9,11 +9,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sim.params import GRAVITY, AirParams, RandomizationParams, RopeParams
+from sim.params import AirParams, RandomizationParams, RopeParams
 from sim.reference.state import Landings as Landings
 from sim.reference.state import Snapshot as Snapshot
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.free_fall import GRAVITY, free_flight
 from visthrow.common.rotations import turned
 from visthrow.task import Experiment, NoiseParams, plant_of
 from visthrow.throws.loose_rope import LooseRope
@@ -380,8 +381,7 @@ def flown(
     """
     time = np.asarray(time, dtype=float)[:, None]
     if not (rope.payload_drag or rope.payload_side or rope.payload_lift):
-        fall = np.array([0.0, 0.0, -GRAVITY])
-        return pos_w + time * vel_w + 0.5 * time**2 * fall, vel_w + time * fall
+        return free_flight(pos_w, vel_w, time), vel_w - time * [0.0, 0.0, GRAVITY]
     wind = np.array(air.wind_w)
     share, side, lift = (
         x / rope.payload_mass for x in (rope.payload_drag, rope.payload_side, rope.payload_lift)
@@ -392,11 +392,8 @@ def flown(
         sideways = np.cross([0.0, 0.0, 1.0], airspeed)
         size = np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-12)
         turned = side * sideways + lift * np.cross(airspeed, sideways / size)
-        return np.linalg.norm(airspeed, axis=1, keepdims=True) * (turned - share * airspeed) - [
-            0.0,
-            0.0,
-            GRAVITY,
-        ]
+        speed = np.linalg.norm(airspeed, axis=1, keepdims=True)
+        return speed * (turned - share * airspeed) - [0.0, 0.0, GRAVITY]
 
     count = max(int(np.ceil(np.max(time, initial=0.0) / FALL_STEP)), 1)
     h = time / count

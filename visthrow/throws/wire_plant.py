@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visthrow.common.constants import GRAVITY
+from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import rotate_back
 from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from visthrow.common.constants import GRAVITY
+from visthrow.common.free_fall import GRAVITY
 from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust import MASS_BAD
 from visthrow.logs.flightlog import Channel

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.signal import lfilter
 
-from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import LogError
+from visthrow.common.free_fall import GRAVITY
 from visthrow.diagnose.models.flyer_params import MOST_LATE, FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of

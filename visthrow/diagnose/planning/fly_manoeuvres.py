@@ -12,8 +12,8 @@ from sim.params import PlantParams
 from sim.units import Units, in_units
 from visthrow import config
 from visthrow.common import mocap
-from visthrow.common.constants import GRAVITY
 from visthrow.common.errors import DiagnoseError, LogError
+from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.diagnose.models.flyer import FlyerModel
 from visthrow.diagnose.models.flyer_params import FlyerParams

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visthrow.common.constants import GRAVITY
+from visthrow.common.free_fall import GRAVITY
 from visthrow.logs.axes import EXCHANGES, MATRICES, OURS, is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row

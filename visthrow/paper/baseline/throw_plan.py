@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.params import GRAVITY
 from visthrow.common.errors import ConfigError
+from visthrow.common.free_fall import fall_time
 from visthrow.logs.flightlog import FlightLog
 from visthrow.paper.baseline.pendulum_model import Pendulum
 from visthrow.paper.baseline.spline import PlanParams, Spline, flat_reference, optimise
@@ -31,21 +31,14 @@ class ReleaseState:
     fall_time: float  # from release to landing [s]
 
 
-def fall_time(pos_z: np.ndarray, vel_z: np.ndarray, landing_height: float) -> np.ndarray:
-    """Time to landing [s] from a height [m] and an upward velocity [m/s]; NaN where the height is
-    never passed.
-    """
-    radicand = np.asarray(vel_z) ** 2 + 2.0 * GRAVITY * (np.asarray(pos_z) - landing_height)
-    return (vel_z + np.sqrt(np.where(radicand < 0.0, np.nan, radicand))) / GRAVITY
-
-
 def landing_point(
     pos_w: np.ndarray, vel_w: np.ndarray, landing_height: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Landing points (..., 2) [m] and times (...) [s] of payloads let go at states, shape (..., 3)
-    each.
+    """Return landing points (..., 2) [m] and times (...) [s] of payloads released at states, shape
+    (..., 3) each; NaN where the landing height is never passed.
     """
-    time = fall_time(pos_w[..., 2], vel_w[..., 2], landing_height)
+    with np.errstate(invalid="ignore"):
+        time = fall_time(pos_w[..., 2] - landing_height, vel_w[..., 2], floor=-np.inf)
     return pos_w[..., :2] + time[..., None] * vel_w[..., :2], time
 
 
@@ -60,7 +53,7 @@ def release_for(target: float, height: float, speed: float, landing_height: floa
             f"release at {height:g} m height with {speed:g} m/s; expected above the landing's"
             f" {landing_height:g} m and above 0"
         )
-    fall = float(fall_time(np.float64(height), np.float64(0.0), landing_height))
+    fall = float(fall_time(np.float64(height - landing_height), np.float64(0.0)))
     return ReleaseState(
         np.array([target - speed * fall, 0.0, height]), np.array([speed, 0.0, 0.0]), fall
     )

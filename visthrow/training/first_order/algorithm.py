@@ -10,9 +10,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from sim.params import GRAVITY
 from sim.torch_bridge import Replayed, on_torch_stream
 from visthrow.common.errors import ConfigError
+from visthrow.common.free_fall import GRAVITY, fall_time
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
@@ -155,12 +155,7 @@ class FirstOrder:
         release = self.cfg.release
         flights = self.flights
         up = x.load_vel[..., 2]
-        fall = (
-            up
-            + (up.square() + 2.0 * GRAVITY * (x.load_pos[..., 2] - release.landing_height))
-            .clamp(min=1e-6)
-            .sqrt()
-        ) / GRAVITY
+        fall = fall_time(x.load_pos[..., 2] - release.landing_height, up, floor=1e-6)
         landing = x.load_pos[..., :2] + x.load_vel[..., :2] * fall[..., None]
         landing = (
             landing + (flights.landing[: len(fall)] - landing).detach()

@@ -1,0 +1,27 @@
+"""Free fall without drag, for NumPy arrays and torch tensors alike."""
+
+from typing import Any
+
+import numpy as np
+
+GRAVITY = 9.81  # acceleration of free fall [m/s^2]; a test holds it equal to the simulator's
+
+
+def fall_time(height: Any, climb: Any, floor: float = 0.0) -> Any:
+    """Return the time [s] until a body comes down to the ground.
+
+    Args:
+        height: above the ground [m], an array or tensor of any shape.
+        climb: upward velocity [m/s], same shape.
+        floor: least radicand [m^2/s^2]: below it the body never reaches the height of the ground.
+    """
+    radicand = (climb * climb + 2.0 * GRAVITY * height).clip(floor)
+    root = np.sqrt(radicand) if isinstance(radicand, np.ndarray | np.generic) else radicand.sqrt()
+    return (climb + root) / GRAVITY
+
+
+def free_flight(pos_w: np.ndarray, vel_w: np.ndarray, time: Any) -> np.ndarray:
+    """Return the position [m] of bodies, shape (..., 3), after a time [s] that broadcasts with
+    it.
+    """
+    return pos_w + time * vel_w + 0.5 * time**2 * np.array([0.0, 0.0, -GRAVITY])
