@@ -5,12 +5,14 @@ Tiny networks and batches.
 
 import errno
 import json
+import math
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,11 +20,13 @@ import torch
 
 from visthrow import cli, config
 from visthrow.common import storage
+from visthrow.common.errors import TrainError
 from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import trainer
 from visthrow.training.ppo.algorithm import PPOTraining
+from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = [
@@ -57,7 +61,17 @@ def whole(tmp_path_factory):
 
 def test_a_training_stops_at_the_first_loss_that_is_not_finite(tmp_path, capsys):
     assert train(tmp_path / "run", "--set", "task.reward.scale=1e30") == 2
-    assert "iteration 1: value inf is not finite" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "iteration 1: " in error
+    assert "value inf" in error
+
+
+@pytest.mark.parametrize("name", ["value", "surrogate", "entropy", "spread", "cost"])
+def test_a_training_names_what_is_not_finite_and_when(name):
+    run = SimpleNamespace(ranks=Ranks(), iteration=4)
+    Trainer._check_losses(run, {"value": 1.0, name: 2.0, "landing_error": math.nan})
+    with pytest.raises(TrainError, match=f"iteration 5: {name} nan is not finite"):
+        Trainer._check_losses(run, {"value": 1.0} | {name: math.nan})
 
 
 def test_a_run_leaves_config_log_checkpoint_summary_and_policy(whole):

@@ -126,8 +126,8 @@ def fitted(experiment: Experiment, policy: Policy) -> Experiment:
     )
 
 
-LOSSES = {"value", "surrogate", "entropy", "gradient_norm"}
-"""Figures of an iteration that must be finite for it to have learnt anything."""
+FINITE = {"value", "surrogate", "entropy", "spread", "cost", "gradient_norm"}
+"""Figures of an iteration that a training stops at when they are not finite."""
 
 
 class Trainer:
@@ -176,18 +176,18 @@ class Trainer:
         )
 
     def _check_losses(self, figures: dict[str, float]) -> None:
-        """Raise TrainError where a loss of this iteration is not finite, in any process."""
+        """Raise TrainError where a loss or spread is not finite, in any process."""
         broken = [
             f"{name} {figures[name]}"
-            for name in LOSSES & figures.keys()
+            for name in FINITE & figures.keys()
             if not math.isfinite(figures[name])
         ]
         if self.ranks.agree(int(bool(broken))):
             what = ", ".join(sorted(broken)) or "a loss of another process"
             raise TrainError(
-                f"iteration {self.iteration + 1}: {what} is not finite: nothing more is learnt;"
-                " expected finite losses: is task.reward.scale or a learning rate too large? The"
-                " last checkpoint is from before"
+                f"iteration {self.iteration + 1}: {what} is not finite, expected finite numbers;"
+                " is task.reward.scale or a learning rate too large? The last checkpoint is of an"
+                " earlier iteration"
             )
 
     def throw(

@@ -298,7 +298,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     ) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
     torch.testing.assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
-    monkeypatch.setattr(fo.layers, "back", lambda k, flown: None)
+    monkeypatch.setattr(fo.layers, "backpropagate", lambda k, flown: None)
     found = []
     for axis in range(2):
         by = dict(

@@ -320,7 +320,7 @@ class FirstOrder:
         for k in reversed(range(self.flights.last)):
             with on_torch_stream(self.env.device):
                 self._launches[k].launch()
-            self.layers.back(k, self.flights.steps >= k)
+            self.layers.backpropagate(k, self.flights.steps >= k)
 
     def collect(self, done: float) -> None:
         self._schedule(1.0 if self._adapting else done)

@@ -168,10 +168,14 @@ class CapturedPPO(PPO):
         for model in (self.actor, self.critic):
             model.update_normalization(self.storage.observations.flatten(0, 1))
         self.storage.clear()
-        *losses, self.learning_rate = torch.cat([self._totals, self.rate]).tolist()
+        figures = torch.cat([self._totals, self.rate, self._std()]).tolist()
+        value, surrogate, entropy, self.learning_rate, *spreads = figures
         count = self.num_learning_epochs * self.num_mini_batches
         return {
-            name: total / count for name, total in zip(("value", "surrogate", "entropy"), losses)
+            "value": value / count,
+            "surrogate": surrogate / count,
+            "entropy": entropy / count,
+            "spread": sum(spreads) / len(spreads),  # NaN where one is
         }
 
     def _epochs(self) -> None:
