@@ -424,7 +424,7 @@ def figures_of(
 
 
 def known_of(prior: str, truth, height: float, e: int, rng: np.random.Generator):
-    """Return a detector's prior knowledge of scene e; see :data:`KNOWN`."""
+    """Return a detector's prior knowledge of scene e; see :data:`PRIORS`."""
     from camera.detectors.contours import Known
     from visthrow.detector_training.eyes import HANGING
 
