@@ -237,7 +237,7 @@ class HybridSim:
         return solvers.Exchange(kernels, world, build)
 
     def _solver(self) -> Callable[[solvers.World], solvers.Solver] | None:
-        """What builds the solver of the plant's bodies; None for the fused kernel."""
+        """Return the builder of the solver of the plant's bodies; None for the fused kernel."""
         name = self.params.sim.solver
         return None if name == "chain" else solvers.solver_class(name)
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 CEILINGS = {
-    "bound function words": 1860,
+    "bound function words": 1358,
     "first lines without a subject": 119,
     "class names twice": 26,
     "file names twice": 28,

@@ -83,8 +83,8 @@ class RenderedEyes:
         Args:
             params: camera. mount_b: of the rope [m], body frame. below: the ball's centre hangs so
                 far below it [m].
-            count: E. seed: of halls and sensors. device: of the renderer. by: one of `METHODS`. samples:
-                rays a pixel.
+            count: E. seed: of halls and sensors. device: of the renderer. by: one of `METHODS`.
+            samples: rays a pixel.
             nuisances: left out, all. weights: of the learnt detector; left out, those that are
                 shipped. keep: whether frames are kept.
         """
