@@ -1,9 +1,14 @@
 """Solvers behind the exchange: they end the hard throw where the fused chain does, and fly, let go
 and start anew as it does; closed forms of a box and of two cables."""
 
+import contextlib
 import dataclasses
+import gc
 import importlib.util
 import math
+import sys
+import weakref
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +17,7 @@ import warp as wp
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, PlantParams
+from sim.solvers.mujoco import _on_gpu
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
 from tests.simulators import fly
@@ -68,13 +74,13 @@ def test_physx_converges_onto_the_chain():
     assert coarse / fine == pytest.approx(4.0, rel=0.15)
 
 
-def flown(solver: str, substep: float, count: int = 12) -> HybridSim:
+def flown(solver: str, substep: float, count: int = 12, device: str = "cpu") -> HybridSim:
     """Random vehicles and ropes, a second of drawn commands, and releases on the way."""
     experiment = config.load(Experiment, config.find("train", "state"))
     plant = on(plant_of(experiment), solver, substep)
     lag = dataclasses.replace(plant.release, lag=0.1113)  # within a substep
     plant, spreads = dataclasses.replace(plant, release=lag), experiment.task.start
-    sim = HybridSim(plant, count, ropes=tether_lengths(plant.rope, spreads), seed=4)
+    sim = HybridSim(plant, count, device, 4, ropes=tether_lengths(plant.rope, spreads))
     sim.randomize(spreads)
     rng, weight = np.random.default_rng(5), GRAVITY * plant.total_mass
     for k in range(50):
@@ -175,6 +181,41 @@ def test_a_cable_pulls_or_is_slack():
             sim.step()
         apart = np.linalg.norm(sim.get("pos_w") - sim.get("payload_pos_w"))
         assert (apart < reach - 0.01) if slack else apart == pytest.approx(reach, abs=3e-3)
+
+
+def test_mujoco_warps_model_lives_as_long_as_the_graph_that_reads_it(monkeypatch):
+    class Model:
+        body_mass = None
+
+    def put_model(*_args, **_options) -> Model:
+        model = Model()
+        made.append(weakref.ref(model))
+        return model
+
+    made: list = []
+    data = SimpleNamespace(qpos=None, qvel=None, ctrl=None)
+    engine = SimpleNamespace(
+        put_model=put_model, make_data=lambda *_, **__: data, step=lambda *_: 0
+    )
+    monkeypatch.setitem(sys.modules, "mujoco_warp", engine)
+    for name in ("ScopedDevice", "ScopedStream", "ScopedCapture", "Stream", "synchronize_device"):
+        capture = contextlib.nullcontext(SimpleNamespace(graph=None))
+        monkeypatch.setattr(wp, name, lambda *_, _made=capture, **__: _made)
+    parts = _on_gpu(None, {}, 1, "cuda:0")
+    gc.collect()
+    assert made[0]() is not None, parts
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("solver", "substep", "near"), SOLVERS)
+def test_a_solver_flies_on_a_gpu_as_the_fused_chain_does(solver, substep, near):
+    if solver == "mujoco_warp":
+        pytest.importorskip("mujoco_warp")
+    ours, theirs = (
+        flown(*build, device="cuda:0") for build in (("chain", 0.002), (solver, substep))
+    )
+    for name in ("pos_w", "payload_pos_w", "landing_w"):
+        np.testing.assert_allclose(theirs.get(name), ours.get(name), atol=near, err_msg=name)
 
 
 def test_what_a_solver_cannot_hold_is_refused():
