@@ -26,6 +26,7 @@ DEADS = 6
 100 ms. Of an axis the pair of time constant and dead time counts that explains most.
 """
 RATE_NOISE = 0.01  # least change of a reported rate from tick to tick in a hover [rad/s]
+GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
 HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
 FEWEST_RATES = 4  # reported changes that a sign is taken from
 FALL, FALL_DEAD = 0.4, 2  # time over which the thrust is judged [s], its dead time in ticks
@@ -154,18 +155,28 @@ class Response:
         self.reported += 1
         if self.reported < FEWEST_RATES:
             return
+        right, reverse = self._misfit(GAINS), self._misfit(-GAINS)
+        fitted = np.minimum(right, reverse)
+        noise = np.maximum(self._wandering(), fitted / self.reported)
+        # how much better one sign explains what was reported, in squared deviations
+        better = (reverse - right) / noise
+        self._judge(np.sign(better) * np.sqrt(np.abs(better)))
+
+    def _misfit(self, gains: np.ndarray) -> np.ndarray:
+        """Return the squares that the best time constant, dead time and gain between two leave of
+        what was reported [rad^2/s^2], shape (3,).
+        """
         product, expected, reported = self._sums
-        explains = np.abs(product / np.sqrt(expected * reported))
-        scores = product / np.sqrt(expected) / self._wandering()
-        self._judge(best_scores(scores, explains))
+        gain = np.clip(product / expected, gains.min(), gains.max())
+        misfit = reported - 2.0 * gain * product + gain**2 * expected
+        return misfit.reshape(-1, 3).min(axis=0)
 
     def _wandering(self) -> np.ndarray:
-        """Return how a reported rate changes by itself from tick to tick [rad/s]."""
-        if len(self._before) < 2:
-            return np.full((len(LAGS), 1, 3), RATE_NOISE)
-        before = np.array(self._before)
-        changes = before[1:] - before[:-1] + self._shares * before[:-1]
-        return np.maximum(np.sqrt((changes**2).mean(axis=1, keepdims=True)), RATE_NOISE)
+        """Return the variance of a reported rate from tick to tick in the autopilot's own hover
+        [rad^2/s^2], shape (3,).
+        """
+        changes = np.diff(np.array(self._before), axis=0) if len(self._before) > 1 else np.zeros(3)
+        return np.maximum((changes**2).mean(axis=0), RATE_NOISE**2)
 
     def _judge_turns(self, vehicle: BodyState) -> None:
         """Judge by poses, whenever all of a doublet was answered."""
@@ -173,7 +184,8 @@ class Response:
         if self._ticks not in self._ends:
             return
         scores = self._agreement / np.sqrt(self._noise)
-        self._judge(best_scores(scores, np.abs(scores)))
+        which = np.abs(scores).reshape(-1, 3).argmax(axis=0)
+        self._judge(scores.reshape(-1, 3)[which, np.arange(3)])
         if self.running and self._ticks == self._ends[-1]:
             self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
 
@@ -185,12 +197,6 @@ class Response:
             self.problem = (
                 f"{_names(wrong)}: the vehicle turns against its commands; a sign is wrong"
             )
-
-
-def best_scores(scores: np.ndarray, explains: np.ndarray) -> np.ndarray:
-    """Return the score of each axis by the time constant and dead time that explain most."""
-    which = explains.reshape(-1, 3).argmax(axis=0)
-    return scores.reshape(-1, 3)[which, np.arange(3)]
 
 
 def _names(which: np.ndarray) -> str:
