@@ -60,9 +60,9 @@ WORK: dict[str, Work] = {
                 for name in ("state_two_cables", "state_box", "state_fast")
             ],
             900.0,
-            140.0,
+            105.0,
         ),
-        ([rates("mujoco_warp")], 85.0, 0.0),
+        ([rates("mujoco_warp", counts=("65536",))], 50.0, 0.0),
         (
             [throws(f"{x}-mujoco_warp", "mujoco_warp") for x in ("state_two_cables", "state_box")]
             + [throws("state_fast-mujoco_warp", solver) for solver in ("mujoco_warp", "chain")],
