@@ -54,6 +54,10 @@ COMMANDS = {
         "print what was measured, with command, commit and machine",
         "visthrow.paper.commands.bench_command",
     ),
+    "cooperative": (
+        "throw one load with several vehicles",
+        "visthrow.cooperative.commands",
+    ),
     "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
 }
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"

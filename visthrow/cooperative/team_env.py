@@ -38,7 +38,8 @@ class TeamEnv(VecEnv):
         earliest: control step of an episode before which no request counts, shape ().
         last: what the last step ended, each over the worlds: ``released``, ``negative``,
             ``contact`` (bool), ``landing_error`` [m], ``duration`` [s], ``landing_w`` [m],
-            ``clearance`` [m], ``gap`` [m] and ``apart`` [s], between first and last separation.
+            ``clearance`` [m], ``gap`` [m], ``apart`` [s], between first and last separation, the
+            load's position [m] and velocity [m/s] at the end of the step.
     """
 
     def __init__(
@@ -231,6 +232,7 @@ class TeamEnv(VecEnv):
         end = begin + when.amax(1)
         chosen["duration"] = end + chosen["time_to_impact"]
         chosen["apart"] = end - memory["first"]
+        chosen["load_w"], chosen["load_vel_w"] = self.load_w.clone(), self.load_vel_w.clone()
         chosen["clearance"] = self._clearance(chosen["time_to_impact"])
         return separated.any(1) & ~attached, chosen
 

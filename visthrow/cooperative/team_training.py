@@ -54,8 +54,8 @@ class TeamTraining(PPOTraining):
     def collect(self, done: float) -> None:
         team = self.experiment.team
         begin, end = team.free
-        left = min(max((end - done) / (end - begin), 0.0), 1.0)
-        self.env.earliest.fill_(round(left * team.first_release))
+        share = min(max((end - done) / (end - begin), 0.0), 1.0)
+        self.env.earliest.fill_(round(share * team.first_release))
         super().collect(done)
 
     def policy(self, made_by: dict[str, Any] | None = None) -> Policy:
@@ -80,7 +80,7 @@ class TeamTraining(PPOTraining):
 
 
 @torch.inference_mode()
-def throw(
+def fly(
     experiment: TeamExperiment,
     policy: Callable[[torch.Tensor], torch.Tensor],
     *,
@@ -91,25 +91,22 @@ def throw(
     seed: int = 12345,
     build: Any = None,
     record: Callable[[TeamEnv], None] | None = None,
-) -> dict[str, Any]:
+) -> dict[str, np.ndarray]:
     """Throw ``count`` times from hover at a target [m] along x, all noise included, as one batch.
 
-    Returns, besides the conditions, ``landed`` (share), ``contact`` (share), mean, median and 95th
-    percentile of the landing error [m], its bias [m], ``duration`` [s] and ``apart`` [s] of the
-    throws that landed clear. A throw whose load comes nearer to a vehicle than both radii in its
-    flight counts as a contact.
+    Returns what :attr:`TeamEnv.last` held as each ended; one that never did was not released.
 
     Args:
         experiment, fault: conditions, see :func:`visthrow.cooperative.team.as_flown`.
         policy: of observations (E, D) -> actions (E, 5).
         build: another solver of the bodies.
-        record: called with the environment before the first step and after each.
+        record: called with the environment before each step.
     """
     devices = [device] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
-        flown = as_flown(experiment, fault)
-        env = TeamEnv(flown, device, seed, count * experiment.team.vehicles, build)
+        rows = count * experiment.team.vehicles
+        env = TeamEnv(as_flown(experiment, fault), device, seed, rows, build)
         env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
         observations = env.reset()
         results: dict[str, torch.Tensor] = {}
@@ -125,9 +122,21 @@ def throw(
             waiting &= ~ended
             if not bool(waiting.any()):
                 break
-    values = {name: value.cpu().numpy() for name, value in results.items()}
-    radii = flown.rope.payload_radius + flown.vehicle.collision_radius
-    return {"fault": fault, "target": target, "seed": seed} | _summary(values, target, radii)
+    return {name: value.cpu().numpy() for name, value in results.items()}
+
+
+def throw(experiment: TeamExperiment, *args: Any, **options: Any) -> dict[str, Any]:
+    """Figures of throws; arguments as of :func:`fly`.
+
+    ``landed`` and ``contact`` are shares. Errors [m], their bias [m], ``duration`` [s] and
+    ``apart`` [s] are of the throws that landed clear: a load that comes nearer to a vehicle than
+    both radii in its flight touches it.
+    """
+    radii = experiment.rope.payload_radius + experiment.vehicle.collision_radius
+    target = options.get("target", 2.0)
+    conditions = {name: options[name] for name in ("fault", "seed") if name in options}
+    values = fly(experiment, *args, **options)
+    return {**conditions, "target": target, **_summary(values, target, radii)}
 
 
 def _summary(values: dict[str, np.ndarray], target: float, radii: float) -> dict[str, Any]:

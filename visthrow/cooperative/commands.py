@@ -1,0 +1,137 @@
+"""``visthrow cooperative``: throws of several vehicles with one load."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
+
+POLICIES = ("pair", "pair_vision")
+"""Shipped policies, each with the configuration of its name in ``configs/cooperative``."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the actions of the command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    demo = actions.add_parser("demo", help="throw once with the shipped policy and draw it")
+    flight = actions.add_parser("fly", help="throw once and write a picture and a recording")
+    comparison = actions.add_parser("compare", help="throw many times under every fault")
+    for one in (demo, flight):
+        add_out(one, "out/cooperative", "for picture and recording")
+    for one in (flight, comparison):
+        one.add_argument("--target", type=ABOVE_ZERO, default=2.0, help="along x [m] (default: 2)")
+        one.add_argument("--seed", type=WHOLE, default=0, help="of starts and noise (default: 0)")
+        one.add_argument(
+            "--solver",
+            choices=("tree", "mujoco"),
+            default="tree",
+            help="of the bodies: the training's, or MuJoCo with 15 segments (default: tree)",
+        )
+    flight.add_argument("policy", nargs="?", default="pair", help=f"of {', '.join(POLICIES)}")
+    flight.add_argument("--fault", default="none", help="none, weak, late or old (default: none)")
+    comparison.add_argument("policies", nargs="*", default=["pair"], metavar="POLICY")
+    comparison.add_argument("--throws", type=WHOLE, default=200, help="of each (default: 200)")
+    comparison.add_argument("--json", metavar="FILE", help="write the figures to this file as well")
+    demo.set_defaults(policy="pair", target=2.0, seed=0, solver="tree", fault="none")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Throw once, or many times."""
+    return _compare(args) if args.action == "compare" else _fly(args)
+
+
+def load(name: str, solver: str) -> tuple[Any, Any, Any]:
+    """Experiment, policy and solver of throws.
+
+    Raises PolicyError: no such policy; MismatchError: one of another team or task.
+    """
+    from visthrow import config
+    from visthrow.common.errors import VisthrowError
+    from visthrow.common.extras import load_extra
+    from visthrow.cooperative.team import TeamExperiment, team_contract
+    from visthrow.onboard.policy import Policy, find_policy
+
+    policy = Policy.load(find_policy(name))
+    vision = policy.contract["observation"]["layout"] == "vision"
+    path = config.find("cooperative", POLICIES[vision])
+    experiment = config.load(TeamExperiment, path)
+    policy.require(team_contract(experiment), allow=("team",))
+    if solver == "tree":
+        return experiment, policy, None
+    referee = load_extra(
+        "visthrow.cooperative.referee", "reference", "--solver mujoco", VisthrowError
+    )
+    experiment = config.load(TeamExperiment, path, ["rope.segments=15"])
+    return experiment, policy, referee.MujocoTeam
+
+
+def _fault(name: str) -> str:
+    from visthrow.common.errors import ConfigError, suggest
+    from visthrow.cooperative.team import FAULTS
+
+    if name not in FAULTS:
+        raise ConfigError(f"no fault '{name}'; {suggest(name, FAULTS)}")
+    return name
+
+
+def _fly(args: argparse.Namespace) -> int:
+    """Throw once and write what came of it."""
+    from visthrow.common.storage import writable
+    from visthrow.cooperative.track import record_throw, write
+
+    folder, fault = Path(args.out), _fault(args.fault)
+    writable(folder)
+    experiment, policy, build = load(args.policy, args.solver)
+    options = {"fault": fault, "target": args.target, "seed": args.seed, "build": build}
+    track = record_throw(experiment, policy.act, **options)
+    if not track.released:
+        print("The load was not released.")
+    else:
+        print(
+            f"Landed {100 * track.landing_error:.1f} cm from the target,"
+            f" {track.flight_time[-1]:.2f} s after the start."
+        )
+    for path in write(track, folder, experiment.rope.payload_radius):
+        print(f"  {path}")
+    return 0
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """Throw many times and print a table."""
+    from visthrow.common.storage import write_json
+    from visthrow.cooperative.team import FAULTS
+    from visthrow.cooperative.team_training import throw
+    from visthrow.view.parts import aligned
+
+    rows, cells = [], []
+    for name in args.policies:
+        experiment, policy, build = load(name, args.solver)
+        for fault in FAULTS:
+            options = {"fault": fault, "target": args.target, "seed": args.seed, "build": build}
+            row = throw(experiment, policy.act, count=args.throws, **options)
+            rows.append({"policy": name, "solver": args.solver, **row})
+            cells.append(_cells(rows[-1]))
+    heads = (
+        "policy",
+        "fault",
+        "throws",
+        "error [m]",
+        "95 % [m]",
+        "duration [s]",
+        "landed",
+        "contact",
+    )
+    print(aligned(heads, cells, heads=2))
+    if args.json:
+        write_json(args.json, rows)
+    return 0
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    """A row of the table."""
+    figures = [
+        f"{row[name]:.3f}" if name in row else "-"
+        for name in ("error_mean", "error_p95", "duration_mean")
+    ]
+    shares = [f"{100 * row[name]:.1f} %" for name in ("landed", "contact")]
+    return (row["policy"], row["fault"], str(row["throws"]), *figures, *shares)
