@@ -9,6 +9,8 @@ from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
 POLICIES = ("pair", "pair_vision")
 """Shipped policies, each with the configuration of its name in ``configs/cooperative``."""
 
+SHIPPED = Path(__file__).with_name("policies")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the actions of the command."""
@@ -46,12 +48,19 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
     Raises PolicyError: no such policy; MismatchError: one of another team or task.
     """
     from visthrow import config
-    from visthrow.common.errors import VisthrowError
+    from visthrow.common.errors import PolicyError, VisthrowError, suggest
     from visthrow.common.extras import load_extra
     from visthrow.cooperative.team import TeamExperiment, team_contract
-    from visthrow.onboard.policy import Policy, find_policy
+    from visthrow.onboard.policy import Policy
 
-    policy = Policy.load(find_policy(name))
+    file = Path(name)
+    if not file.is_file():
+        file = SHIPPED / f"{name}.npz"
+    if not file.is_file():
+        raise PolicyError(
+            f"no policy '{name}', neither a file nor shipped; {suggest(name, POLICIES)}"
+        )
+    policy = Policy.load(file)
     vision = policy.contract["observation"]["layout"] == "vision"
     path = config.find("cooperative", POLICIES[vision])
     experiment = config.load(TeamExperiment, path)
