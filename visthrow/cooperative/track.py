@@ -71,6 +71,7 @@ def record_throw(
     )
 
 
+HUES = (style.COLOURS[0], style.COLOURS[3], style.COLOURS[5])  # of vehicles
 GHOSTS = 5
 """Times at which the picture shows vehicles and cables."""
 
@@ -84,7 +85,7 @@ def picture(track: Track, path: Path) -> None:
     steps = np.unique(np.linspace(0, len(track.time) - 1, GHOSTS).round().astype(int))
     for axis, columns in zip(axes, ((0, 2), (0, 1)), strict=True):
         for v in range(track.pos_w.shape[1]):
-            colour = style.COLOURS[v]
+            colour = HUES[v % len(HUES)]
             axis.plot(*track.pos_w[:, v][:, columns].T, color=colour, lw=0.8)
             for k in steps:
                 nose = track.rot_wb[k, v] @ np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]).T
@@ -103,7 +104,8 @@ def picture(track: Track, path: Path) -> None:
     axes[0].set_ylabel("z [m]")
     axes[1].set_ylabel("y [m]")
     axes[0].legend(loc="lower left")
-    figure.suptitle(f"Landed {100.0 * track.landing_error:.1f} cm from the target")
+    landed = f"Landed {100.0 * track.landing_error:.1f} cm from the target"
+    figure.suptitle(landed if track.released else "Not released")
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
