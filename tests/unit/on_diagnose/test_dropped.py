@@ -22,7 +22,7 @@ ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
 
 
 @cache
-def model_of(lost: float, throws: int = 3, **theta: float) -> ThrowModel:
+def model_of(lost: float, throws: int = 2, **theta: float) -> ThrowModel:
     return ThrowModel(
         fly(setting_with(theta), seed=4, free=1, throws=throws, seconds=3.0, lost=lost),
         paper_plant(),

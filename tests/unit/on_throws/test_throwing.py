@@ -253,6 +253,17 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
     assert (out / "compare-hybrid.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_compare_throws_under_the_conditions_of_its_options(dropper, tmp_path, capsys, monkeypatch):
+    def throw(loaded, *conditions):
+        raise ConfigError(f"thrown {len(loaded)} {conditions}")
+
+    monkeypatch.setattr("visthrow.cli.compare.throw_hybrid", throw)
+    words = ["--targets", "0.5", "1", "--throws", "7", "--seed", "3", "--device", "cpu"]
+    out = ["--calibrate", "--out", str(tmp_path)]
+    assert main(["compare", str(dropper), str(dropper), *words, *out]) == 2
+    assert "thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)" in capsys.readouterr().err
+
+
 def test_protocol_on_the_reference_plant(dropper, monkeypatch):
     """A drop from hover lands below the hover point, so far from the target as that is; in parts or
     as a whole.
