@@ -8,11 +8,9 @@ import json
 import pytest
 
 from bench import faults as hil_faults
-from bench import figures as hil
 from bench import runner
 from bench import soak as hil_soak
 from bench.processes import Pair
-from visthrow.cli import main
 from visthrow.common.errors import VisthrowError
 
 SOAK_MINUTES = 1.0
@@ -25,31 +23,6 @@ more. A minute is short for a line, the recorder's buffers breathe.
 def test_a_run_that_does_not_start_says_why(tmp_path):
     with pytest.raises(VisthrowError, match=r"did not start.*no policy 'nobody'"):
         Pair(("--config", "fake", "--set", "policy=nobody"), hil_soak.STILL).fly(tmp_path / "run")
-
-
-def test_a_short_soak_over_udp(tmp_path, capsys):
-    """Three seconds: all is counted, and the fake saw nothing that it should not.
-
-    Times are for a quiet machine.
-    """
-    out, run = tmp_path / "soak.json", tmp_path / "run"
-    assert (
-        runner.main(
-            ["--minutes", "0.05", "--json", str(out), "--keep", str(run), "--out", str(tmp_path)]
-        )
-        == 0
-    )
-    figures = json.loads(out.read_text())["figures"]
-    assert figures["ticks"] > 50
-    assert figures["breaches"] == []
-    assert all(
-        figures["latency_ms"][name]
-        for name in ("poll", "estimate", "observation", "policy", "send", "total")
-    )
-    assert not figures["interrupted"]
-    assert hil.json_lines(tmp_path / "soak.jsonl")[0]["memory_bytes"] > 50e6
-    assert "within the bars" in capsys.readouterr().out.replace("NOT ", "")
-    assert main(["hil", "replay", str(run)]) == 0
 
 
 @pytest.mark.slow

@@ -201,6 +201,21 @@ def test_messages_without_a_stamp_or_with_another_clock_share_the_clock_of_the_f
     assert "never overlap" not in str(check([log])[0].rows)
 
 
+def test_another_senders_messages_are_left_out_by_name(tmp_path):
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    def more(mav, i):
+        return [mav.sys_status_encode(0, 0, 0, 0, 15000, 0, 0, 0, 0, 0, 0, 0, 0)]
+
+    path, other = write_tlog(tmp_path / "a.tlog", more), dialect.MAVLink(None, 2, 190)
+    late = struct.pack(">Q", int((1.7e9 + 1.0) * 1e6))
+    report = other.sys_status_encode(0, 0, 0, 0, 9000, 0, 0, 0, 0, 0, 0, 0, 0)
+    path.write_bytes(path.read_bytes() + late + bytes(report.pack(other)))
+    log = read(path)[0]
+    assert set(log["battery_voltage"].values) == {15.0}
+    assert "1 SYS_STATUS of system 2, component 190: of another sender" in log.meta["left_out"]
+
+
 @pytest.mark.parametrize(("frame", "known"), [(1, True), (21, True), (8, False)])
 def test_odometry_of_a_failed_tracker_or_of_another_frame_is_no_position(frame, known, tmp_path):
     nan = [math.nan] * 21

@@ -444,6 +444,14 @@ def test_command_line(tmp_path, capsys):
     assert (tmp_path / "01-a.npz.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "a.json").read_text())["logs"][0]["verdict"] == "ok"
     assert cli.main(["diagnose", "check", str(tmp_path / "b.npz")]) == 2
+    FlightLog({}).save(tmp_path / "empty.npz")
+    logs = [str(tmp_path / "a.npz"), str(tmp_path / "empty.npz")]
+    short, whole = (
+        (cli.main(["diagnose", "check", *logs, "--no-pictures", *more]), capsys.readouterr().out)
+        for more in ([], ["--all"])
+    )
+    assert (short[0], whole[0]) == (1, 1), "one bad log is enough"
+    assert len(whole[1].splitlines()) > len(short[1].splitlines())
 
 
 def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, capsys):

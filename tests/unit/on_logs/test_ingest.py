@@ -334,6 +334,36 @@ class TestTables:
         assert logs[1]["x"].time[0] == 100.0
         assert logs[1]["y"].time[0] == pytest.approx(0.5)
 
+    def test_scale_and_offset_are_in_the_files_unit(self, tmp_path):
+        entry = ChannelMap("x", ("v",), "cm", scale=2.0, offset=3.0)
+        (log,) = read(written(tmp_path, ["t,v", "0,1", "10,2", "20,-4"]), mapping(entry))
+        assert log["x"].values == pytest.approx([0.05, 0.07, -0.05])
+
+    @pytest.mark.parametrize(
+        ("clock", "times"),
+        [
+            (TimeColumn("t", "ms", offset=0.5), [0.5, 0.51, 0.53]),
+            (TimeColumn("t", "s", offset=-2.0), [-2.0, 8.0, 28.0]),
+            (TimeColumn(row_period=0.02, offset=1.0), [1.0, 1.02, 1.04]),
+        ],
+    )
+    def test_clocks(self, clock, times, tmp_path):
+        path = written(tmp_path, ["t,v", "0,1", "10,2", "30,3"])
+        (log,) = read(path, TableMap(clock, (ChannelMap("x", ("v",), "m"),)))
+        assert log["x"].time == pytest.approx(times)
+
+    @pytest.mark.parametrize(
+        ("gap", "shortest", "firsts"),
+        [(0.05, 0.0, [1, 4, 6]), (0.07, 0.0, [1, 6]), (0.05, 0.015, [1, 6]), (0.05, 0.025, [6])],
+    )
+    def test_a_gap_begins_a_log_and_short_ones_are_left_out(self, gap, shortest, firsts, tmp_path):
+        """Stretches of 20, 10 and 30 ms, gaps of 60 and 80 ms."""
+        stamps = [0, 10, 20, 80, 90, 170, 180, 190, 200]
+        rows = ["t,v", *(f"{stamp},{i}" for i, stamp in enumerate(stamps, start=1))]
+        rule = mapping(ChannelMap("x", ("v",), "m"), split=Split(gap=gap, shortest=shortest))
+        logs = read(written(tmp_path, rows), rule)
+        assert [log["x"].values[0] for log in logs] == firsts
+
     def test_export_comes_back(self, tmp_path):
         time = np.arange(30) * 0.01
         log = FlightLog(
