@@ -146,10 +146,10 @@ def _not_taken(rosters: list[Roster], seconds: float) -> list[str]:
     ]
 
 
-def _body_line(name: str, track: Track, now: float, seconds: float, stamped: bool) -> str:
-    flow = track.stream.flow(now)
+def _body_line(name: str, track: Track, time: float, seconds: float, stamped: bool) -> str:
+    flow = track.stream.flow(time)
     state, refused = (
-        track.state(now),
+        track.state(time),
         (json.dumps(track.gate.refused) if track.gate.refused else "none"),
     )
     if state is None:
@@ -192,17 +192,17 @@ class AutopilotCheck:
             else HoverMeter(getattr(params, params.backend).thrust)
         )
 
-    def status(self, now: float) -> Status:
+    def status(self, time: float) -> Status:
         """Return what the runner is to know of it at a time [s]; what the audit found is said by
         :meth:`results`.
         """
-        return dataclasses.replace(self.backend.status(now), fault=None)
+        return dataclasses.replace(self.backend.status(time), fault=None)
 
-    def tick(self, now: float, runner: Any) -> None:
+    def tick(self, time: float, runner: Any) -> None:
         """Listen; the runner knows whether the vehicle hovers."""
-        self.backend.service(now)
+        self.backend.service(time)
         track = runner.tracks[VEHICLE]
-        state = track.state(now)
+        state = track.state(time)
         if (
             self.meter is not None
             and state is not None
@@ -212,11 +212,11 @@ class AutopilotCheck:
             self.meter.add(self.backend.share)
         self.backend.share = None  # each report counts once
 
-    def results(self, now: float, mass: float) -> list[tuple[bool, str]]:
+    def results(self, time: float, mass: float) -> list[tuple[bool, str]]:
         """Return what was found with a mass [kg] that hovers: whether it is good, and in words."""
         if self.meter is None:
             return []
-        audit, status = self.backend.audit, self.backend.status(now)
+        audit, status = self.backend.audit, self.backend.status(time)
         if audit.rules:
             print(audit.table())
         out = [] if audit.fault() is None else [(False, audit.fault())]

@@ -69,7 +69,7 @@ class ReleaseCheck:
         drag = -self._drag * math.hypot(*vel)
         return (drag * vel[0], drag * vel[1], drag * vel[2] - GRAVITY)
 
-    def miss(self, now: float, payload: BodyState, goal_w: Vector) -> str | None:
+    def miss(self, time: float, payload: BodyState, goal_w: Vector) -> str | None:
         """Return why a release at a time [s] is refused, or None."""
         if self._params is None:
             return None
@@ -79,12 +79,12 @@ class ReleaseCheck:
             return None
         self.refused += 1
         if self._first is None:
-            self._first = now
+            self._first = time
         return (
             f"it would land at ({x:.2f}, {y:.2f}) m, {error:.2f} m from the goal, within"
             f" {self._params.bound:g} m expected"
         )
 
-    def given_up(self, now: float) -> bool:
+    def given_up(self, time: float) -> bool:
         """Return whether the patience is over at a time [s] since the first refused release."""
-        return self._first is not None and now - self._first >= self._params.patience
+        return self._first is not None and time - self._first >= self._params.patience

@@ -86,7 +86,7 @@ class Calibrating:
         self._due: Hovered | None = None
         self._solving = False
 
-    def rates(self, now: float, calm: bool, goal_w: Vector) -> tuple[float, float]:
+    def rates(self, time: float, calm: bool, goal_w: Vector) -> tuple[float, float]:
         """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``calm``: the vehicle
         hovers and nothing swings; ``goal_w``: the goal's position [m].
         """
@@ -94,10 +94,10 @@ class Calibrating:
         if self.calibration is not None or self._solving:
             return 0.0, 0.0
         if self._begin is None and calm:
-            self._begin = now
-        if self._begin is None or now - self._begin < p.still:
+            self._begin = time
+        if self._begin is None or time - self._begin < p.still:
             return 0.0, 0.0
-        swayed = now - self._begin - p.still
+        swayed = time - self._begin - p.still
         if swayed >= p.sway:
             self._finish(goal_w)
             return 0.0, 0.0
@@ -105,7 +105,7 @@ class Calibrating:
 
     def note(
         self,
-        now: float,
+        time: float,
         vehicle: BodyState,
         thrust: float,
         points: np.ndarray,
@@ -118,7 +118,7 @@ class Calibrating:
         """
         if self._begin is not None and not self._solving and self.calibration is None:
             state = (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate)
-            self._rows.append((now, *state, thrust, points, valid, age))
+            self._rows.append((time, *state, thrust, points, valid, age))
 
     def stop(self) -> None:
         """Start again with the next calm hover: the vehicle was not ours."""

@@ -81,18 +81,18 @@ class PayloadFlight:
             return None
         return self._landing()
 
-    def overdue(self, now: float) -> Landing | None:
+    def overdue(self, time: float) -> Landing | None:
         """Return the landing of a payload whose poses ended shortly before the ground, by a time
         [s].
         """
         times = self._times
         if len(times) < LANDING_POSES or times[-LANDING_POSES] <= self.latch + self.lag:
             return None
-        if now - times[-1] < POSE_TIMEOUT:
+        if time - times[-1] < POSE_TIMEOUT:
             return None
         landing = self._landing()
         extrapolated = landing.time - times[-1]
-        landed = extrapolated < MOST_EXTRAPOLATION and landing.time < now - POSE_TIMEOUT
+        landed = extrapolated < MOST_EXTRAPOLATION and landing.time < time - POSE_TIMEOUT
         return landing if landed else None
 
     def _landing(self) -> Landing:
@@ -203,24 +203,24 @@ class Latch:
         """Forget the last release: the payload hangs again, and the next throw is armed."""
         self.at = None
 
-    def begin(self, now: float) -> None:
+    def begin(self, time: float) -> None:
         """Note the start of a throw [s]."""
-        self._start = now
+        self._start = time
 
-    def trip(self, now: float, goal_w: Vector) -> float:
+    def trip(self, time: float, goal_w: Vector) -> float:
         """Latch at a time [s]; return the time of the mechanism's command [s], from which it
         separates after the trained lag.
         """
-        self.at, self.command_time = now, now + self._wait
+        self.at, self.command_time = time, time + self._wait
         self.count += 1
-        self._flight = PayloadFlight(goal_w, self._start, now, self._height, self.lag)
+        self._flight = PayloadFlight(goal_w, self._start, time, self._height, self.lag)
         return self.command_time
 
-    def separated(self, now: float) -> bool:
+    def separated(self, time: float) -> bool:
         """Return whether the payload has separated by a time [s], by latch and lag."""
-        return self.at is not None and now - self.at >= self.lag - ROUNDING
+        return self.at is not None and time - self.at >= self.lag - ROUNDING
 
-    def payload_hangs(self, now: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
+    def payload_hangs(self, time: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
         """Return whether the payload hangs on the vehicle at a time [s], by the latch and by the
         positions [m]; None for a payload without a fresh pose.
         """
@@ -229,7 +229,7 @@ class Latch:
         excess = math.dist(vehicle_w, payload_w) - self._hang
         if self.at is None:  # it may have come off by itself
             return excess < self._tolerance
-        if now - self.at < self.lag + STUCK_AFTER:
+        if time - self.at < self.lag + STUCK_AFTER:
             return False
         hangs = abs(excess) < self._tolerance
         if hangs and self._flight is not None:
@@ -241,10 +241,10 @@ class Latch:
         if self._flight is not None:
             self._note_landing(self._flight.add(time, payload_w))
 
-    def overdue(self, now: float) -> None:
+    def overdue(self, time: float) -> None:
         """Note the landing of a payload whose poses ended shortly before the ground."""
         if self._flight is not None:
-            self._note_landing(self._flight.overdue(now))
+            self._note_landing(self._flight.overdue(time))
 
     def _note_landing(self, landing: Landing | None) -> None:
         if landing is not None:

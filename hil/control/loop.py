@@ -3,9 +3,9 @@
 import gc
 import math
 import re
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 from typing import Any, Protocol
 
 from hil.control.calibrating import Calibrating, CalibrationSolver
@@ -130,36 +130,36 @@ class Loop:
         runner.take_poses(early)
         _wait(clock, ticker.due(), backend, source)
         due, missed = ticker.due(), ticker.missed
-        now, start = ticker.take(), time.perf_counter()
+        time, start = ticker.take(), perf_counter()
         self.ours += (ticker.missed - missed) * (self._ended > due)
-        late = source.poll(now)
-        polled = time.perf_counter()
-        status, words = backend.status(now), self.operator.words(runner.machine.state.value)
+        late = source.poll(time)
+        polled = perf_counter()
+        status, words = backend.status(time), self.operator.words(runner.machine.state.value)
         if over:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
-        runner.decider.rivals = source.rivals(now)
-        end = time.perf_counter()
+        runner.decider.rivals = source.rivals(time)
+        end = perf_counter()
         if self.eyes is not None:
-            self.eyes.hint = runner.estimator.hint(now)
-            runner.estimator.take_detections(self.eyes.poll(now))
+            self.eyes.hint = runner.estimator.hint(time)
+            runner.estimator.take_detections(self.eyes.poll(time))
         if self.solver is not None and (result := self.solver.poll()) is not None:
             runner.commander.calibration = result
-        decision = runner.tick(now, late, status, words, recording)
+        decision = runner.tick(time, late, status, words, recording)
         if self.solver is not None and (hovered := runner.calibrating.due()) is not None:
             self.solver.submit(hovered)
         times = {
             "late": ticker.late,
             "poll": polled - start,
-            **self.stages.poses(early + late, now),
+            **self.stages.poses(early + late, time),
             **runner.parts.spent,
         }
         if "total" in times:
             times["total"] += end - start
-        backend.service(now)
+        backend.service(time)
         self.stages.add(times)
         if decision.release:
-            self.throws.append(now)
+            self.throws.append(time)
         self._tell(decision)
         if self.recorder is not None:
             self.recorder.tick(

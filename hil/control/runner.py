@@ -66,7 +66,7 @@ class Runner:
 
     def tick(
         self,
-        now: float,
+        time: float,
         poses: list[Pose],
         status: Status,
         words: OperatorInput,
@@ -86,14 +86,14 @@ class Runner:
         try:
             self._raise_early_error()
             self.estimator.take_poses(poses)
-            estimate = self.estimator.estimate(now)
+            estimate = self.estimator.estimate(time)
             record = self.decider.decide(estimate, status, words, recording)
             self.commander.enter(estimate, record.state)
             self.estimator.show_detection(estimate, record)
             self.parts.spent["estimate"] = perf_counter() - begin
             self.commander.act(estimate, status, record, begin)
         except Exception as error:  # in flight nothing raises past the runner
-            return self.fail(now, error)
+            return self.fail(time, error)
         return record
 
     def _raise_early_error(self) -> None:
@@ -101,7 +101,7 @@ class Runner:
             error, self._early_error = self._early_error, None
             raise error
 
-    def fail(self, now: float, error: BaseException) -> TickRecord:
+    def fail(self, time: float, error: BaseException) -> TickRecord:
         """Abort the run because of an exception: no further release, and the autopilot is asked to
         land, tick by tick.
         """
@@ -111,11 +111,11 @@ class Runner:
             trace = "".join(traceback.format_exception(error))
             if trace not in self.errors and len(self.errors) < MOST_ERRORS:
                 self.errors.append(trace)
-        self.machine.step(now, Inputs(ABORT, ABORT, failure=reason))
+        self.machine.step(time, Inputs(ABORT, ABORT, failure=reason))
         self.backend.stop_release()
         if self.machine.flown:
-            self.backend.abort(now)
-        return TickRecord(now, self.machine.state.value, self.machine.reason, note="exception")
+            self.backend.abort(time)
+        return TickRecord(time, self.machine.state.value, self.machine.reason, note="exception")
 
     @property
     def in_flight(self) -> bool:

@@ -135,23 +135,23 @@ class Machine:
         self.handed_back = False
         self._lasting_since: float | None = None  # of the condition that must last [s]
 
-    def step(self, now: float, inputs: Inputs) -> State:
+    def step(self, time: float, inputs: Inputs) -> State:
         """Advance by one tick; return the state to act in."""
         if self.since is None:
-            self.since = now
+            self.since = time
         urgent = self._abort_reason(inputs)
         if self.state is State.ABORT:
             # A vehicle that was never ours needs no descent.
-            if not self.flown or now - self.since > self.params.abort:
-                self._go(now, State.DONE, self.reason)
+            if not self.flown or time - self.since > self.params.abort:
+                self._go(time, State.DONE, self.reason)
         elif self.state is not State.DONE:
             if inputs.disagrees is not None and self.state in (State.READY, State.ARMED):
                 self.handed_back = True
-                self._go(now, State.ABORT, f"handed back: {inputs.disagrees}")
+                self._go(time, State.ABORT, f"handed back: {inputs.disagrees}")
             elif urgent is not None:
-                self._go(now, State.ABORT, urgent)
+                self._go(time, State.ABORT, urgent)
             else:
-                _STEPS[self.state](self, now, inputs)
+                _STEPS[self.state](self, time, inputs)
         return self.state
 
     def _abort_reason(self, inputs: Inputs) -> str | None:
@@ -172,17 +172,17 @@ class Machine:
             return f"the autopilot is silent, disarmed or in another mode{note}"
         return None
 
-    def _go(self, now: float, state: State, reason: str) -> None:
+    def _go(self, time: float, state: State, reason: str) -> None:
         if self.state is State.THROW and state is not State.THROW and reason != "separated":
             self.cancelled += 1
-        self.state, self.reason, self.since = state, reason, now
+        self.state, self.reason, self.since = state, reason, time
         self._lasting_since = None
         self.throws += state is State.THROW
         self.flown |= state in FLYING
         self.aborted |= state is State.ABORT
 
-    def _go_land(self, now: float, inputs: Inputs, reason: str = "") -> None:
-        self._go(now, State.LAND, "the operator said land" if inputs.land else reason)
+    def _go_land(self, time: float, inputs: Inputs, reason: str = "") -> None:
+        self._go(time, State.LAND, "the operator said land" if inputs.land else reason)
 
     def waits(self, inputs: Inputs) -> str:
         """Return what the state waits for, in words; empty where it waits for time alone."""
@@ -205,86 +205,86 @@ class Machine:
             texts.append("the operator's word: arm")
         return "; ".join(texts)
 
-    def _lasted(self, now: float, holds: bool, time: float) -> bool:
+    def _lasted(self, time: float, holds: bool, duration: float) -> bool:
         """Return whether a condition has held for a time [s]."""
         if not holds:
             self._lasting_since = None
             return False
         if self._lasting_since is None:
-            self._lasting_since = now
-        return now - self._lasting_since >= time - 1e-9
+            self._lasting_since = time
+        return time - self._lasting_since >= duration - 1e-9
 
-    def lasting(self, now: float) -> float:
+    def lasting(self, time: float) -> float:
         """Return for how long the condition that must last has held [s]."""
-        return 0.0 if self._lasting_since is None else now - self._lasting_since
+        return 0.0 if self._lasting_since is None else time - self._lasting_since
 
-    def _late(self, now: float) -> bool:
-        return now - self.since > getattr(self.params, self.state.value)
+    def _late(self, time: float) -> bool:
+        return time - self.since > getattr(self.params, self.state.value)
 
-    def _idle(self, now: float, inputs: Inputs) -> None:
+    def _idle(self, time: float, inputs: Inputs) -> None:
         if not inputs.missing():
-            self._go(now, State.CHECK, "poses and autopilot are there")
-        elif self._late(now) and not self.patient:
-            self._go(now, State.ABORT, f"{', '.join(inputs.missing())}, for {self.params.idle:g} s")
+            self._go(time, State.CHECK, "poses and autopilot are there")
+        elif self._late(time) and not self.patient:
+            self._go(time, State.ABORT, f"{', '.join(inputs.missing())}, for {self.params.idle:g} s")
 
-    def _check(self, now: float, inputs: Inputs) -> None:
+    def _check(self, time: float, inputs: Inputs) -> None:
         good = not (inputs.missing() or inputs.failed_checks or inputs.streams)
-        if self._lasted(now, good, self.params.check_hold):
-            self._go(now, State.READY, "checks passed")
-        elif self._late(now) and not self.patient:
+        if self._lasted(time, good, self.params.check_hold):
+            self._go(time, State.READY, "checks passed")
+        elif self._late(time) and not self.patient:
             reason = self.waits(inputs) or "poses or autopilot come and go"
-            self._go(now, State.ABORT, f"checks: {reason}")
+            self._go(time, State.ABORT, f"checks: {reason}")
 
-    def _ready(self, now: float, inputs: Inputs) -> None:
-        if inputs.land or self._late(now):
-            self._go_land(now, inputs, "nobody armed a throw")
+    def _ready(self, time: float, inputs: Inputs) -> None:
+        if inputs.land or self._late(time):
+            self._go_land(time, inputs, "nobody armed a throw")
         elif not (inputs.arm and inputs.following and inputs.recording):
             return
         elif not inputs.failed_checks and inputs.payload < HOLD:
-            self._go(now, State.ARMED, "the operator armed this throw")
+            self._go(time, State.ARMED, "the operator armed this throw")
 
-    def _armed(self, now: float, inputs: Inputs) -> None:
+    def _armed(self, time: float, inputs: Inputs) -> None:
         if inputs.land:
-            self._go_land(now, inputs)
+            self._go_land(time, inputs)
         elif inputs.poses_are_stale() or not (inputs.recording and inputs.following):
             reason = "disarmed: stale poses, not followed, or the recording failed"
-            self._go(now, State.READY, reason)
-        elif self._lasted(now, inputs.calm and not inputs.failed_checks, self.params.quiet) and (
-            now - self.since >= self.params.armed_least
+            self._go(time, State.READY, reason)
+        elif self._lasted(time, inputs.calm and not inputs.failed_checks, self.params.quiet) and (
+            time - self.since >= self.params.armed_least
         ):
-            self._go(now, State.THROW, "calm")
-        elif self._late(now):
+            self._go(time, State.THROW, "calm")
+        elif self._late(time):
             reason = self.waits(inputs) or "the swing did not calm down"
-            self._go(now, State.READY, f"disarmed: {reason}")
+            self._go(time, State.READY, f"disarmed: {reason}")
 
-    def _throw(self, now: float, inputs: Inputs) -> None:
+    def _throw(self, time: float, inputs: Inputs) -> None:
         if inputs.separated:
-            self._go(now, State.RECOVER, "separated")
+            self._go(time, State.RECOVER, "separated")
         elif inputs.released:
             return  # a latched release cannot be taken back: fly on until the separation
         elif inputs.poses_are_stale():
-            self._go(now, State.RECOVER, "stale poses")
+            self._go(time, State.RECOVER, "stale poses")
         elif inputs.lost:
-            self._go(now, State.RECOVER, "the payload has come off by itself")
+            self._go(time, State.RECOVER, "the payload has come off by itself")
         elif inputs.astray:
-            self._go(now, State.RECOVER, "the policy released where it would miss")
-        elif self._late(now):
-            self._go(now, State.RECOVER, "the policy did not release in time")
+            self._go(time, State.RECOVER, "the policy released where it would miss")
+        elif self._late(time):
+            self._go(time, State.RECOVER, "the policy did not release in time")
 
-    def _recover(self, now: float, inputs: Inputs) -> None:
+    def _recover(self, time: float, inputs: Inputs) -> None:
         if inputs.fence is not None:  # the payload is off and the vehicle brakes: no more throws
             self.left_fence = inputs.fence
-            self._go(now, State.LAND, f"after the throw, fence: {inputs.fence}")
+            self._go(time, State.LAND, f"after the throw, fence: {inputs.fence}")
         # A stale pose never moves: that says nothing about the vehicle.
-        elif self._lasted(now, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
+        elif self._lasted(time, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
             state = State.READY if self.throws < self.max_throws else State.LAND
-            self._go(now, state, "hovering again")
-        elif inputs.land or self._late(now):
-            self._go_land(now, inputs, "not calm again in time")
+            self._go(time, state, "hovering again")
+        elif inputs.land or self._late(time):
+            self._go_land(time, inputs, "not calm again in time")
 
-    def _land(self, now: float, inputs: Inputs) -> None:
-        if inputs.grounded or self._late(now):
-            self._go(now, State.DONE, "landed" if inputs.grounded else "landing took too long")
+    def _land(self, time: float, inputs: Inputs) -> None:
+        if inputs.grounded or self._late(time):
+            self._go(time, State.DONE, "landed" if inputs.grounded else "landing took too long")
 
 
 _STEPS = {

@@ -95,11 +95,11 @@ class Detections:
             max(found.latency, 0.0),
         )
 
-    def note_vehicle(self, now: float, pos: Vector, quat: Quaternion) -> None:
+    def note_vehicle(self, time: float, pos: Vector, quat: Quaternion) -> None:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than
         these.
         """
-        self._path.append((now, np.array(pos), rotation_of(quat)))
+        self._path.append((time, np.array(pos), rotation_of(quat)))
 
     def take(self, detection: Detection, quat: Quaternion, aged: float = 0.0) -> None:
         """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
@@ -119,14 +119,14 @@ class Detections:
             if getattr(frame, name) is not None:
                 self._points[part], self._valid[part] = points[part], valid[part]
 
-    def problems(self, now: float) -> list[str]:
+    def problems(self, time: float) -> list[str]:
         """Return what speaks against a throw at a time [s]: a ball that hangs and a goal that lies
         in view are seen.
         """
         return [
             f"the pictures show no {name}"
             for name, stamp in self._times.items()
-            if now - stamp > self._hold
+            if time - stamp > self._hold
         ]
 
     def _carried(self, seen: Seen, when: float) -> Seen:
@@ -171,13 +171,13 @@ class Detections:
         way = Rotation.from_matrix(rot.T @ rot_after).as_rotvec()
         return pos + share * (pos_after - pos), rot @ Rotation.from_rotvec(share * way).as_matrix()
 
-    def keypoints(self, now: float) -> tuple[np.ndarray, np.ndarray]:
+    def keypoints(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape
         (1, 8).
         """
         points, valid = self._points.clone(), self._valid.clone()
         for name, part in PARTS.items():
-            if now - self._times[name] > self._hold:
+            if time - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)
                 edge_exit = self._camera.edge_reads and bool((radius > NEAR_EDGE).any())
                 points[part] = (

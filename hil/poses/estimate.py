@@ -145,10 +145,10 @@ def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
     return (x, y, z)
 
 
-def _turn(now: Quaternion, then: Quaternion | None) -> Vector:
+def _turn(time: Quaternion, then: Quaternion | None) -> Vector:
     """Return the rotation vector from the attitude now to an earlier one, in the body frame of now
     [rad].
     """
     if then is None:
         return (0.0, 0.0, 0.0)
-    return rotation_vector(multiply(conjugate(now), then))
+    return rotation_vector(multiply(conjugate(time), then))

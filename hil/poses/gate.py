@@ -200,15 +200,15 @@ class Gate:
                 return "turn"
         return None
 
-    def age(self, now: float) -> float:
+    def age(self, time: float) -> float:
         """Return the time since the content last changed [s]; infinite before the first pose."""
-        return now - self._changed
+        return time - self._changed
 
-    def level(self, now: float) -> int:
+    def level(self, time: float) -> int:
         """Return :data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age;
         ABORT where content is rare.
         """
         if self._gaps >= RARE:
             return ABORT
-        age = self.age(now)
+        age = self.age(time)
         return (age > self.params.warn) + (age > self.params.hold) + (age > self.params.abort)

@@ -73,27 +73,27 @@ class Stream:
         while pose.arrival - rows[0][0] > WINDOW:
             rows.popleft()
 
-    def flow(self, now: float) -> Flow | None:
+    def flow(self, time: float) -> Flow | None:
         """Return what came lately, at a time [s]; None before enough time has passed."""
-        if self._first is None or now - self._first < SETTLING:
+        if self._first is None or time - self._first < SETTLING:
             return None
-        begin = max(self._first, now - WINDOW)
+        begin = max(self._first, time - WINDOW)
         rows = [row for row in self._rows if row[0] >= begin]
         arrivals, stamps = (np.array([row[i] for row in rows]) for i in (0, 1))
         good = np.array([row[2] is None for row in rows], bool)
         stamps[~np.isfinite(stamps)] = math.nan
         steps, taken = np.diff(stamps), stamps[good]
-        waits = np.diff(np.concatenate([[begin], arrivals[good], [now]]))
+        waits = np.diff(np.concatenate([[begin], arrivals[good], [time]]))
         late = np.maximum(waits - self._gate.warn, 0.0).sum()
         unknown = good & ~np.array([row[3] for row in rows], bool)
         passed = (arrivals - stamps)[unknown]
         span = float(arrivals[-1] - arrivals[0]) if len(rows) > 1 else 0.0
         return Flow(
             len(rows),
-            good.sum() / (now - begin),
+            good.sum() / (time - begin),
             Counter(row[2] for row in rows if row[2] is not None),
             float(waits.max()),
-            float(late / (now - begin)),
+            float(late / (time - begin)),
             _share_close(np.diff(arrivals)),
             (float(stamps[0]), float(stamps[-1]), len(set(stamps))) if len(rows) else (),
             float(np.mean(steps < 0.0)) if len(steps) else math.nan,
@@ -103,16 +103,16 @@ class Stream:
             float(np.subtract(*np.quantile(passed, [0.9, 0.1]))) if len(passed) else math.nan,
         )
 
-    def problems(self, now: float) -> list[str]:
+    def problems(self, time: float) -> list[str]:
         """Return what of the last seconds' poses no estimate is to be made of, in words; judged
         anew every :data:`AGAIN`.
         """
-        if now - self._judged[0] >= AGAIN:
-            self._judged = (now, self._judge(now))
+        if time - self._judged[0] >= AGAIN:
+            self._judged = (time, self._judge(time))
         return self._judged[1]
 
-    def _judge(self, now: float) -> list[str]:
-        flow = self.flow(now)
+    def _judge(self, time: float) -> list[str]:
+        flow = self.flow(time)
         if flow is None or not flow.count:
             return []
         found = self._stamps(flow)

@@ -135,14 +135,14 @@ class Track:
             *(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3))
         )
 
-    def state(self, now: float, ahead: float = 0.0) -> BodyState | None:
+    def state(self, time: float, ahead: float = 0.0) -> BodyState | None:
         """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of
         what is known of its accelerations.
         """
         pose = self._pose
         if pose is None:
             return None
-        pos, quat, vel, age = pose.pos, pose.quat, self._vel, self.gate.age(now)
+        pos, quat, vel, age = pose.pos, pose.quat, self._vel, self.gate.age(time)
         rate = self.filter.rate if self._turns else (0.0, 0.0, 0.0)
         ahead = min(max(ahead, 0.0), MOST_PREDICTION)
         if ahead > 0.0:

@@ -92,7 +92,7 @@ class Stages:
         for name, seconds in times.items():
             self.stages[name].add(seconds)
 
-    def poses(self, poses: list[Pose], now: float) -> dict[str, float]:
+    def poses(self, poses: list[Pose], time: float) -> dict[str, float]:
         """Return times of the vehicle's poses that have come for a tick at ``now`` [s]; transport
         is counted a pose.
         """
@@ -111,7 +111,7 @@ class Stages:
                 self._fastest = delay
             self._fastest = min(self._fastest, delay)
             self.stages["transport"].add(delay - self._fastest)
-        return {} if newest is None else {"arrival": now - newest}
+        return {} if newest is None else {"arrival": time - newest}
 
     def summary(self) -> dict[str, dict[str, float]]:
         """Return summaries by stage."""

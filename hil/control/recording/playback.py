@@ -186,8 +186,8 @@ def again(args: argparse.Namespace) -> int:
     """
     with opened(args.folder) as folder:
         comparison = replay(folder)
-    for n, name, was, now in comparison["differences"][:10]:
-        print(f"tick {n}: {name} was {was}, is {now}")
+    for n, name, was, time in comparison["differences"][:10]:
+        print(f"tick {n}: {name} was {was}, is {time}")
     same = (
         "all bit for bit the same"
         if not comparison["differences"]

@@ -60,11 +60,11 @@ class Commander:
 
     def enter(self, estimate: Estimate, state: str) -> None:
         """Do what a change of state requires."""
-        parts, now, previous = self.parts, estimate.time, self._state
+        parts, time, previous = self.parts, estimate.time, self._state
         if state != previous:
             self._state = state
             self._change_state(estimate, previous, state)
-        if now >= self._release_end or state == State.ABORT:
+        if time >= self._release_end or state == State.ABORT:
             parts.backend.stop_release()
             self._release_end = math.inf
 
@@ -107,19 +107,19 @@ class Commander:
             pilot.act(pos, level, zero, zero, payload_w, goal_w)
 
     def _change_state(self, estimate: Estimate, previous: str, state: str) -> None:
-        parts, now, latch = self.parts, estimate.time, self.parts.latch
+        parts, time, latch = self.parts, estimate.time, self.parts.latch
         if previous == State.THROW:
             # Where commands act late, a fast mechanism gets its command only after the policy's
             # own time of separation.
             latched = state == State.RECOVER and latch.at is not None
-            self._release_end = latch.command_time if latched else now
+            self._release_end = latch.command_time if latched else time
         if state == State.ARMED:
             latch.rearm()
             parts.backend.rearm()
             self.warm_up(estimate.vehicle)
         if state == State.THROW:
             parts.pilot.start()
-            latch.begin(now)
+            latch.begin(time)
             parts.aim.begin()
         if state in (State.READY, State.RECOVER) and previous in (State.CHECK, State.THROW):
             parts.hovering.hold(parts.params.home_w)
@@ -165,8 +165,8 @@ class Commander:
 
     def _run_policy(self, estimate: Estimate, record: TickRecord) -> PilotOutput:
         """Run the policy on the estimate, and note its input and output."""
-        parts, vehicle, now = self.parts, estimate.vehicle, record.time
-        keypoints = None if parts.detections is None else parts.detections.keypoints(now)
+        parts, vehicle, time = self.parts, estimate.vehicle, record.time
+        keypoints = None if parts.detections is None else parts.detections.keypoints(time)
         output: PilotOutput = parts.pilot.act(
             np.array([vehicle.pos]),
             np.array([vehicle.quat]),
@@ -174,9 +174,9 @@ class Commander:
             np.array([vehicle.rate]),
             np.array([estimate.payload.pos]),
             np.array(estimate.goal_w),
-            not parts.latch.separated(now),
+            not parts.latch.separated(time),
             keypoints,
-            now,
+            time,
         )
         parts.spent["observation"], parts.spent["policy"] = parts.pilot.spent
         record.action = output.action[0].tolist()
@@ -192,7 +192,7 @@ class Commander:
         """Return the command with the sway of a calibration, and give the calibration what came in
         this tick.
         """
-        parts, calibrating, now = self.parts, self.parts.calibrating, record.time
+        parts, calibrating, time = self.parts, self.parts.calibrating, record.time
         result, self.calibration = self.calibration, None
         if result is not None:
             calibrating.take(result)
@@ -205,27 +205,27 @@ class Commander:
             return command
         thrust, roll, pitch, yaw = command
         calm = parts.is_calm(estimate, holding=False)
-        added_roll, added_pitch = calibrating.rates(now, calm, estimate.goal_w)
+        added_roll, added_pitch = calibrating.rates(time, calm, estimate.goal_w)
         if record.detection is not None and parts.detections.fresh is not None:
             stamp, points, valid = parts.detections.fresh
-            age = now - estimate.shown_age - stamp
-            calibrating.note(now, estimate.vehicle, thrust, points, valid, age)
+            age = time - estimate.shown_age - stamp
+            calibrating.note(time, estimate.vehicle, thrust, points, valid, age)
         return (thrust, roll + added_roll, pitch + added_pitch, yaw)
 
     def _ask_mode(self, estimate: Estimate, state: str, status: Status) -> None:
         """Ask the autopilot to follow, or to hold and land by itself where it can."""
-        parts, backend, now = self.parts, self.parts.backend, estimate.time
+        parts, backend, time = self.parts, self.parts.backend, estimate.time
         if state in (State.READY, State.ARMED, State.THROW):
-            backend.ask(FOLLOW, now)
+            backend.ask(FOLLOW, time)
             if status.mode != FOLLOW:
                 parts.hovering.reset()
         elif state == State.RECOVER and backend.holds:
             vehicle = estimate.vehicle
             lost = vehicle is None or estimate.vehicle_level >= HOLD
             if lost or can_hand_over(vehicle) or status.mode == HOLDING:
-                backend.ask(HOLDING, now)
+                backend.ask(HOLDING, time)
         elif state == State.LAND and backend.holds:
-            backend.ask(LAND, now)
+            backend.ask(LAND, time)
 
     def _is_ours(self, state: str, status: Status) -> bool:
         """Return whether commands are sent: not to a vehicle that was handed or taken over, that

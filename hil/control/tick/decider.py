@@ -50,7 +50,7 @@ class Decider:
     def _inputs(
         self, estimate: Estimate, status: Status, words: OperatorInput, recording: bool
     ) -> Inputs:
-        parts, now = self.parts, estimate.time
+        parts, time = self.parts, estimate.time
         state, latch, vehicle = parts.machine.state, parts.latch, estimate.vehicle
         failure, fence, calm = status.fault, None, False
         if status.release == FAILED and state in (State.THROW, State.RECOVER):
@@ -71,10 +71,10 @@ class Decider:
             failed_checks=tuple(checks),
             fence=fence,
             calm=calm,
-            separated=latch.separated(now),
+            separated=latch.separated(time),
             released=latch.at is not None,
             lost=latch.at is None and not parts.carries_payload(estimate),
-            astray=parts.aim.given_up(now),
+            astray=parts.aim.given_up(time),
             grounded=vehicle is not None and vehicle.pos[2] < GROUND,
             failure=failure,
             arm=words.arm,
@@ -84,7 +84,7 @@ class Decider:
             following=status.mode == FOLLOW,
             note=status.note,
             why=words.why,
-            streams=tuple(self._stream_problems(now)),
+            streams=tuple(self._stream_problems(time)),
             disagrees=None if parts.response is None else parts.response.problem,
         )
 
@@ -142,7 +142,7 @@ class Decider:
             problems.append("its response to body rates is being checked")
         return problems
 
-    def _stream_problems(self, now: float) -> list[str]:
+    def _stream_problems(self, time: float) -> list[str]:
         """Return what is wrong with the streams of poses; nothing after the take-over."""
         if self.parts.machine.state not in (State.IDLE, State.CHECK):
             return []
@@ -150,7 +150,7 @@ class Decider:
             f"{body}: {text}"
             for body, track in self.parts.tracks.items()
             if body != GOAL
-            for text in track.stream.problems(now)
+            for text in track.stream.problems(time)
         ]
         return problems + self.rivals
 

@@ -52,29 +52,29 @@ class StateEstimator:
         if detections:
             self._detection = detections[-1]
 
-    def estimate(self, now: float) -> Estimate:
+    def estimate(self, time: float) -> Estimate:
         """Return the states of the bodies at a tick [s]."""
         parts = self.parts
         tracks, delay = parts.tracks, parts.params.delay
-        parts.latch.overdue(now)
+        parts.latch.overdue(time)
         if parts.machine.state in (State.IDLE, State.CHECK):
             for track in tracks.values():
                 # On the ground a body may be carried about unseen; in flight a jump stays refused.
-                if REACQUIRE < track.gate.age(now) < math.inf:
+                if REACQUIRE < track.gate.age(time) < math.inf:
                     track.restart()
-        states = {body: self._state(track, now) for body, track in tracks.items()}
+        states = {body: self._state(track, time) for body, track in tracks.items()}
         self.goal_w = parts.params.goal_w
         if GOAL in tracks:
             self.goal_w = None if states[GOAL] is None else states[GOAL].pos
-        age = self._age(tracks[VEHICLE], now)
+        age = self._age(tracks[VEHICLE], time)
         return Estimate(
-            now,
+            time,
             states[VEHICLE],
             states[PAYLOAD],
             self.goal_w,
-            tracks[VEHICLE].gate.level(now),
-            tracks[PAYLOAD].gate.level(now),
-            tracks[GOAL].gate.level(now) if GOAL in tracks else OK,
+            tracks[VEHICLE].gate.level(time),
+            tracks[PAYLOAD].gate.level(time),
+            tracks[GOAL].gate.level(time) if GOAL in tracks else OK,
             min(age, parts.trained_age) if delay.compensate else age,
         )
 
@@ -92,13 +92,13 @@ class StateEstimator:
             if detection is not None:
                 detections.take(detection, vehicle.quat, estimate.shown_age)
 
-    def hint(self, now: float) -> Hint | None:
+    def hint(self, time: float) -> Hint | None:
         """Return a hint for a detector: the vehicle's pose and, while the payload hangs, limits of
         its distance; None without a fresh pose.
         """
         track, hang = self.parts.tracks[VEHICLE], self.parts.hang
-        vehicle = track.state(now)
-        if vehicle is None or vehicle.quat is None or track.gate.level(now) >= HOLD:
+        vehicle = track.state(time)
+        if vehicle is None or vehicle.quat is None or track.gate.level(time) >= HOLD:
             return None
         distances = (0.5 * hang, 1.4 * hang) if self.parts.latch.at is None else None
         return Hint(vehicle.pos, vehicle.quat, distances)
@@ -118,16 +118,16 @@ class StateEstimator:
         fresh = track.gate.level(pose.arrival) < HOLD
         return Tether(pos, self._reach if fresh else math.inf)
 
-    def _state(self, track: Track, now: float) -> BodyState | None:
+    def _state(self, track: Track, time: float) -> BodyState | None:
         """Return the state of a body, predicted to the age that the policy was trained with where
         the config says so.
         """
-        delay, age, lead = self.parts.params.delay, self._age(track, now), 0.0
+        delay, age, lead = self.parts.params.delay, self._age(track, time), 0.0
         if delay.compensate and math.isfinite(age):
             lead = age - self.parts.trained_age + delay.command
-        return track.state(now, lead)
+        return track.state(time, lead)
 
-    def _age(self, track: Track, now: float) -> float:
+    def _age(self, track: Track, time: float) -> float:
         """Return the age of a body's last pose [s]."""
         last, source = track.gate.last, self.parts.params.delay.source
-        return track.gate.age(now) + (source if last is None else last.transit(source))
+        return track.gate.age(time) + (source if last is None else last.transit(source))

@@ -28,7 +28,7 @@ class Source:
         self.links, self._clock = links, clock
         self.rosters = [link.roster for link in links]
 
-    def poll(self, now: float) -> list[Pose]:
+    def poll(self, time: float) -> list[Pose]:
         """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of
         arrival.
         """
@@ -50,9 +50,9 @@ class Source:
         """
         return sum([link.pump(self._clock) for link in self.links])
 
-    def rivals(self, now: float) -> list[str]:
+    def rivals(self, time: float) -> list[str]:
         """Return for whom two senders speak at a time [s], in words."""
-        return [text for roster in self.rosters for text in roster.rivals(now)]
+        return [text for roster in self.rosters for text in roster.rivals(time)]
 
     def hold(self, flying: bool) -> None:
         """Say whether the vehicle is ours in flight: then nobody's address on the links
@@ -98,9 +98,9 @@ class Recorded(Source):
         """Arrival of the first pose [s]."""
         return self.poses[0].arrival
 
-    def poll(self, now: float) -> list[Pose]:
+    def poll(self, time: float) -> list[Pose]:
         first, self._next = (
             self._next,
-            bisect_right(self.poses, now, self._next, key=lambda pose: pose.arrival),
+            bisect_right(self.poses, time, self._next, key=lambda pose: pose.arrival),
         )
         return self.poses[first : self._next]

@@ -131,7 +131,7 @@ class Eyes:
         )
         return Detection(stamp, corners, ball)
 
-    def poll(self, now: float) -> list[Detection]:
+    def poll(self, time: float) -> list[Detection]:
         """Return detections that have come by a time [s]; never waits."""
         raise NotImplementedError
 
@@ -155,11 +155,11 @@ class RecordedImages(Eyes):
         self._times = [time + params.delay for time in times]
         self._next = 0
 
-    def poll(self, now: float) -> list[Detection]:
+    def poll(self, time: float) -> list[Detection]:
         """Return detections that have come, of several pictures the newest; raises `SourceError`
         for one that cannot be read.
         """
-        first, self._next = self._next, bisect_right(self._times, now, self._next)
+        first, self._next = self._next, bisect_right(self._times, time, self._next)
         if self._next == first:
             return []
         index = self._next - 1
@@ -209,7 +209,7 @@ class LiveImages(Eyes):
             self.failure = f"{type(error).__name__}: {error}"
             print(f"camera stopped: {self.failure}", file=sys.stderr, flush=True)
 
-    def poll(self, now: float) -> list[Detection]:
+    def poll(self, time: float) -> list[Detection]:
         detection, self._newest = self._newest, None
         return [] if detection is None else [detection]
 

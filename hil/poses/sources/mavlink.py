@@ -150,7 +150,7 @@ class MavlinkSource(Source):
     def _drop(self, message: Any, why: str) -> None:
         self._link.roster.refuse(seen_of(message, self._link.sender, why))
 
-    def poll(self, now: float) -> list[Pose]:
+    def poll(self, time: float) -> list[Pose]:
         self.pump()
         poses, self._waiting = self._waiting, []
         return poses

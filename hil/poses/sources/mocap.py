@@ -17,10 +17,10 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from time import monotonic, sleep
 from typing import Any, Literal
 
 from hil.errors import SourceError
@@ -114,7 +114,7 @@ class MocapSource(Source):
         """Take a pose; from any thread."""
         self._waiting.append(pose)
 
-    def poll(self, now: float) -> list[Pose]:
+    def poll(self, time: float) -> list[Pose]:
         self.pump()
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
@@ -182,12 +182,12 @@ class MotionCaptureSource(MocapSource):
             self._said = text
             self._tell(text)
 
-    def poll(self, now: float) -> list[Pose]:
-        quiet = time.monotonic() - self._heard > QUIET and not self.roster.flying
+    def poll(self, time: float) -> list[Pose]:
+        quiet = monotonic() - self._heard > QUIET and not self.roster.flying
         if quiet and self._process is not None:
             self._heard = math.inf
             self._process.kill()
-        return super().poll(now)
+        return super().poll(time)
 
     def _listen_here(self) -> None:
         p, stopped = self._params, self._stop.is_set
@@ -214,7 +214,7 @@ class MotionCaptureSource(MocapSource):
                 text=True,
             ) as process,
         ):
-            self._process, self._heard = process, time.monotonic()
+            self._process, self._heard = process, monotonic()
             for line in process.stdout:
                 self._take(json.loads(line))
             status = process.wait()
@@ -237,7 +237,7 @@ class MotionCaptureSource(MocapSource):
         elif isinstance(value, int):
             self.roster.drop(("others", 0), "datagram", f"source.mocap.host is {host[0]}", value)
         else:
-            self._heard = time.monotonic()
+            self._heard = monotonic()
             for name, (*pos, x, y, z, w) in value.items():
                 self.hand_over(Pose(arrival, arrival, self._names[name], tuple(pos), (x, y, z, w)))
 
@@ -311,7 +311,7 @@ class NatNetSource(MocapSource):
         except TimeoutError:
             return False
         except OSError:  # none is there; or the host's port is closed, or the network is gone
-            time.sleep(PAUSE)
+            sleep(PAUSE)
             return False
         self.take(data, sender)
         return True
