@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.states import State
+from hil.control.state_machine import State
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from hil.poses.sources.capture import listen
-from hil.poses.sources.mocap import (
+from hil.poses.sources.motion_capture import (
     MocapParams,
     MocapSource,
     MotionCaptureSource,

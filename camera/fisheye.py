@@ -57,9 +57,9 @@ class Fisheye:
             -0.5 - slack,
             params.height - 0.5 + slack,
         )
-        left, right, top, bottom = self._bounds
+        low, right, top, bottom = self._bounds
         self.circle_inside_image = (
-            params.cx - reach_x >= left
+            params.cx - reach_x >= low
             and params.cx + reach_x <= right
             and params.cy - reach_y >= top
             and params.cy + reach_y <= bottom
@@ -184,9 +184,9 @@ class Fisheye:
         """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included:
         bool, shape (...).
         """
-        left, right, top, bottom = self._bounds
+        low, right, top, bottom = self._bounds
         u, v = pixels.unbind(-1)
-        return (u >= left) & (u <= right) & (v >= top) & (v <= bottom)
+        return (u >= low) & (u <= right) & (v >= top) & (v <= bottom)
 
     def _angle_from_radius(self, radius: torch.Tensor) -> torch.Tensor:
         """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last

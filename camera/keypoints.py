@@ -173,14 +173,14 @@ def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     Returns:
         Midpoints of the left, top, right and bottom edge, shape (E, 4, 2).
     """
-    left, top, right, bottom = (
+    low, top, right, bottom = (
         extremes[:, 0, 0],
         extremes[:, 1, 1],
         extremes[:, 2, 0],
         extremes[:, 3, 1],
     )
-    u, v = (left + right) * 0.5, (top + bottom) * 0.5
-    middles: torch.Tensor = torch.stack([left, v, u, top, right, v, u, bottom], -1).unflatten(
+    u, v = (low + right) * 0.5, (top + bottom) * 0.5
+    middles: torch.Tensor = torch.stack([low, v, u, top, right, v, u, bottom], -1).unflatten(
         -1, (4, 2)
     )
     return middles
@@ -211,9 +211,11 @@ def corrected_keypoints(
         camera.fisheye.denormalize(points / (1.0 + scale[:, None, None]))
     )
     turn_c = camera.rot_cb @ rotation_from_vector(turn_b) @ camera.rot_cb.T
-    seen, visible = camera.fisheye.project_normalized(rays_c @ turn_c.transpose(-1, -2), clip=True)
+    projected, visible = camera.fisheye.project_normalized(
+        rays_c @ turn_c.transpose(-1, -2), clip=True
+    )
     valid = valid & visible
-    return seen * valid.unsqueeze(-1), valid
+    return projected * valid.unsqueeze(-1), valid
 
 
 def payload_keypoints(
@@ -269,10 +271,10 @@ def keypoints(
         torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b
     )
     rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._axes)
-    seen, valid = camera.fisheye.project_normalized(
+    projected, valid = camera.fisheye.project_normalized(
         torch.cat([points_c[:, :4], rays_c], -2), clip=True
     )
-    points = torch.cat([seen[:, :4], box_midpoints(seen[:, 4:])], -2)
+    points = torch.cat([projected[:, :4], box_midpoints(projected[:, 4:])], -2)
     return by_rule(camera, points, valid)
 
 

@@ -53,8 +53,8 @@ def draw_overlay(
     visible = valid.detach().cpu().numpy().astype(bool)
     goal, box = pixels[:GOAL_KEYPOINTS], pixels[GOAL_KEYPOINTS:]
     _draw_group(canvas, goal, visible[:GOAL_KEYPOINTS], goal, GREEN, thick)
-    left, top, right, bottom = box[0, 0], box[1, 1], box[2, 0], box[3, 1]
-    rectangle = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+    low, top, right, bottom = box[0, 0], box[1, 1], box[2, 0], box[3, 1]
+    rectangle = np.array([[low, top], [right, top], [right, bottom], [low, bottom]])
     _draw_group(canvas, box, visible[GOAL_KEYPOINTS:], rectangle, RED, thick)
     return canvas
 
@@ -66,12 +66,12 @@ def _fixed(points: np.ndarray) -> np.ndarray:
     return np.round(np.clip(points, -1e4, 1e4) * 2**SHIFT).astype(np.int32)
 
 
-def _draw_group(canvas, points, seen, outline, colour, thick) -> None:
+def _draw_group(canvas, points, valid, outline, colour, thick) -> None:
     import cv2
 
-    if seen.all():
+    if valid.all():
         cv2.polylines(canvas, [_fixed(outline)[:, None]], True, colour, 1, cv2.LINE_AA, SHIFT)
-    for point, ok in zip(points, seen, strict=True):
+    for point, ok in zip(points, valid, strict=True):
         if ok:
             cv2.circle(
                 canvas,

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import torch
 
-from camera.detectors.contours import BallSeen, Detector, GoalSeen, Seen
+from camera.detectors.contours import BallSeen, Detector, FrameDetections, GoalSeen
 from hil.poses.sources import images
 from visthrow.cli import main
 
@@ -30,7 +30,7 @@ class Mine(Detector):
     def rays(self, pixels: list[list[float]]) -> np.ndarray:
         return self.lens.unproject(torch.tensor(pixels, dtype=torch.float64))[0].numpy()
 
-    def detect(self, image: np.ndarray, known: object = None) -> Seen:
+    def detect(self, image: np.ndarray, prior: object = None) -> FrameDetections:
         self.check(image)  # size and type; BGR
         corners, box = network(image)
         goal = ball = None
@@ -43,7 +43,7 @@ class Mine(Detector):
             middle = sides.sum(axis=0) / np.linalg.norm(sides.sum(axis=0))
             half_angle = float(np.arccos(sides @ middle).mean())
             ball = BallSeen(middle, half_angle=half_angle, score=1.0)
-        return Seen(ball, goal)
+        return FrameDetections(ball, goal)
 
 
 images.DETECTORS["mine"] = Mine

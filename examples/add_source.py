@@ -8,11 +8,11 @@ import argparse
 import numpy as np
 
 from hil.control.runner import Runner
-from hil.control.states import OperatorInput
+from hil.control.state_machine import OperatorInput
 from hil.links.backends import make_backend
 from hil.params import HilParams
 from hil.poses.pose import Pose
-from hil.poses.sources.base import Source
+from hil.poses.sources.pose_source import Source
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 

@@ -17,7 +17,7 @@ from camera.params import CameraParams
 from hil.links.clock import MonotonicClock
 from hil.params import HilParams
 from hil.poses.frames import Frames
-from hil.poses.sources.opening import open_source
+from hil.poses.sources.open_source import open_source
 from visthrow import config
 from visthrow.onboard.observations import rotation_from_quat
 

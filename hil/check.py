@@ -13,9 +13,9 @@ from typing import Any
 
 from hil.control.recording.record import CONFIG, POLICY, TICKS, lines, require_run
 from hil.control.runner import Runner
-from hil.control.states import OperatorInput, State
+from hil.control.state_machine import OperatorInput, State
 from hil.errors import RunError
-from hil.flight import key_of, params_of
+from hil.fly_run import key_of, params_of
 from hil.links.backends import make_backend
 from hil.links.backends.base import FOLLOW, DryRun, Status
 from hil.links.backends.thrust import LEAST_SHARES, HoverMeter
@@ -24,7 +24,7 @@ from hil.links.roster import Roster
 from hil.params import HilParams
 from hil.poses import handcarry
 from hil.poses.pose import VEHICLE
-from hil.poses.sources.opening import open_source, unit_problems
+from hil.poses.sources.open_source import open_source, unit_problems
 from hil.poses.track import Track
 from visthrow import config
 from visthrow.onboard.hover import GRAVITY
@@ -101,10 +101,10 @@ def _listen(args: argparse.Namespace) -> int:
         last: list[str] = []
         while clock.now() - begin < seconds and not source.ended:
             time = clock.now()
-            came = source.poll(time)
-            poses += came
+            new_poses = source.poll(time)
+            poses += new_poses
             runner.decider.rivals = source.rivals(time)
-            runner.tick(time, came, autopilot.status(time), OperatorInput())
+            runner.tick(time, new_poses, autopilot.status(time), OperatorInput())
             last = runner.decider.problems() or last
             autopilot.tick(time, runner)
             clock.sleep_until(time + runner.pilot.period)
@@ -122,10 +122,10 @@ def _listen(args: argparse.Namespace) -> int:
         + unit_problems(poses, params.frames)
         + [text for good, text in results if not good]
     )
-    held, wanted = runner.machine.lasting(time), params.states.check_hold
-    if not problems and held < wanted:
+    lasted, required = runner.machine.lasting(time), params.states.check_hold
+    if not problems and lasted < required:
         problems = [
-            f"all was well for the last {held:.1f} s; expected {wanted:g} s:"
+            f"all was well for the last {lasted:.1f} s; expected {required:g} s:"
             f" {'; '.join(last) or 'look longer, with --seconds'}"
         ]
     print("".join(f"{text}\n" for good, text in results if good), end="")
@@ -138,10 +138,10 @@ def _not_taken(rosters: list[Roster], seconds: float) -> list[str]:
     as of a position before the first attitude.
     """
     return [
-        f"{count} {seen.text()}"
+        f"{count} {entry.text()}"
         for roster in rosters
-        for seen, count in roster.seen.items()
-        if seen.why and seen.system is not None and seen.address in (None, *roster.at.values())
+        for entry, count in roster.seen.items()
+        if entry.why and entry.system is not None and entry.address in (None, *roster.at.values())
         if count > seconds
     ]
 
@@ -170,9 +170,9 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
     """
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
-    for seen, count in sorted(roster.seen.items(), key=lambda row: -row[1]):
-        if silent or seen.why:
-            lines.append(f"  {count / seconds:.1f} a second: {seen.text()}")
+    for entry, count in sorted(roster.seen.items(), key=lambda row: -row[1]):
+        if silent or entry.why:
+            lines.append(f"  {count / seconds:.1f} a second: {entry.text()}")
     if silent and not roster.seen:
         lines.append(f"  nobody speaks on {params.source.device or params.link.device}")
     return lines

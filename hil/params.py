@@ -12,7 +12,7 @@ from hil.control.aim import AimParams
 from hil.control.calibrating import CalibrationParams
 from hil.control.realtime import RealtimeParams
 from hil.control.safety import CheckParams, FenceParams, GuardParams, box_violation
-from hil.control.states import StateParams
+from hil.control.state_machine import StateParams
 from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.backends.betaflight import BetaflightParams
 from hil.links.backends.crazyflie import CrazyflieParams
@@ -24,7 +24,7 @@ from hil.poses.gate import GateParams
 from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE
 from hil.poses.sources.images import ImageParams
 from hil.poses.sources.mavlink import BodyIds
-from hil.poses.sources.mocap import MocapParams, RigidBody
+from hil.poses.sources.motion_capture import MocapParams, RigidBody
 from hil.poses.sources.player import CHANNELS, LogBody
 from hil.poses.track import MOST_PREDICTION
 from visthrow.common.errors import ConfigError

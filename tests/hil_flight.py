@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hil.control.runner import OperatorInput, Runner, TickRecord
-from hil.control.states import State
+from hil.control.state_machine import State
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.pose import Pose

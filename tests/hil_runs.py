@@ -4,7 +4,7 @@ command records them.
 
 from pathlib import Path
 
-from hil.control.recording.record import Recorder
+from hil.control.recording.record import RunRecorder
 from hil.control.runner import Runner, TickRecord
 from tests.hil_flight import Spy, fly, params, simple_policy
 from visthrow.onboard.actions import hover_action
@@ -31,7 +31,7 @@ def record_run(
     """
     wanted = params(*overrides)
     runner = Runner(wanted, Policy.load(find_policy(wanted.policy)), Spy())
-    recorder, decisions = Recorder(folder, wanted), []
+    recorder, decisions = RunRecorder(folder, wanted), []
     tick = runner.tick
 
     def keep(time, poses, status, words, recording=True):

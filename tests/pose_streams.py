@@ -13,7 +13,7 @@ from hil.links.pymav import mav
 from hil.links.roster import Roster
 from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
-from hil.poses.sources.opening import parties
+from hil.poses.sources.open_source import parties
 from tests.loopback.wire import HERE, pipe
 
 SECONDS = 3.0

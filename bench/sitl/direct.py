@@ -22,16 +22,16 @@ import numpy as np
 
 from hil.control.loop import Loop
 from hil.control.recording.flightlogs import read, throws
-from hil.control.recording.record import Recorder
-from hil.control.recording.report import throw_path
+from hil.control.recording.record import RunRecorder
+from hil.control.recording.run_report import throw_path
 from hil.control.runner import Runner
-from hil.control.states import State
+from hil.control.state_machine import State
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.device import Device, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
-from hil.poses.sources.base import Source
-from hil.poses.sources.opening import open_source
+from hil.poses.sources.open_source import open_source
+from hil.poses.sources.pose_source import Source
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl, MotorPlant
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
@@ -151,7 +151,7 @@ def throw(
         clock.sleep_until(
             clock.now() + np.random.default_rng([seed, 1]).uniform(0.0, 1.0 / mocap.rate)
         )
-        recorder = Recorder(folder / "run", params)
+        recorder = RunRecorder(folder / "run", params)
         summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
         recorder.close(summary)
         for number, log in enumerate(throws(read(folder / "run")), start=1):

@@ -14,7 +14,7 @@ import numpy as np
 from bench.sitl.direct import opened
 from bench.sitl.piloted import Piloted
 from hil.control.loop import Loop
-from hil.control.states import State
+from hil.control.state_machine import State
 from hil.links.backends.betaflight import STICKS
 from hil.params import HilParams
 from hil.rehearsal.fake_mocap import FakeMocapParams

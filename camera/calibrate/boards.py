@@ -182,8 +182,8 @@ def calibrate_from_boards(
     """
     import cv2
 
-    (height, width), found = find_boards(images, board)
-    numbers = [i for i, view in enumerate(found) if view is not None]
+    (height, width), boards = find_boards(images, board)
+    numbers = [i for i, view in enumerate(boards) if view is not None]
     left_out: dict[int, str] = {}
     while True:
         used = [i for i in numbers if i not in left_out]
@@ -192,7 +192,7 @@ def calibrate_from_boards(
                 f"no fisheye fits the boards of {DETECTED_AT_LEAST} pictures; left out: "
                 + "; ".join(f"picture {i + 1}: {why}" for i, why in left_out.items())
             )
-        views = [view for i in used if (view := found[i]) is not None]
+        views = [view for i in used if (view := boards[i]) is not None]
         try:
             lens = _solved(views, width, height, fov_deg)
         except cv2.error as error:
@@ -215,7 +215,7 @@ def calibrate_from_boards(
         if sizes[wrong] <= limit:
             break
         left_out[wrong] = f"is {sizes[wrong]:.2f} px off, the others {limit / WRONG_BOARD:.2f} px"
-    poses = [estimates.get(i) for i in range(len(found))]
+    poses = [estimates.get(i) for i in range(len(boards))]
     return replace(lens, fov_deg=fov_deg), replace(_report(poses), left_out=left_out)
 
 

@@ -89,7 +89,7 @@ def read(
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if len(cameras) > 1:
-        names = ", ".join(of[2] or str(i) for i, of in enumerate(cameras))
+        names = ", ".join(entry[2] or str(i) for i, entry in enumerate(cameras))
         report = replace(
             report,
             remarks=(f"camera {name} of {len(cameras)} in the file ({names})", *report.remarks),
@@ -125,16 +125,16 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     return MountParams((x, y, z), (roll, pitch, yaw))
 
 
-def _chosen(found: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
-    names = [name for *_, name in found]
+def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
+    names = [name for *_, name in entries]
     number = int(camera) if str(camera).isdigit() else -1
     if camera in names:
-        return found[names.index(str(camera))]
-    if 0 <= number < len(found):
-        return found[number]
+        return entries[names.index(str(camera))]
+    if 0 <= number < len(entries):
+        return entries[number]
     raise ValueError(
-        f"camera {camera} asked for; expected a number below {len(found)}, the cameras in the file,"
-        f" or one of their names: {', '.join(name or '(no name)' for name in names)}"
+        f"camera {camera} was requested; expected a number below {len(entries)}, the cameras in the"
+        f" file, or one of their names: {', '.join(name or '(no name)' for name in names)}"
     )
 
 
@@ -196,28 +196,28 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
     elif isinstance(tree, dict):
         if isinstance(tree.get("intrinsics"), list) and "resolution" in tree:
             tree = _unzipped(tree)
-        known = {str(key) for key in tree}
-        box = next((box for box, (keys, _) in BOXES.items() if keys(known)), "")
+        keys = {str(key) for key in tree}
+        box = next((box for box, (matches, _) in BOXES.items() if matches(keys)), "")
         if box:
             return [(box, tree, str(tree.get("label", name) or name))]
         named = [(str(key), entry) for key, entry in tree.items()]
     else:
         return []
     return [
-        found
+        entries
         for key, entry in named
-        for found in _cameras(entry, name if key in ("camera", "value0", "cameras") else key)
+        for entries in _cameras(entry, name if key in ("camera", "value0", "cameras") else key)
     ]
 
 
 def _unzipped(tree: Node) -> Node:
     """Basalt's cameras, whose intrinsics and resolutions stand in two lists."""
-    if not all(isinstance(of, dict) for of in tree["intrinsics"]):
+    if not all(isinstance(entry, dict) for entry in tree["intrinsics"]):
         return tree
     sizes = tree["resolution"]
     return {
-        f"cam{i}": {**of, "resolution": sizes[i] if i < len(sizes) else None}
-        for i, of in enumerate(tree["intrinsics"])
+        f"cam{i}": {**entry, "resolution": sizes[i] if i < len(sizes) else None}
+        for i, entry in enumerate(tree["intrinsics"])
     }
 
 
@@ -309,8 +309,8 @@ def _kalibr(node: Node) -> Camera:
     values = dict(zip(words, _floats(_any(node, "intrinsics"), "intrinsics", (len(words),))))
     if core in ("ds", "eucm"):
         return core, values
-    given = _any(node, "distortion_coeffs", "distortion_coefficients")
-    coefficients = _floats(given, "distortion_coeffs")
+    coefficients_node = _any(node, "distortion_coeffs", "distortion_coefficients")
+    coefficients = _floats(coefficients_node, "distortion_coeffs")
     return _model(core, _label(node, "distortion_model"), values, coefficients)
 
 
@@ -331,8 +331,8 @@ def _camodocal(node: Node) -> Camera:
     if kind not in CAMODOCAL:
         raise ValueError(f"model_type is {kind.upper()!r}; expected one of {[*CAMODOCAL]}")
     model, names = CAMODOCAL[kind]
-    inner = [of for key, of in node.items() if isinstance(of, dict) and "inv" not in key]
-    flat = {key: of for section in (node, *inner) for key, of in section.items()}
+    inner = [entry for key, entry in node.items() if isinstance(entry, dict) and "inv" not in key]
+    flat = {key: entry for section in (node, *inner) for key, entry in section.items()}
     pairs = [word.partition("=") for word in names.split()]
     values = {ours: _floats([_any(flat, his or ours)], his or ours)[0] for ours, _, his in pairs}
     return model, values | ({"fy": 1.0} if model == "ocam" else {})
@@ -406,7 +406,9 @@ def _matrix(node: Node) -> Camera:
 def _orbslam(node: Node) -> Camera:
     head = "Camera1" if "Camera1.fx" in node else "Camera"
     fisheye = "kannala" in str(node.get("Camera.type", "")).lower()
-    plain = {key.partition(".")[2]: of for key, of in node.items() if key.startswith(head + ".")}
+    plain = {
+        key.partition(".")[2]: entry for key, entry in node.items() if key.startswith(head + ".")
+    }
     names = KB4.split()[4:] if fisheye else DISTORTIONS["radtan"][0].split()[:5]
     coefficients = [_floats([plain.get(name, 0.0)], name)[0] for name in names]
     values = _named(plain, "fx fy cx cy")
@@ -556,7 +558,7 @@ def _fitted(
 
 
 def _contradictions(
-    model: str, values: Values, size: tuple[int, int], asked: bool
+    model: str, values: Values, size: tuple[int, int], labelled: bool
 ) -> tuple[str, list[str]]:
     """The model that a file's numbers are of, and what they say against their label."""
     names = values.keys() & set(["k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "w"])
@@ -571,7 +573,7 @@ def _contradictions(
             f"all distortion coefficients are zero{focal}: was this lens calibrated, or are its"
             " pictures rectified?"
         )
-    if model == "pinhole-radtan" and not asked:
+    if model == "pinhole-radtan" and not labelled:
         k1, k2, k3, k4 = (values.get(k, 0.0) for k in ("k1", "k2", "p1", "p2"))
         higher_terms = any(values.get(k, 0.0) for k in ("k3", "k4", "k5", "k6"))
         tangential = max(abs(k3), abs(k4))

@@ -89,7 +89,7 @@ class GoalSeen:
 
 
 @dataclass(frozen=True)
-class Seen:
+class FrameDetections:
     """The ball and the goal of one frame; None where nothing was detected."""
 
     ball: BallSeen | None
@@ -98,7 +98,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Known:
+class Prior:
     """Prior knowledge of a frame; each part may be missing."""
 
     up_c: np.ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
@@ -142,7 +142,7 @@ class Detector:
         )
         self._in_view = (plane < edge).astype(np.uint8)
 
-    def detect(self, image: np.ndarray, known: Known | None = None) -> Seen:
+    def detect(self, image: np.ndarray, prior: Prior | None = None) -> FrameDetections:
         """Find ball and goal. Raises ValueError: an image of another size or type.
 
         Args:
@@ -150,7 +150,7 @@ class Detector:
             known: narrows what is looked for.
         """
         self.check(image)
-        p, known = self.params, known or Known()
+        p, prior = self.params, prior or Prior()
         colours = colours_of(image)
         ball = colour_maps(
             colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow"
@@ -158,8 +158,8 @@ class Detector:
         goal = colour_maps(
             colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green"
         )
-        squares = self._squares(*goal, colours.bright, known)
-        return Seen(self._ball(*ball, known), squares[0] if squares else None, squares)
+        squares = self._squares(*goal, colours.bright, prior)
+        return FrameDetections(self._ball(*ball, prior), squares[0] if squares else None, squares)
 
     def check(self, image: np.ndarray) -> None:
         """Raise ValueError for an image of another size or type."""
@@ -170,53 +170,53 @@ class Detector:
                 " uint8"
             )
 
-    def _ball(self, mask: np.ndarray, level: np.ndarray, known: Known) -> BallSeen | None:
+    def _ball(self, mask: np.ndarray, level: np.ndarray, prior: Prior) -> BallSeen | None:
         """The blob whose edge is the best cone; where none is, what stands out by its colour from
         where the ball is expected.
         """
-        best = self._best_cone(circles_of(mask), level, known)
+        best = self._best_cone(circles_of(mask), level, prior)
         return (
-            self._expected(level, known) if best is None and known.ball_ray_c is not None else best
+            self._expected(level, prior) if best is None and prior.ball_ray_c is not None else best
         )
 
     def _best_cone(
-        self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, known: Known
+        self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, prior: Prior
     ) -> BallSeen | None:
         best: BallSeen | None = None
         for centre, radius in circles:
             cone = self._cone(level, centre, radius)
-            if cone is None or not self._in_place(cone.ray_c, cone.half_angle, known):
+            if cone is None or not self._in_place(cone.ray_c, cone.half_angle, prior):
                 continue
             score = cone.score
-            if known.ball_ray_c is not None:
+            if prior.ball_ray_c is not None:
                 score -= (
                     0.5
-                    * math.acos(min(1.0, float(cone.ray_c @ known.ball_ray_c)))
-                    / known.ball_within
+                    * math.acos(min(1.0, float(cone.ray_c @ prior.ball_ray_c)))
+                    / prior.ball_within
                 )
             if best is None or score > best.score:
                 best = BallSeen(cone.ray_c, cone.half_angle, score)
         return best
 
-    def _expected(self, level: np.ndarray, known: Known) -> BallSeen | None:
+    def _expected(self, level: np.ndarray, prior: Prior) -> BallSeen | None:
         """A ball on a ground or beside a thing that has its colour too, about where it
         is expected.
         """
         import cv2
 
         middle, visible = self.lens.project(
-            torch.from_numpy(np.ascontiguousarray(known.ball_ray_c, np.float64)[None])
+            torch.from_numpy(np.ascontiguousarray(prior.ball_ray_c, np.float64)[None])
         )
         if not bool(visible):
             return None
-        low, high = known.ball_distance or self.params.ball_distance
+        low, high = prior.ball_distance or self.params.ball_distance
         radius = self.lens.params.fx * self.radius / math.sqrt(low * high)
         u, v = (int(x) for x in middle[0].round())
         patch = level[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4]
         distinct = cv2.subtract(level, ABOVE * float(np.median(patch)) if patch.size else 0.0)  # type: ignore[call-overload]  # a scalar: its types leave it out
         mask = ((distinct > 0.0) & (self._in_view > 0)).astype(np.uint8)
         circles = [(centre, size) for centre, size in circles_of(mask) if size < 2.0 * radius]
-        return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, known)
+        return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, prior)
 
     def _cone(self, level: np.ndarray, centre: np.ndarray, radius: float) -> BallSeen | None:
         """The cone about a circle [px]; looked for again from where it was found, as part of a ball
@@ -241,23 +241,23 @@ class Detector:
             radius = float(np.median(np.linalg.norm(edge.points - centre, axis=1)))
         return best
 
-    def _in_place(self, ray: np.ndarray, half_angle: float, known: Known) -> bool:
+    def _in_place(self, ray: np.ndarray, half_angle: float, prior: Prior) -> bool:
         """Whether a ball can be where a cone puts it: its true radius says how far off it is."""
         distance = self.radius / max(math.sin(half_angle), 1e-9)
-        low, high = known.ball_distance or self.params.ball_distance
+        low, high = prior.ball_distance or self.params.ball_distance
         if not low <= distance <= high:
             return False
-        if known.ball_ray_c is not None and float(ray @ known.ball_ray_c) < math.cos(
-            known.ball_within
+        if prior.ball_ray_c is not None and float(ray @ prior.ball_ray_c) < math.cos(
+            prior.ball_within
         ):
             return False
-        if known.up_c is None or known.height is None:
+        if prior.up_c is None or prior.height is None:
             return True
         # A smaller thing on the ground would, were it the ball, lie below the ground.
-        return known.height + distance * float(ray @ known.up_c) > -DISTANCE_ERROR * distance
+        return prior.height + distance * float(ray @ prior.up_c) > -DISTANCE_ERROR * distance
 
     def _squares(
-        self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, known: Known
+        self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, prior: Prior
     ) -> tuple[GoalSeen, ...]:
         """The blobs that are squares with a rim, the best first."""
         fits = [
@@ -265,20 +265,20 @@ class Detector:
             for contour in outlines_of(mask)
         ]
         squares = [
-            GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], known)
+            GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], prior)
         ]
         return tuple(sorted(squares, key=lambda square: -square.score))
 
-    def _right_size(self, rays_c: np.ndarray, known: Known) -> bool:
+    def _right_size(self, rays_c: np.ndarray, prior: Prior) -> bool:
         """Whether the corners lie on the ground, a goal's side from one another; true where that
         cannot be told.
         """
-        if known.up_c is None or known.height is None:
+        if prior.up_c is None or prior.height is None:
             return True
-        down = -rays_c @ known.up_c
+        down = -rays_c @ prior.up_c
         if down.min() < 0.02:
             return False
-        corners = rays_c * (known.height / down)[:, None]
+        corners = rays_c * (prior.height / down)[:, None]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
         return bool(np.all(np.abs(sides / self.side - 1.0) < self.params.side_tolerance))
 
@@ -306,7 +306,7 @@ def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
 
 
 def detected_keypoints(
-    camera: KeypointCamera, seen: Seen, rot_wb: np.ndarray
+    camera: KeypointCamera, detections: FrameDetections, rot_wb: np.ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of the training camera from what was seen, by the functions that training calls.
 
@@ -326,13 +326,15 @@ def detected_keypoints(
     """
     points = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, 2)
     valid = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, dtype=torch.bool)
-    if seen.goal is not None:
+    if detections.goal is not None:
         rot_wc = rot_wb @ camera.rot_cb.double().numpy().T
-        rays = ordered_corners(seen.goal.rays_c, rot_wc)
+        rays = ordered_corners(detections.goal.rays_c, rot_wc)
         corners, ok = camera.fisheye.project_normalized(torch.from_numpy(rays).float(), clip=True)
         points[:GOAL_KEYPOINTS], valid[:GOAL_KEYPOINTS] = corners, ok
-    if seen.ball is not None:
-        ball_c = seen.ball.ray_c * (camera.params.payload_radius / math.sin(seen.ball.half_angle))
+    if detections.ball is not None:
+        ball_c = detections.ball.ray_c * (
+            camera.params.payload_radius / math.sin(detections.ball.half_angle)
+        )
         box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
         points[GOAL_KEYPOINTS:], valid[GOAL_KEYPOINTS:] = box[0], ok[0]
     points, valid = by_rule(camera, points[None], valid[None])

@@ -15,7 +15,7 @@ from camera.fisheye import Fisheye
 
 LEAST_AREA = 14  # blobs smaller than this are noise [px]
 MOST_PAIRED = 12  # largest blobs that are looked at in pairs
-OUTSIDE = 3.0  # how far beyond the goal's side its edge is looked for at least [px]
+SEARCH_MARGIN = 3.0  # how far beyond the goal's side its edge is looked for at least [px]
 ANGLES = 64  # directions in which a ball's edge is looked for
 STEP = 0.25  # between two samples across an edge [px]
 MOST_BENT = 0.12  # RMS of the goal's edge from its line, over the side
@@ -29,7 +29,7 @@ RIM_LEVEL = 0.42
 rendered balls, where the mean error of the half-angle then vanishes.
 """
 BLUR_WIDTH = 1.75  # half of the widest edge of a frame that is fit to be used [px]
-ALONG = 24  # samples along a side of the goal
+SIDE_SAMPLES = 24  # samples along a side of the goal
 LEAST_LEVEL = 8.0  # colour inside an edge that is too faint to have one, of 255
 
 
@@ -80,11 +80,11 @@ def colour_maps(
 
     blue, green, red = colours.bgr
     low, high = (round(hue * 256.0 / 360.0) for hue in hue_deg)
-    found = cv2.inRange(
+    selected = cv2.inRange(
         colours.hsv, (low, 255.0 * saturation, 255.0 * brightness), (high, 255, 255)
     )
     mask = cv2.morphologyEx(
-        cv2.bitwise_and(found, in_view), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
+        cv2.bitwise_and(selected, in_view), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
     )
     pair = (cv2.min(red, green), blue) if kind == "yellow" else (green, cv2.max(red, blue))
     return mask, cv2.subtract(*pair, dtype=cv2.CV_32F)
@@ -117,8 +117,8 @@ def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
     for i, j in combinations(range(min(len(single), MOST_PAIRED)), 2):
         (first, one), (second, two) = single[i], single[j]
         if np.linalg.norm(first - second) < one + two:
-            both = np.concatenate([outlines[i], outlines[j]]).astype(np.float32)
-            centre, radius = cv2.minEnclosingCircle(both)
+            joined = np.concatenate([outlines[i], outlines[j]]).astype(np.float32)
+            centre, radius = cv2.minEnclosingCircle(joined)
             pairs.append((np.array(centre), float(radius)))
     return single + pairs
 
@@ -235,15 +235,15 @@ def _quadrangle(points: np.ndarray) -> np.ndarray | None:
     scale = float(np.abs(points).max())
     hull = cv2.convexHull(points / scale)
     length = cv2.arcLength(hull, True)
-    found = cv2.boxPoints(cv2.minAreaRect(hull))
+    selected = cv2.boxPoints(cv2.minAreaRect(hull))
     for share in np.arange(0.02, 0.16, 0.01):
         polygon = cv2.approxPolyDP(hull, share * length, True)
         if len(polygon) == 4:
-            found = polygon[:, 0]
+            selected = polygon[:, 0]
             break
         if len(polygon) < 4:
             break
-    corners = found.astype(np.float64) * scale
+    corners = selected.astype(np.float64) * scale
     if cv2.contourArea((corners / scale).astype(np.float32)) < 1e-3:
         return None
     off = corners - corners.mean(axis=0)
@@ -260,7 +260,7 @@ def _refined(
     middle = corners.mean(axis=0)
     for first, second in zip(corners, np.roll(corners, -1, axis=0)):
         side = second - first
-        part = np.linspace(0.12, 0.88, ALONG)[:, None]
+        part = np.linspace(0.12, 0.88, SIDE_SAMPLES)[:, None]
         on_side = first + part * side
         inwards = middle - 0.5 * (first + second)
         start, end = (_pixels(lens, on_side + share * inwards, frame) for share in (0.4, -0.35))
@@ -268,7 +268,9 @@ def _refined(
             return None
         way = end - start
         length = np.linalg.norm(way, axis=1)
-        way *= (1.0 + np.maximum(0.0, OUTSIDE / np.maximum(length, 1e-9) - 0.35 / 0.75))[:, None]
+        way *= (1.0 + np.maximum(0.0, SEARCH_MARGIN / np.maximum(length, 1e-9) - 0.35 / 0.75))[
+            :, None
+        ]
         length = np.linalg.norm(way, axis=1)
         reach = np.linspace(0.0, 1.0, max(8, math.ceil(float(length.max()) / STEP)))
         values = _sample(
@@ -277,7 +279,7 @@ def _refined(
             start[:, 1, None] + way[:, 1, None] * reach,
         )
         hit, distance = _first_crossing(values, reach)
-        if hit.sum() < ALONG // 3:
+        if hit.sum() < SIDE_SAMPLES // 3:
             return None
         edge = rays_of(lens, start[hit] + way[hit] * distance[hit, None]) @ frame
         line, off = _line(edge[:, :2] / edge[:, 2:])
@@ -412,9 +414,9 @@ def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
         np.arange(len(values))[:, None],
         values.shape[1] - 1,
     )
-    near = np.arange(start, 2 * start)
-    high = np.quantile(values[rows, np.clip(last[:, None] - near, 0, peak)], 0.75, axis=1)
-    low = np.median(values[rows, np.clip(last[:, None] + near, 0, peak)], axis=1)
+    distances = np.arange(start, 2 * start)
+    high = np.quantile(values[rows, np.clip(last[:, None] - distances, 0, peak)], 0.75, axis=1)
+    low = np.median(values[rows, np.clip(last[:, None] + distances, 0, peak)], axis=1)
     window = np.clip(last[:, None] + np.arange(-2 * start, 2 * start + 1), 0, peak)
     level = low + RIM_LEVEL * (high - low)
     local = values[rows, window]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from camera.detectors.contours import GATE, BallSeen, GoalSeen, Known, Seen
+from camera.detectors.contours import GATE, BallSeen, FrameDetections, GoalSeen, Prior
 
 READ = 0.01
 """Of a direction in the world, about each axis: of the attitude, with which a detection is turned
@@ -32,7 +32,10 @@ THRUST = 14.0
 hover has 12.5. The rest is in `DRIVEN`.
 """
 
-STILL = 0.05, 0.2  # of a ball that is said to hang still: direction [rad] and its rate [rad/s]
+INITIAL_SPREADS = (
+    0.05,
+    0.2,
+)  # of a ball that is said to hang still: direction [rad] and its rate [rad/s]
 
 LOST = 0.04
 """Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by
@@ -48,7 +51,7 @@ alike the closer they are.
 SUREST = 0.99  # probability of a square in one frame at most
 
 
-class Track:
+class BallTrack:
     """A direction in the world, its rate and how well both are known; the same about each axis
     across it.
     """
@@ -72,15 +75,15 @@ class Track:
         dt, self.stamp = stamp - self.stamp, stamp
         moved, push = np.array([[1.0, dt], [0.0, 1.0]]), np.array([0.5 * dt * dt, dt])
         self.ray_w = _unit(self.ray_w + dt * self.rate_w + push[0] * driven_w)
-        self.rate_w = _across(self.rate_w + dt * driven_w, self.ray_w)
+        self.rate_w = _perpendicular(self.rate_w + dt * driven_w, self.ray_w)
         self._covariance = moved @ self._covariance @ moved.T + DRIVEN**2 * np.outer(push, push)
 
-    def see(self, ray_w: np.ndarray) -> None:
+    def correct(self, ray_w: np.ndarray) -> None:
         """Take in where it was seen, shape (3,), at the time that was predicted."""
         gain = self._covariance[:, 0] / (self._covariance[0, 0] + READ**2)
-        off = _across(ray_w - self.ray_w, self.ray_w)
+        off = _perpendicular(ray_w - self.ray_w, self.ray_w)
         self.ray_w = _unit(self.ray_w + gain[0] * off)
-        self.rate_w = _across(self.rate_w + gain[1] * off, self.ray_w)
+        self.rate_w = _perpendicular(self.rate_w + gain[1] * off, self.ray_w)
         self._covariance = self._covariance - np.outer(gain, self._covariance[0])
 
 
@@ -95,7 +98,7 @@ class Square:
     log_odds: float = 0.0
 
 
-class Following:
+class BallGoalTracker:
     """Tracks of ball and goal in one camera."""
 
     def __init__(self, radius: float, side: float, ball_w: np.ndarray | None = None) -> None:
@@ -103,18 +106,18 @@ class Following:
         lens [m], shape (3,), or with none.
         """
         self._radius, self._side, self._half_angle, self._begin = radius, side, 0.0, ball_w
-        self._ball: Track | None = None
+        self._ball: BallTrack | None = None
         self._squares: list[Square] = []
         self._eye_w, self._stamp, self._weight = np.zeros(3), math.inf, 0.0
 
-    def known(
+    def prior(
         self,
         rot_wc: np.ndarray,
         up_w: np.ndarray,
         eye_w: np.ndarray,
         distance: tuple[float, float] | None,
         stamp: float,
-    ) -> Known:
+    ) -> Prior:
         """Return the prior knowledge for a frame.
 
         Args:
@@ -126,7 +129,7 @@ class Following:
         if self._begin is not None:
             length = float(np.linalg.norm(self._begin))
             self._ball, self._half_angle = (
-                Track(self._begin / length, stamp, *STILL),
+                BallTrack(self._begin / length, stamp, *INITIAL_SPREADS),
                 math.asin(self._radius / length),
             )
             self._begin = None
@@ -135,7 +138,7 @@ class Following:
             pull = (
                 THRUST * math.sin(self._half_angle) / self._radius if distance is not None else 0.0
             )
-            self._ball.predict(stamp, -pull * _across(up_w, self._ball.ray_w))
+            self._ball.predict(stamp, -pull * _perpendicular(up_w, self._ball.ray_w))
             where = {
                 "ball_ray_c": rot_wc.T @ self._ball.ray_w,
                 "ball_within": min(GATE * self._ball.spread, math.pi),
@@ -151,9 +154,11 @@ class Following:
                 "goal_ray_c": rot_wc.T @ _unit(offset),
                 "goal_within": self._side / float(np.linalg.norm(offset)),
             }
-        return Known(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
+        return Prior(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
-    def take(self, seen: Seen, rot_wc: np.ndarray | None, stamp: float) -> Seen:
+    def take(
+        self, detections: FrameDetections, rot_wc: np.ndarray | None, stamp: float
+    ) -> FrameDetections:
         """Return the detections of a frame, with a ball that was missed where it is predicted, and
         of the squares the one that is the goal.
 
@@ -161,27 +166,29 @@ class Following:
         """
         if rot_wc is None:
             self._ball, self._squares = None, []
-            return seen
-        seen = replace(seen, goal=self._goal(seen, rot_wc))
-        if seen.ball is not None:
-            ray_w = rot_wc @ seen.ball.ray_c
+            return detections
+        detections = replace(detections, goal=self._goal(detections, rot_wc))
+        if detections.ball is not None:
+            ray_w = rot_wc @ detections.ball.ray_c
             if self._ball is not None and ray_w @ self._ball.ray_w > math.cos(
                 min(GATE * math.hypot(self._ball.spread, READ), math.pi)
             ):
-                self._ball.see(ray_w)
+                self._ball.correct(ray_w)
             else:
-                self._ball = Track(ray_w, stamp, READ, TURNS)
-            self._half_angle = seen.ball.half_angle
+                self._ball = BallTrack(ray_w, stamp, READ, TURNS)
+            self._half_angle = detections.ball.half_angle
         elif self._ball is not None and self._ball.spread < LOST:
-            return replace(seen, ball=BallSeen(rot_wc.T @ self._ball.ray_w, self._half_angle, 0.0))
-        return seen
+            return replace(
+                detections, ball=BallSeen(rot_wc.T @ self._ball.ray_w, self._half_angle, 0.0)
+            )
+        return detections
 
-    def _goal(self, seen: Seen, rot_wc: np.ndarray) -> GoalSeen | None:
+    def _goal(self, detections: FrameDetections, rot_wc: np.ndarray) -> GoalSeen | None:
         """Add up what a frame says of squares, of which two are no nearer than a side; returns the
         goal, unless it was missed.
         """
         squares: dict[int, GoalSeen] = {}
-        for one in seen.squares:  # the likeliest first
+        for one in detections.squares:  # the likeliest first
             ray_w = rot_wc @ one.rays_c.mean(0)
             place_w = self._eye_w[:2] + ray_w[:2] * (self._eye_w[2] / -ray_w[2])
             distances = [
@@ -209,6 +216,6 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _across(vector: np.ndarray, ray: np.ndarray) -> np.ndarray:
+def _perpendicular(vector: np.ndarray, ray: np.ndarray) -> np.ndarray:
     """The part of a vector across a unit ray."""
     return vector - ray * (ray @ vector)

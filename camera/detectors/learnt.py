@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from camera.detectors.contours import GATE, BallSeen, Detector, GoalSeen, Known, Seen
+from camera.detectors.contours import GATE, BallSeen, Detector, FrameDetections, GoalSeen, Prior
 from camera.fisheye import Fisheye
 
 SHIPPED = Path(__file__).parent / "learnt.npz"
@@ -48,7 +48,7 @@ def _block(inward: int, outward: int, stride: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(inward, outward, 3, stride, 1), nn.SiLU())
 
 
-class Search(nn.Module):
+class FrameNetwork(nn.Module):
     """Whole frames, halved, (B, 3, H / 2, W / 2), to (B, 2, 4, H / 16, W / 16): logit, place in the
     cell [cells] and log size [cells].
     """
@@ -71,7 +71,7 @@ class Search(nn.Module):
         return self.body(frames).unflatten(1, (2, 4))
 
 
-class Look(nn.Module):
+class PatchNetwork(nn.Module):
     """Patches (B, 3, S, S) to (B, outputs): logit, log accuracy, and what is where, in half sides
     of the patch.
     """
@@ -105,9 +105,9 @@ class Networks(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.search, self.ball, self.goal = (
-            Search(),
-            Look(PATCH["ball"], 5),
-            Look(PATCH["goal"], 10),
+            FrameNetwork(),
+            PatchNetwork(PATCH["ball"], 5),
+            PatchNetwork(PATCH["goal"], 10),
         )
         self.calibration = {kind: (1.0, 0.0, 1.0) for kind in KINDS}
         self.made_by: dict = {}
@@ -204,10 +204,10 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
         frames: RGB, uint8, shape (F, H, W, 3). index: frame of each patch, shape (B,).
         views: of the patches. lens: of the frames. side: S.
     """
-    at = (torch.arange(side, device=frames.device) + 0.5) * (2.0 / side) - 1.0
-    grid = torch.stack([at[None, :].expand(side, -1), at[:, None].expand(-1, side)], -1).reshape(
-        1, -1, 2
-    )
+    centres = (torch.arange(side, device=frames.device) + 0.5) * (2.0 / side) - 1.0
+    grid = torch.stack(
+        [centres[None, :].expand(side, -1), centres[:, None].expand(-1, side)], -1
+    ).reshape(1, -1, 2)
     rays = views.rays(grid.expand(len(index), -1, -1))
     pixels, _ = lens.project(rays)
     height, width = frames.shape[1:3]
@@ -247,25 +247,29 @@ class LearntDetector(Detector):
         self.networks = networks or Networks.load()
 
     @torch.inference_mode()
-    def detect(self, image: np.ndarray, known: Known | None = None) -> Seen:
+    def detect(self, image: np.ndarray, prior: Prior | None = None) -> FrameDetections:
         """Find ball and goal; see `camera.detectors.contours.Detector.detect`."""
         self.check(image)
-        known = known or Known()
+        prior = prior or Prior()
         frames = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))[None]
         places = places_of(self.networks.search(halved(frames)), self.lens)
         north = torch.tensor(
-            known.north_c if known.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32
+            prior.north_c if prior.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32
         )
         ball, goal = (self._closest(kind, frames, *places[kind], north) for kind in KINDS)
-        squares = self._squares(*goal, known)
-        return Seen(self._best_ball(*ball, known), squares[0] if squares else None, squares)
+        squares = self._squares(*goal, prior)
+        return FrameDetections(
+            self._best_ball(*ball, prior), squares[0] if squares else None, squares
+        )
 
     def _closest(
         self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Probabilities and findings at places."""
         factor, offset, _ = self.networks.calibration[kind]
-        views, outputs, _, _ = looked(self.networks, kind, frames, rays, sizes, self.lens, north)
+        views, outputs, _, _ = look_closely(
+            self.networks, kind, frames, rays, sizes, self.lens, north
+        )
         probability = torch.sigmoid(factor * outputs[:, 0] + offset)
         things = (
             ball_of(views, outputs)
@@ -274,34 +278,34 @@ class LearntDetector(Detector):
         )
         return probability, things
 
-    def _best_ball(self, probability: Tensor, things: Tensor, known: Known) -> BallSeen | None:
+    def _best_ball(self, probability: Tensor, things: Tensor, prior: Prior) -> BallSeen | None:
         probability = self._expected_there(
-            probability, things[:, :3], known.ball_ray_c, known.ball_within
+            probability, things[:, :3], prior.ball_ray_c, prior.ball_within
         )
         for i in probability.argsort(descending=True).tolist():
             ray, half_angle = things[i, :3].double().numpy(), float(things[i, 3])
-            if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, known):
+            if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, prior):
                 return BallSeen(ray, half_angle, float(probability[i]))
         return None
 
-    def _squares(self, probability: Tensor, things: Tensor, known: Known) -> tuple[GoalSeen, ...]:
+    def _squares(self, probability: Tensor, things: Tensor, prior: Prior) -> tuple[GoalSeen, ...]:
         """Return detections that are certain, or certain where expected, the likeliest first; each
         by its own probability, which frames add up.
         """
         raised = self._expected_there(
-            probability, F.normalize(things.mean(1), dim=-1), known.goal_ray_c, known.goal_within
+            probability, F.normalize(things.mean(1), dim=-1), prior.goal_ray_c, prior.goal_within
         )
         squares = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
             if max(probability[i], raised[i]) >= LEAST_PROBABILITY and self._right_size(
-                rays, known
+                rays, prior
             ):
                 squares.append(GoalSeen(rays, float(probability[i])))
         return tuple(squares)
 
     def _expected_there(
-        self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, within: float
+        self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, tolerance: float
     ) -> Tensor:
         """Probabilities where it is known about where the thing is; the networks' own are of a
         thing that can be anywhere in view.
@@ -310,7 +314,7 @@ class LearntDetector(Detector):
         in the view's solid angle."""
         if expected_c is None:
             return probability
-        cosine, variance = rays @ torch.from_numpy(expected_c).float(), (within / GATE) ** 2
+        cosine, variance = rays @ torch.from_numpy(expected_c).float(), (tolerance / GATE) ** 2
         likelier = (
             (1.0 - math.cos(self.lens.params.half_fov))
             / variance
@@ -320,7 +324,7 @@ class LearntDetector(Detector):
         return odds / (1.0 + odds)
 
 
-def looked(
+def look_closely(
     networks: Networks,
     kind: str,
     frame: Tensor,
@@ -344,23 +348,23 @@ def looked(
     return views, outputs, rays, sizes
 
 
-def middle_of(kind: str, views: Views, found: Tensor) -> tuple[Tensor, Tensor]:
+def middle_of(kind: str, views: Views, outputs: Tensor) -> tuple[Tensor, Tensor]:
     """Ray to the middle, shape (B, 3), and size [rad], shape (B,), of what was found."""
     if kind == "ball":
-        thing = ball_of(views, found)
+        thing = ball_of(views, outputs)
         return thing[:, :3], thing[:, 3]
-    corners = views.rays(found[:, 2:].unflatten(1, (4, 2)))
+    corners = views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
     middle = F.normalize(corners.mean(1), dim=-1)
     return middle, (corners @ middle[:, :, None])[..., 0].clamp(max=1.0 - 1e-7).acos().mean(1)
 
 
-def ball_of(views: Views, found: Tensor) -> Tensor:
+def ball_of(views: Views, outputs: Tensor) -> Tensor:
     """Unit ray and half-angle [rad] of balls, shape (B, 4)."""
-    ray = views.rays(found[:, None, 2:4])[:, 0]
+    ray = views.rays(outputs[:, None, 2:4])[:, 0]
     return torch.cat(
         [
             ray,
-            (views.reach / REACH["ball"] * found[:, 4].clamp(-3.0, 1.5).exp())[:, None].clamp(
+            (views.reach / REACH["ball"] * outputs[:, 4].clamp(-3.0, 1.5).exp())[:, None].clamp(
                 1e-3, 1.2
             ),
         ],
@@ -402,6 +406,6 @@ def log_size(angle: Tensor, lens: Fisheye) -> Tensor:
     return (angle.clamp(min=1e-4) * (lens.params.fx / CELL)).log()
 
 
-def spread_of(found: Tensor, views: Views) -> Tensor:
+def spread_of(outputs: Tensor, views: Views) -> Tensor:
     """Standard deviation of a direction [rad], before calibration, shape (B,)."""
-    return found[:, 1].clamp(-8.0, 3.0).exp() * views.reach
+    return outputs[:, 1].clamp(-8.0, 3.0).exp() * views.reach

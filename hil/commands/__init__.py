@@ -56,6 +56,6 @@ def add_flight_options(parser: argparse.ArgumentParser) -> None:
 
 def fly(args: argparse.Namespace) -> int:
     """Fly, or run dry, and return the exit status."""
-    from hil import flight
+    from hil import fly_run
 
-    return flight.fly(args)
+    return fly_run.fly(args)

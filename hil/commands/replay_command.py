@@ -15,4 +15,4 @@ def run(args: argparse.Namespace) -> int:
     """Replay and compare."""
     from hil.control.recording import playback
 
-    return playback.again(args)
+    return playback.compare_run(args)

@@ -151,8 +151,8 @@ class Calibrating:
         """Return why a throw has to wait, or is refused."""
         p, estimate = self.params, self.calibration
         if estimate is None:
-            again = f" again: {self._problem}" if self._problem else ""
-            return [f"calibrating in the hover{again}"]
+            repeated = f" again: {self._problem}" if self._problem else ""
+            return [f"calibrating in the hover{repeated}"]
         tilt = np.abs(np.degrees(estimate.turn_b[:2])).max()
         tilt_sigma = np.degrees(estimate.turn_sigma[:2]).max()
         thrust = f"thrust {estimate.thrust:.2f} of the commanded, within {p.thrust:g} of 1 expected"

@@ -11,15 +11,15 @@ from typing import Any, Protocol
 from hil.control.calibrating import Calibrating, CalibrationSolver
 from hil.control.realtime import collected
 from hil.control.recording.latency import Stages
-from hil.control.recording.record import Recorder
+from hil.control.recording.record import RunRecorder
 from hil.control.runner import Runner
-from hil.control.states import OperatorInput, State, TickRecord
+from hil.control.state_machine import OperatorInput, State, TickRecord
 from hil.links.backends.base import Backend, DryRun
 from hil.links.clock import Clock, Ticker
-from hil.poses.sources.base import Source
 from hil.poses.sources.images import Eyes
+from hil.poses.sources.pose_source import Source
 
-AHEAD, AHEAD_SPREAD = 1e-3, 5e-3
+LEAD, LEAD_SPREAD = 1e-3, 5e-3
 """Before a tick the poses that have come are taken in [s], so that the tick finds the last one or
 two alone; earlier by a share of the second number that goes round from tick to tick, so that the
 link is looked at, and peers are asked for their time, at any point of their periods.
@@ -43,7 +43,7 @@ class Operator(Protocol):
         """Return what was said since the last tick; ``state`` is the runner's. Never waits."""
 
 
-class Lander:
+class LandAfterCalibration:
     """Another operator, who lands too once the camera is calibrated: for a run that is flown for
     nothing else.
     """
@@ -52,8 +52,10 @@ class Lander:
         self._operator, self._calibrating = operator, calibrating
 
     def words(self, state: str) -> OperatorInput:
-        said = self._operator.words(state)
-        return replace(said, arm=False, land=said.land or self._calibrating.calibration is not None)
+        words = self._operator.words(state)
+        return replace(
+            words, arm=False, land=words.land or self._calibrating.calibration is not None
+        )
 
 
 @dataclass
@@ -64,7 +66,7 @@ class Loop:
     source: Source  # of poses
     clock: Clock  # of the ticks
     operator: Operator  # who arms
-    recorder: Recorder | None = None  # of the run's folder
+    recorder: RunRecorder | None = None  # of the run's folder
     tell: Callable[[TickRecord], None] | None = (
         # called with the first decision of each state, and of each reason why it does not go on
         None
@@ -78,14 +80,14 @@ class Loop:
     _ended: float = -math.inf
     _state: str = ""
     _waits: str = ""
-    _said: dict[str, float] = field(
+    _announced: dict[str, float] = field(
         default_factory=dict
     )  # reasons to wait, without their numbers, and when they were said [s]
 
     def __post_init__(self) -> None:
         self.ticker = Ticker(self.clock, self.runner.pilot.period)
 
-    def fly(self, most: float = math.inf) -> dict[str, Any]:
+    def fly(self, limit: float = math.inf) -> dict[str, Any]:
         """Run until the state machine is done, the recorded poses have ended, or for ``most``
         seconds; returns the summary.
 
@@ -95,7 +97,7 @@ class Loop:
         runner, clock, begin = self.runner, self.clock, self.clock.now()
         with collected():
             while runner.machine.state is not State.DONE and not self.source.ended:
-                finished = clock.now() - begin >= most
+                finished = clock.now() - begin >= limit
                 if finished and (runner.backend.name == DryRun.name or not runner.in_flight):
                     break
                 try:
@@ -110,7 +112,7 @@ class Loop:
                     clock.sleep_until(clock.now() + runner.pilot.period)
         return self.summary()
 
-    def turn(self, over: bool) -> None:
+    def turn(self, finished: bool) -> None:
         """Do one tick; ``over``: the run's time is, and what flies is to come down."""
         runner, source, clock, ticker, backend = (
             self.runner,
@@ -122,7 +124,7 @@ class Loop:
         source.hold(runner.in_flight)
         _wait(
             clock,
-            ticker.due() - AHEAD - AHEAD_SPREAD * (self.count * GOLDEN % 1.0),
+            ticker.due() - LEAD - LEAD_SPREAD * (self.count * GOLDEN % 1.0),
             backend,
             source,
         )
@@ -135,7 +137,7 @@ class Loop:
         late = source.poll(time)
         polled = perf_counter()
         status, words = backend.status(time), self.operator.words(runner.machine.state.value)
-        if over:
+        if finished:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
         runner.decider.rivals = source.rivals(time)
@@ -176,14 +178,16 @@ class Loop:
         waits, time = decision.waits, decision.time
         kind = NUMBER.sub("", waits)
         if decision.state != self._state:
-            self._state, self._said = decision.state, {}
+            self._state, self._announced = decision.state, {}
         elif decision.calibration is not None:
             pass
         elif (
-            not waits or waits == self._waits or time - self._said.get(kind, -math.inf) < SAY_AGAIN
+            not waits
+            or waits == self._waits
+            or time - self._announced.get(kind, -math.inf) < SAY_AGAIN
         ):
             return
-        self._said[kind], self._waits = time, waits
+        self._announced[kind], self._waits = time, waits
         if self.tell is not None:
             self.tell(decision)
 

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from time import perf_counter
 from typing import Any
 
-from hil.control.states import Inputs, OperatorInput, State, TickRecord
+from hil.control.state_machine import Inputs, OperatorInput, State, TickRecord
 from hil.control.tick.commander import Commander
 from hil.control.tick.decider import Decider
 from hil.control.tick.flight_parts import build_parts

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from camera.detectors.contours import BallSeen, GoalSeen, Seen, detected_keypoints
+from camera.detectors.contours import BallSeen, FrameDetections, GoalSeen, detected_keypoints
 from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
 from camera.mount import rotation_from_vector
 from hil.poses.pose import Quaternion, Vector
@@ -51,11 +51,11 @@ class Detection:
             None if ball is None else tuple(ball),
         )
 
-    def seen(self) -> Seen:
+    def frame_detections(self) -> FrameDetections:
         """Return it as `camera.detectors.contours` has it."""
         goal = None if self.corners is None else GoalSeen(np.array(self.corners), 1.0)
         ball = None if self.ball is None else BallSeen(np.array(self.ball[:3]), self.ball[3], 1.0)
-        return Seen(ball, goal)
+        return FrameDetections(ball, goal)
 
 
 def rotation_of(quat: Quaternion) -> np.ndarray:
@@ -85,14 +85,14 @@ class Detections:
         self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
         self.fresh: tuple[float, np.ndarray, np.ndarray] | None = None
 
-    def correct(self, found: Calibration) -> None:
+    def correct(self, calibration: Calibration) -> None:
         """Turn rays and carry them forward from now on by what a calibration found."""
         rot_cb = self._camera.rot_cb.double()
-        turn = rotation_from_vector(torch.tensor(found.turn_b, dtype=torch.float64))
+        turn = rotation_from_vector(torch.tensor(calibration.turn_b, dtype=torch.float64))
         self._turn, self._scale, self._latency = (
             (rot_cb @ turn @ rot_cb.T).numpy(),
-            found.scale,
-            max(found.latency, 0.0),
+            calibration.scale,
+            max(calibration.latency, 0.0),
         )
 
     def note_vehicle(self, time: float, pos: Vector, quat: Quaternion) -> None:
@@ -105,7 +105,7 @@ class Detections:
         """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
         at a tick [s].
         """
-        frame = detection.seen()
+        frame = detection.frame_detections()
         rot_wb = rotation_of(quat)
         if self._turn is not None and self._path:
             frame = self._carried(frame, detection.stamp - self._latency + aged)
@@ -129,7 +129,7 @@ class Detections:
             if time - stamp > self._hold
         ]
 
-    def _carried(self, seen: Seen, when: float) -> Seen:
+    def _carried(self, detections: FrameDetections, when: float) -> FrameDetections:
         """Return what was seen at a time as the camera of training would see it now: the goal lies,
         the ball goes with the vehicle.
         """
@@ -139,7 +139,7 @@ class Detections:
             self._camera.rot_cb.double().numpy().T,
             self._camera.position_b.double().numpy(),
         )
-        turn, ball, goal = self._turn, seen.ball, seen.goal
+        turn, ball, goal = self._turn, detections.ball, detections.goal
         if ball is not None:
             ray = rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ self._to_scale(ball.ray_c[None])[0]
             ball = BallSeen(ray, ball.half_angle / (1.0 + self._scale), ball.score)
@@ -149,7 +149,7 @@ class Detections:
             from_now = eye + reach * rays_w - (pos_now + rot_now @ lens)
             rays = from_now @ (rot_now @ rot_bc)
             goal = GoalSeen(rays / np.linalg.norm(rays, axis=1, keepdims=True), goal.score)
-        return Seen(ball, goal)
+        return FrameDetections(ball, goal)
 
     def _to_scale(self, rays_c: np.ndarray) -> np.ndarray:
         """Return rays, shape (N, 3), by the focal length that was found."""

@@ -145,10 +145,10 @@ def _sum(weights: list[float], vectors: list[Vector]) -> Vector:
     return (x, y, z)
 
 
-def _turn(time: Quaternion, then: Quaternion | None) -> Vector:
-    """Return the rotation vector from the attitude now to an earlier one, in the body frame of now
+def _turn(quat: Quaternion, earlier: Quaternion | None) -> Vector:
+    """Return the rotation vector from an attitude to an earlier one, in the former's body frame
     [rad].
     """
-    if then is None:
+    if earlier is None:
         return (0.0, 0.0, 0.0)
-    return rotation_vector(multiply(conjugate(time), then))
+    return rotation_vector(multiply(conjugate(quat), earlier))

@@ -1,10 +1,9 @@
-"""The hand-carry check: the vehicle is carried about in a stated order, and its poses tell which
-axes the source really has.
+"""The hand-carry check: an operator carries the vehicle in a stated order, and its poses show the
+source's axes.
 
-Nose along our x and level at first, a second of rest before and after each move. Three moves of the
-place tell the world's axes, three turns those of the body and the quaternion's order: of the 24
-axis cases each (and the two orders) the one under which every move went where it was meant to is
-named."""
+It starts level, its nose along our x, with a second of rest before and after each move. Three
+translations show the world's axes, three turns the body's and the quaternion's order. The result is
+the one of 24 axis cases each, and of two orders, under which every move goes as stated."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -18,7 +17,7 @@ from hil.errors import RunError
 from hil.links.clock import Clock
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import VEHICLE, Pose
-from hil.poses.sources.base import Source
+from hil.poses.sources.pose_source import Source
 from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
 from visthrow.logs.axes import OURS, TURNS, turn_of
 
@@ -27,14 +26,14 @@ SPEED, RATE = (
     0.25,
 )  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
 SPAN = 0.2  # over which speed and rate are taken [s]
-REST = 0.5  # the vehicle rests only after it has for this long [s]
-LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)  # smaller moves than these are no moves [m], [rad]
-LOOK = 0.25  # between two looks at what came [s]
+REST_TIME = 0.5  # shortest rest [s]
+LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)  # of a move [m], [rad]
+POLL_INTERVAL = 0.25  # [s]
 TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not walk straight [rad]
 
 
 @dataclass(frozen=True)
-class Move:
+class CarryMove:
     """One step of the check."""
 
     text: str  # for the operator
@@ -45,19 +44,19 @@ class Move:
 
 
 MOVES = (
-    Move("carry it forward, along our x, by half a metre", False, 0),
-    Move("carry it to its left, along our y, by half a metre", False, 1),
-    Move("lift it by half a metre", False, 2),
-    Move("tip its nose down by 45 deg, and hold it", True, 1),
-    Move("bring it level again", True, None),
-    Move("tip its right side down by 45 deg, and hold it", True, 0),
-    Move("bring it level again", True, None),
-    Move("turn it to the left by 90 deg, as seen from above", True, 2),
+    CarryMove("carry it forward, along our x, by half a metre", False, 0),
+    CarryMove("carry it to its left, along our y, by half a metre", False, 1),
+    CarryMove("lift it by half a metre", False, 2),
+    CarryMove("tip its nose down by 45 deg, and hold it", True, 1),
+    CarryMove("bring it level again", True, None),
+    CarryMove("tip its right side down by 45 deg, and hold it", True, 0),
+    CarryMove("bring it level again", True, None),
+    CarryMove("turn it to the left by 90 deg, as seen from above", True, 2),
 )
 
 
 @dataclass(frozen=True)
-class Step:
+class MeasuredMove:
     """A move as the source tells it, in its own frames."""
 
     before: Pose  # mean of the rest before
@@ -86,7 +85,7 @@ Line = tuple[str, bool]  # judgement of one move: in words, and whether it passe
 
 
 @dataclass(frozen=True)
-class Finding:
+class CarryResult:
     """Outcome of the check."""
 
     lines: tuple[Line, ...]
@@ -97,7 +96,7 @@ class Finding:
     passed: bool
 
 
-def find_steps(poses: Sequence[Pose]) -> list[Step]:
+def find_steps(poses: Sequence[Pose]) -> list[MeasuredMove]:
     """Return moves between rests, of raw poses of the vehicle in order; raises `RunError` for one
     without attitude.
     """
@@ -109,7 +108,7 @@ def find_steps(poses: Sequence[Pose]) -> list[Step]:
     good = [p for p in poses if np.isfinite([*p.pos, *p.quat]).all() and math.hypot(*p.quat) > 0.5]
     rests = _rests(good)
     steps = [
-        Step(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b))
+        MeasuredMove(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b))
         for a, b in pairwise(rests)
     ]
     return [s for s in steps if np.linalg.norm(s.way) > LEAST_WAY or s.turn > LEAST_TURN]
@@ -127,14 +126,16 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
     resting = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
     return [
-        s for (s,) in find_objects(label(resting)[0]) if times[s.stop - 1] - times[s.start] >= REST
+        s
+        for (s,) in find_objects(label(resting)[0])
+        if times[s.stop - 1] - times[s.start] >= REST_TIME
     ]
 
 
-def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
+def _mean(poses: Sequence[Pose], span: slice) -> Pose:
     """Return the mean of the poses of a rest next to a move."""
     close = [
-        p for p in poses[: rest.stop - rest.start] if abs(p.arrival - poses[0].arrival) <= REST
+        p for p in poses[: span.stop - span.start] if abs(p.arrival - poses[0].arrival) <= REST_TIME
     ]
     quats = np.array([p.quat for p in close])
     quats[np.sum(quats * quats[0], axis=1) < 0.0] *= -1.0
@@ -143,9 +144,9 @@ def _mean(poses: Sequence[Pose], rest: slice) -> Pose:
     return replace(close[0], pos=place, quat=tuple((quat / np.linalg.norm(quat)).tolist()))
 
 
-def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
-    """Say of each move whether it went where it was meant to by the config's frames, and which
-    frames would fit; raises `RunError` for another number of moves than `MOVES`.
+def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
+    """Judge each move by the config's frames, and find the frames that fit best; raises `RunError`
+    for another number of moves than `MOVES`.
     """
     if len(steps) != len(MOVES):
         moves = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
@@ -188,7 +189,7 @@ def judge(steps: Sequence[Step], frames: FrameParams) -> Finding:
     mirrored = bool(
         np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5
     )
-    return Finding(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
+    return CarryResult(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
 def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
@@ -200,23 +201,21 @@ def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
     """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be
     the walker's.
     """
-    forward, left = (world @ ways[i][1] for i in (0, 1))
-    off = math.degrees(math.atan2(-forward[1] + left[0], forward[0] + left[1]))
-    return round(off, 0) if abs(off) > 10.0 else 0.0
+    forward, leftward = (world @ ways[i][1] for i in (0, 1))
+    angle = math.degrees(math.atan2(-forward[1] + leftward[0], forward[0] + leftward[1]))
+    return round(angle, 0) if abs(angle) > 10.0 else 0.0
 
 
-def _line(move: Move, step: Step, frames: FrameParams) -> Line:
+def _line(move: CarryMove, step: MeasuredMove, frames: FrameParams) -> Line:
     ours = Frames(frames)
     motion = step.turns(ours)[1] if move.turn else np.array(ours.world_from_source(tuple(step.way)))
     size = "rad about" if move.turn else "m along"
     length = float(np.linalg.norm(motion))
-    off = math.acos(max(-1.0, min(1.0, motion[move.axis] / max(length, 1e-12))))
-    passed = off <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
+    angle = math.acos(max(-1.0, min(1.0, motion[move.axis] / max(length, 1e-12))))
+    passed = angle <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
     numbers = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", motion))
-    return (
-        f"{move.text.split(',')[0]}: {numbers} ({size} our axes), {math.degrees(off):.0f} deg off",
-        passed,
-    )
+    name, deviation = move.text.split(",")[0], math.degrees(angle)
+    return f"{name}: {numbers} ({size} our axes), {deviation:.0f} deg off", passed
 
 
 def _start(pose: Pose, frames: FrameParams) -> Line:
@@ -238,30 +237,28 @@ def collect(
     seconds: float,
     tell: Callable[[str], None] = lambda text: None,
     recorded: bool = False,
-) -> list[Step]:
+) -> list[MeasuredMove]:
     """Take in the vehicle's poses until all moves were made, or for a time [s]; a recording to its
     end. ``tell`` hears each move.
     """
     poses: list[Pose] = []
-    steps: list[Step] = []
-    begin, told = clock.now(), -1
+    steps: list[MeasuredMove] = []
+    begin, prompted = clock.now(), -1
     while (
         not source.ended and len(steps) < len(MOVES) and (recorded or clock.now() - begin < seconds)
     ):
-        source.wait(clock, clock.now() + LOOK)
+        source.wait(clock, clock.now() + POLL_INTERVAL)
         poses += [pose for pose in source.poll(clock.now()) if pose.body == VEHICLE]
         if not recorded:
             steps = find_steps(poses)
-            if len(steps) != told and len(steps) < len(MOVES):
-                told = len(steps)
-                tell(
-                    f"{told + 1} of {len(MOVES)}: {MOVES[told].text}; then hold it still for a"
-                    " second"
-                )
+            if len(steps) != prompted and len(steps) < len(MOVES):
+                prompted = len(steps)
+                text = MOVES[prompted].text
+                tell(f"{prompted + 1} of {len(MOVES)}: {text}; then hold it still for a second")
     return find_steps(poses)
 
 
-def summary_text(finding: Finding, frames: FrameParams) -> str:
+def summary_text(finding: CarryResult, frames: FrameParams) -> str:
     """Return the outcome in words."""
     lines = [f"{'PASS' if passed else 'FAIL'}  {text}" for text, passed in finding.lines]
     if finding.mirrored:

@@ -19,7 +19,7 @@ ZEROS = ([0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 """Attitudes that captures write for a body that they do not see, sorted: zeros, or no turn."""
 
 
-def known(quat: Quaternion | None) -> bool:
+def has_attitude(quat: Quaternion | None) -> bool:
     """Return whether an attitude is told: single markers have NaN or zeros there."""
     return quat is not None and not any(map(math.isnan, quat)) and any(quat)
 
@@ -50,7 +50,7 @@ class Pose:
         """
         return not self.valid or (
             not any(self.pos)
-            and (self.quat is None or sorted(self.quat) in ZEROS or not known(self.quat))
+            and (self.quat is None or sorted(self.quat) in ZEROS or not has_attitude(self.quat))
         )
 
     def transit(self, usual: float) -> float:

@@ -15,7 +15,7 @@ from hil.poses.pose import Pose
 
 WINDOW = 2.0  # of arrivals that are looked at [s]
 SETTLING = 0.5  # of arrivals before anything is judged [s]
-AGAIN = 0.1  # between two judgements [s]
+JUDGE_INTERVAL = 0.1  # between two judgements [s]
 MOST_KEPT = 10_000  # poses in a window
 
 MOST_REFUSED = 0.05  # share of poses that the gate may refuse beside repeated ones
@@ -107,7 +107,7 @@ class Stream:
         """Return what of the last seconds' poses no estimate is to be made of, in words; judged
         anew every :data:`AGAIN`.
         """
-        if time - self._judged[0] >= AGAIN:
+        if time - self._judged[0] >= JUDGE_INTERVAL:
             self._judged = (time, self._judge(time))
         return self._judged[1]
 
@@ -115,16 +115,16 @@ class Stream:
         flow = self.flow(time)
         if flow is None or not flow.count:
             return []
-        found = self._stamps(flow)
+        problems = self._stamps(flow)
         refused = sum(n for reason, n in flow.refused.items() if reason != "repeated")
         share = refused / flow.count
-        if share > MOST_REFUSED and not (found and set(flow.refused) <= {"old", "repeated"}):
+        if share > MOST_REFUSED and not (problems and set(flow.refused) <= {"old", "repeated"}):
             reasons = "; ".join(f"{n} {REASONS[key]}" for key, n in flow.refused.most_common(3))
-            found.append(
+            problems.append(
                 f"{100 * share:.0f} % of the poses are refused ({reasons}); expected at most"
                 f" {100 * MOST_REFUSED:g} %"
             )
-        return found or self._times(flow)
+        return problems or self._times(flow)
 
     def _stamps(self, flow: Flow) -> list[str]:
         """Return what is wrong with the stamps, the first reason alone: others follow from it."""
@@ -151,17 +151,18 @@ class Stream:
     def _times(self, flow: Flow) -> list[str]:
         """Return what is wrong with rate and regularity."""
         gate, estimate = self._gate, self._estimate
-        least, most = estimate.order / estimate.window, MOST_SAMPLES / estimate.window
+        lowest, highest = estimate.order / estimate.window, MOST_SAMPLES / estimate.window
         rate, out = flow.rate, []
-        if rate < least:
+        if rate < lowest:
             out.append(
-                f"{rate:.1f} good poses a second; expected {least:.0f} or more: the estimate's"
+                f"{rate:.1f} good poses a second; expected {lowest:.0f} or more: the estimate's"
                 f" window of {1e3 * estimate.window:g} ms holds {estimate.order + 1} then"
             )
-        elif rate > most:
+        elif rate > highest:
             out.append(
-                f"{rate:.0f} poses a second; expected {most:.0f} at most: the estimate's window of"
-                f" {1e3 * estimate.window:g} ms holds {MOST_SAMPLES}; let the source send fewer"
+                f"{rate:.0f} poses a second; expected {highest:.0f} at most: the estimate's"
+                f" window of {1e3 * estimate.window:g} ms holds {MOST_SAMPLES}; let the source"
+                " send fewer"
             )
         if flow.stale > MOST_STALE:
             out.append(
@@ -172,13 +173,13 @@ class Stream:
             )
         period = 1.0 / rate if rate else math.inf
         allowed = max(LEAST_SCATTER, SCATTER * period)
-        if rate >= least and (flow.scatter > allowed or flow.bunched > MOST_CLOSE):
+        if rate >= lowest and (flow.scatter > allowed or flow.bunched > MOST_CLOSE):
             out.append(
                 f"stamps scatter by {1e3 * flow.scatter:.1f} ms, {100 * flow.bunched:.0f} % of them"
                 f" are bunched; expected {1e3 * allowed:.1f} ms and {100 * MOST_CLOSE:g} %: stamp"
                 " where the camera measures, not where it is forwarded"
             )
-        if rate >= least and flow.transit > gate.warn:
+        if rate >= lowest and flow.transit > gate.warn:
             out.append(
                 f"poses take {1e3 * flow.transit:.0f} ms longer at times; expected"
                 f" {1e3 * gate.warn:g} ms at most: a cable in place of radio, or TIMESYNC"
@@ -200,5 +201,5 @@ def _scatter(intervals: np.ndarray) -> float:
     period = float(np.median(intervals))
     if not period > 0.0:
         return math.inf
-    rest = intervals - np.maximum(np.round(intervals / period), 1.0) * period
-    return float(np.sqrt(np.mean(rest * rest)))
+    deviation = intervals - np.maximum(np.round(intervals / period), 1.0) * period
+    return float(np.sqrt(np.mean(deviation * deviation)))

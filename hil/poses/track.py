@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
-from hil.poses.pose import Pose, Quaternion, Vector, known
+from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from hil.poses.stream import Stream
 from visthrow.common.rotations import multiply
 
@@ -79,7 +79,7 @@ class Track:
     def _taken(self, raw: Pose, tether: Tether | None) -> str | None:
         if raw.lost():
             raw = replace(raw, valid=False)
-        if not self._turns and raw.quat is not None and not known(raw.quat):
+        if not self._turns and raw.quat is not None and not has_attitude(raw.quat):
             raw = replace(raw, quat=None)
         pose = self.frames.pose_from_source(raw)
         before, stepped = self.gate.last, self.gate.stepped(pose)
@@ -135,7 +135,7 @@ class Track:
             *(sum(c * pos[i] for c, (_, pos) in zip(weights, self._slow)) for i in range(3))
         )
 
-    def state(self, time: float, ahead: float = 0.0) -> BodyState | None:
+    def state(self, time: float, lead: float = 0.0) -> BodyState | None:
         """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of
         what is known of its accelerations.
         """
@@ -144,15 +144,15 @@ class Track:
             return None
         pos, quat, vel, age = pose.pos, pose.quat, self._vel, self.gate.age(time)
         rate = self.filter.rate if self._turns else (0.0, 0.0, 0.0)
-        ahead = min(max(ahead, 0.0), MOST_PREDICTION)
-        if ahead > 0.0:
-            pos = tuple(x + ahead * v for x, v in zip(pos, vel))
-            vel = tuple(v + TRUST * ahead * a for v, a in zip(vel, self.filter.acceleration))
+        lead = min(max(lead, 0.0), MOST_PREDICTION)
+        if lead > 0.0:
+            pos = tuple(x + lead * v for x, v in zip(pos, vel))
+            vel = tuple(v + TRUST * lead * a for v, a in zip(vel, self.filter.acceleration))
             if quat is not None:
-                half = 0.5 * ahead
+                half = 0.5 * lead
                 turn = multiply(quat, (*(half * r for r in rate), 1.0))
                 norm = sum(x * x for x in turn) ** 0.5
                 quat = tuple(x / norm for x in turn)
             if self._turns:
-                rate = tuple(r + TRUST * ahead * a for r, a in zip(rate, self.filter.spin))
+                rate = tuple(r + TRUST * lead * a for r, a in zip(rate, self.filter.spin))
         return BodyState(pos, quat, vel, rate, age)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hil.commands import examples
 from hil.errors import RunError
-from hil.flight import key_of
+from hil.fly_run import key_of
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hil.control.recording.playback import replay
-from hil.control.recording.record import Recorder, lines, read_poses
+from hil.control.recording.record import RunRecorder, lines, read_poses
 from hil.control.runner import OperatorInput, Runner
 from hil.links.backends.base import Status
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
@@ -65,7 +65,7 @@ def stream(streams: int, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
 def recorded(flown: dict[str, np.ndarray], folder) -> dict[int, list[Pose]]:
     """The stream as poses that were written to a run's folder and read back."""
     wanted = params("policy=state")
-    recorder = Recorder(folder, wanted)
+    recorder = RunRecorder(folder, wanted)
     count = flown["pos_w"].shape[0] * flown["pos_w"].shape[1]
     flat = {
         name: values.reshape(count, -1).astype(float).tolist() for name, values in flown.items()

@@ -12,8 +12,8 @@ import time
 import numpy as np
 import pytest
 
-from hil.control.recording.record import Recorder
-from hil.control.states import OperatorInput
+from hil.control.recording.record import RunRecorder
+from hil.control.state_machine import OperatorInput
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
@@ -362,7 +362,7 @@ def test_the_disk_is_full(tmp_path, full_at):
     In mid throw: it is flown to its end, and said in the summary.
     """
     params = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)[0].params
-    recorder = Recorder(tmp_path / "run", params)
+    recorder = RunRecorder(tmp_path / "run", params)
 
     class Full:
         def write(self, text):

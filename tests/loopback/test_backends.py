@@ -7,7 +7,7 @@ import pytest
 
 from hil.check import AutopilotCheck
 from hil.control.loop import Loop
-from hil.control.states import OperatorInput
+from hil.control.state_machine import OperatorInput
 from hil.links import msp
 from hil.links.backends.ardupilot import BRAKE
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT

@@ -9,7 +9,7 @@ import signal
 import pytest
 
 from hil.control.loop import Loop
-from hil.terminal import ENDING, Terminal
+from hil.operator_terminal import ENDING, Terminal
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers

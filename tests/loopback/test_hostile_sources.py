@@ -11,7 +11,12 @@ import pytest
 
 from bench.hostile import READERS, judge
 from hil.poses.sources.capture import LOOK
-from hil.poses.sources.mocap import MocapParams, MotionCaptureSource, NatNetSource, RigidBody
+from hil.poses.sources.motion_capture import (
+    MocapParams,
+    MotionCaptureSource,
+    NatNetSource,
+    RigidBody,
+)
 from tests.fuzz import EACH, SEEDS, noise
 from tests.motive import FRAME, Motive, frame, message
 
@@ -84,8 +89,8 @@ def test_what_ends_the_reader_of_motioncapture_ends_no_run(motive, monkeypatch):
     not get to it; those of the host's address end its process, which is started again.
     """
     pytest.importorskip("motioncapture", reason="extra motioncapture")
-    monkeypatch.setattr("hil.poses.sources.mocap.AGAIN", 0.5)
-    monkeypatch.setattr("hil.poses.sources.mocap.QUIET", 3.0)
+    monkeypatch.setattr("hil.poses.sources.motion_capture.RESTART_DELAY", 0.5)
+    monkeypatch.setattr("hil.poses.sources.motion_capture.QUIET", 3.0)
     params = MocapParams("optitrack", "127.0.0.1", settings={"interface_ip": "127.0.0.1"})
     names = (RigidBody("vehicle", "quad"), RigidBody("payload", "ball"))
     source = MotionCaptureSource(params, names, time.monotonic, tell=lambda text: None)

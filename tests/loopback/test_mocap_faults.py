@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from hil.control.states import OperatorInput
+from hil.control.state_machine import OperatorInput
 from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant

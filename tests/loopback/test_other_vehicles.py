@@ -8,7 +8,7 @@ import pytest
 
 from hil.control.loop import Loop
 from hil.control.response import AXES
-from hil.control.states import State
+from hil.control.state_machine import State
 from hil.errors import RunError
 from hil.links.backends import require_reach
 from hil.links.backends.base import FOLLOW

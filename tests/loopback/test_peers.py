@@ -17,7 +17,7 @@ from hil.links.pymav import mav
 from hil.links.roster import SILENT
 from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
-from hil.poses.sources.opening import open_source
+from hil.poses.sources.open_source import open_source
 from tests.hil_runs import record_run, saved_policy
 from visthrow import config
 from visthrow.cli import main

@@ -6,7 +6,7 @@ import pytest
 
 from hil.control.loop import Loop
 from hil.control.runner import Runner
-from hil.control.states import OperatorInput
+from hil.control.state_machine import OperatorInput
 from hil.links.backends.base import DryRun
 from hil.links.clock import ManualClock
 from hil.params import HilParams

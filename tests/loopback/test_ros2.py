@@ -7,7 +7,7 @@ import time
 import pytest
 
 from hil.errors import SourceError
-from hil.poses.sources.mocap import MocapParams, RigidBody
+from hil.poses.sources.motion_capture import MocapParams, RigidBody
 from hil.poses.sources.ros2 import KINDS, Ros2Source
 
 pytest.importorskip("cyclonedds", reason="extra ros2")
@@ -18,7 +18,7 @@ PUBLISHER = """
 import sys, time
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
-from hil.poses.sources.mocap import MocapParams
+from hil.poses.sources.motion_capture import MocapParams
 from hil.poses.sources.ros2 import KINDS, domain, message_types
 types = message_types()
 own, member = domain(MocapParams("ros2", "127.0.0.1", settings={"domain": sys.argv[1]}))

@@ -13,7 +13,7 @@ import pytest
 
 from hil.control.loop import Loop
 from hil.control.recording.playback import replay
-from hil.control.recording.record import Recorder
+from hil.control.recording.record import RunRecorder
 from hil.control.runner import Runner
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.clock import MonotonicClock
@@ -121,7 +121,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
         HilParams, config.find("hil", "fake"), [f'link.device="udp:{device}"', "states.abort=0.5"]
     )
     clock = MonotonicClock()
-    recorder = Recorder(tmp_path / "run", params)
+    recorder = RunRecorder(tmp_path / "run", params)
     link = Link(
         open_port(check_device(params.link.device)), tlog=TlogWriter(tmp_path / "run" / "link.tlog")
     )

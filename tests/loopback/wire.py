@@ -13,7 +13,7 @@ from hil.links.backends.crazyflie import Crazyflie
 from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
-from hil.poses.sources.opening import parties
+from hil.poses.sources.open_source import parties
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import make_fake

@@ -22,7 +22,7 @@ from hil.links.mavlink_link import Link, LinkSync
 from hil.links.pymav import mav
 from hil.links.roster import Roster
 from hil.params import HilParams
-from hil.poses.sources.opening import parties
+from hil.poses.sources.open_source import parties
 from visthrow import config
 
 pytestmark = pytest.mark.sitl

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import Known
+from camera.detectors.contours import Prior
 from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
@@ -149,7 +149,7 @@ def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
     nothing, pose, *tracks = (
         detector.known_of(known, truth, 1.2, e, np.random.default_rng(e)) for known, e in asked
     )
-    assert nothing == Known()
+    assert nothing == Prior()
     np.testing.assert_allclose([pose.up_c, pose.north_c], rot[1, [2, 0]])
     assert (pose.height, pose.ball_ray_c, pose.ball_distance) == (1.2, None, None)
     assert [track.ball_distance for track in tracks] == [HANGING, None]

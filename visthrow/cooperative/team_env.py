@@ -12,8 +12,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from camera import history as hist
+from camera.keypoint_noise import StepDraw, apply_noise
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
-from camera.noise import StepDraw, apply_noise
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.cooperative.team import TeamExperiment, layout_of, members

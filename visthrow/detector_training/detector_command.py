@@ -425,16 +425,16 @@ def figures_of(
 
 def known_of(prior: str, truth, height: float, e: int, rng: np.random.Generator):
     """Return a detector's prior knowledge of scene e; see :data:`PRIORS`."""
-    from camera.detectors.contours import Known
+    from camera.detectors.contours import Prior
     from visthrow.detector_training.eyes import HANGING
 
     rot_wc = truth.rot_wc[e].numpy()
     distance = float(truth.ball_c[e].norm())
     pose = {"up_c": rot_wc[2], "height": height, "north_c": rot_wc[0]} if prior != "nothing" else {}
     if prior != "track":
-        return Known(**pose)
+        return Prior(**pose)
     ray = truth.ball_ray[e].numpy() + TRACK_ERROR / math.sqrt(2.0) * rng.standard_normal(3)
-    return Known(
+    return Prior(
         **pose,
         ball_ray_c=ray / np.linalg.norm(ray),
         ball_distance=HANGING if distance < HANGING[1] else None,

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from camera.detectors.contours import Detector, Seen, detected_keypoints
-from camera.detectors.following import Following
+from camera.detectors.contours import Detector, FrameDetections, detected_keypoints
+from camera.detectors.following import BallGoalTracker
 from camera.detectors.learnt import LearntDetector, Networks
 from camera.fisheye import Fisheye
 from camera.keypoints import KEYPOINTS, KeypointCamera
@@ -109,7 +109,7 @@ class RenderedEyes:
         self.camera = KeypointCamera(params)
         self._looks = 0
         self._hall: Scenes | None = None
-        self._followed: list[Following] = []
+        self._followed: list[BallGoalTracker] = []
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
         self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
@@ -163,10 +163,10 @@ class RenderedEyes:
         self.found["refused"] = len(lost)
         return lost
 
-    def _hanging(self, rot_wb: np.ndarray) -> Following:
+    def _hanging(self, rot_wb: np.ndarray) -> BallGoalTracker:
         """A ball that hangs still below a vehicle: where it is looked for first."""
         from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
-        return Following(
+        return BallGoalTracker(
             self.params.payload_radius, self.params.goal_side, from_lens - [0.0, 0.0, self._below]
         )
 
@@ -178,7 +178,7 @@ class RenderedEyes:
         rot_wb: np.ndarray,
         carried: bool,
         stamp: float,
-    ) -> Seen:
+    ) -> FrameDetections:
         """Return the detections, with a missed ball where it is predicted; vehicle e and
         its measured pose at a time [s].
         """
@@ -186,7 +186,7 @@ class RenderedEyes:
         eye_w = pos_w + rot_wb @ np.array(self.params.mount.position_b)
         detections = self.detector.detect(
             picture,
-            self._followed[e].known(
+            self._followed[e].prior(
                 rot_wc, rot_wb[:, 2], eye_w, HANGING if carried else None, stamp
             ),
         )

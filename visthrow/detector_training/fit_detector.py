@@ -25,7 +25,7 @@ from camera.detectors.learnt import (
     Views,
     halved,
     log_size,
-    looked,
+    look_closely,
     patches_of,
     places_of,
     spread_of,
@@ -485,7 +485,7 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
     scores = {}
     for kind in KINDS:
         rays, sizes = places[kind]
-        views, out, rays, sizes = looked(networks, kind, frame, rays, sizes, lens, labels.north)
+        views, out, rays, sizes = look_closely(networks, kind, frame, rays, sizes, lens, labels.north)
         error = _angle_between(rays, labels.rays[kind])
         hit = (
             labels.seen[kind]

@@ -17,7 +17,7 @@ import numpy as np
 from hil.control.latch import Landing
 from hil.control.recording.playback import Playback, Sample, Tick
 from hil.control.recording.record import PROVENANCE, SUMMARY, load_run
-from hil.control.states import State
+from hil.control.state_machine import State
 from hil.errors import RunError
 from hil.links.backends.base import FOLLOW, ROUNDING, Status
 from hil.params import HilParams
@@ -40,7 +40,7 @@ a motor]; before that commands are no valid ones.
 
 # poses on either side that a clock's offset is the median of: jitter of the transport goes, drift
 # stays
-ABOUT = 25
+HALF_WINDOW = 25
 AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)  # states that belong to a throw
 
 STATES = tuple(state.value for state in State)
@@ -72,12 +72,12 @@ class PlayedRun:
                 by_body.setdefault(sample.body, []).append(sample)
         for samples in by_body.values():
             stamps = np.array([sample.pose.stamp for sample in samples])
-            apart = (
+            offsets = (
                 np.array([measured(sample, self.playback.params) for sample in samples]) - stamps
             )
-            around = np.pad(apart, ABOUT, mode="edge")
+            around = np.pad(offsets, HALF_WINDOW, mode="edge")
             offset = np.median(
-                np.lib.stride_tricks.sliding_window_view(around, 2 * ABOUT + 1), axis=1
+                np.lib.stride_tricks.sliding_window_view(around, 2 * HALF_WINDOW + 1), axis=1
             )
             for sample, time in zip(samples, stamps + offset):
                 sample.time = float(time)
@@ -95,16 +95,16 @@ def read(folder: str | Path) -> PlayedRun:
     if not lines:
         raise RunError(f"{folder}: the run ended before its first tick; there is nothing to show")
     playback = Playback(params, policy)
-    provenance = _known(folder / PROVENANCE)
+    provenance = _read_json(folder / PROVENANCE)
     provenance["simulated"] = any(
-        link.get("simulated") for link in _known(folder / SUMMARY).get("links", [])
+        link.get("simulated") for link in _read_json(folder / SUMMARY).get("links", [])
     )
     return PlayedRun(
         playback, [playback.feed(line, poses.get(line["n"], [])) for line in lines], provenance
     )
 
 
-def _known(path: Path) -> dict[str, Any]:
+def _read_json(path: Path) -> dict[str, Any]:
     """Return what a file of a run says; nothing where the run was killed before it was written
     whole.
     """
@@ -114,7 +114,7 @@ def _known(path: Path) -> dict[str, Any]:
         return {}
 
 
-class Samples:
+class TickLogger:
     """Fills a recorder with ticks."""
 
     def __init__(self, playback: Playback, meta: dict) -> None:
@@ -191,13 +191,13 @@ class Samples:
                 self.recorder.add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
             self._note(vel_w=pose.vel, rate_b=pose.rate)
 
-    def _note(self, **given: Any) -> None:
+    def _note(self, **source_values: Any) -> None:
         """Note in the metadata which channels are the runner's own, of what the source gave of
         each.
         """
         estimated = self.recorder.meta.setdefault("estimated", [])
         estimated += [
-            name for name, value in given.items() if value is None and name not in estimated
+            name for name, value in source_values.items() if value is None and name not in estimated
         ]
 
 
@@ -246,7 +246,7 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
         if throw is not None
         else ticks[0].line["time"]
     )
-    samples = Samples(played.playback, meta_of(played.playback, played.provenance, start))
+    samples = TickLogger(played.playback, meta_of(played.playback, played.provenance, start))
     landings = (
         []
         if throw is None

@@ -30,7 +30,7 @@ OF_CLOCK = ("transport", "arrival", "late", "ack")
 real time.
 """
 
-LEAST, GROWTH, BINS = (
+SHORTEST, GROWTH, BINS = (
     1e-6,
     1.01,
     1640,
@@ -56,7 +56,7 @@ class Stage:
 
     def add(self, seconds: float) -> None:
         """Count one time [s]."""
-        place = int(math.log(seconds / LEAST) / math.log(GROWTH)) if seconds > LEAST else 0
+        place = int(math.log(seconds / SHORTEST) / math.log(GROWTH)) if seconds > SHORTEST else 0
         self.counts[min(place, BINS - 1)] += 1
         self.most = max(self.most, seconds)
 
@@ -65,7 +65,7 @@ class Stage:
         above the largest.
         """
         reached = np.searchsorted(np.cumsum(self.counts), share * self.counts.sum())
-        return min(LEAST * GROWTH ** (float(reached) + 0.5), self.most)
+        return min(SHORTEST * GROWTH ** (float(reached) + 0.5), self.most)
 
     def summary(self) -> dict[str, float]:
         """Return p50, p95, p99 and max [ms] and the count; empty where nothing was counted."""
@@ -182,7 +182,7 @@ def _histogram(axis: Any, row: int, name: str, stage: Stage) -> None:
 
     group = 8  # bins of one per cent to a bar
     counts = stage.counts.reshape(-1, group).sum(1)
-    edges = 1e3 * LEAST * GROWTH ** (group * np.arange(len(counts) + 1))
+    edges = 1e3 * SHORTEST * GROWTH ** (group * np.arange(len(counts) + 1))
     used = np.flatnonzero(counts)
     part = slice(used[0], used[-1] + 1)
     heights = row - _BAR * counts[part] / counts.max()
@@ -202,7 +202,7 @@ def _histogram(axis: Any, row: int, name: str, stage: Stage) -> None:
         lw=0.8,
     )
     axis.plot(
-        1e3 * max(stage.most, LEAST),
+        1e3 * max(stage.most, SHORTEST),
         row,
         "v",
         color=style.COLOURS[1],

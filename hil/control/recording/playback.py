@@ -11,7 +11,7 @@ from typing import Any
 
 from hil.control.recording.record import SUMMARY, load_run, opened, pack
 from hil.control.runner import Runner
-from hil.control.states import OperatorInput, State, TickRecord
+from hil.control.state_machine import OperatorInput, State, TickRecord
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.detection import Detection
@@ -180,7 +180,7 @@ def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str 
     )
 
 
-def again(args: argparse.Namespace) -> int:
+def compare_run(args: argparse.Namespace) -> int:
     """Run a recorded run again, and compare; 1 where anything differs or the recording was cut,
     else 0: ``visthrow hil replay``.
     """

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hil.control.states import OperatorInput, TickRecord
+from hil.control.state_machine import OperatorInput, TickRecord
 from hil.errors import RunError
 from hil.links.backends.base import Status
 from hil.links.writer import Writer
@@ -66,7 +66,7 @@ def begun(folder: Path) -> Iterator[None]:
         raise
 
 
-class Recorder:
+class RunRecorder:
     """Writes a run's folder."""
 
     def __init__(self, folder: str | Path, params: HilParams) -> None:
@@ -170,9 +170,9 @@ def lines(path: Path) -> Iterator[Any]:
 
 def pose_of(row: list) -> tuple[int, Pose]:
     """Return the number of the tick and the raw pose of a line of :data:`POSES`."""
-    index, stamp, arrival, body, *rest = row
-    pos, quat, vel, rate = (None if v is None else tuple(v) for v in rest[:4])
-    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, *rest[4:])
+    index, stamp, arrival, body, *values = row
+    pos, quat, vel, rate = (None if v is None else tuple(v) for v in values[:4])
+    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, *values[4:])
 
 
 def read_poses(folder: Path) -> dict[int, list[Pose]]:
@@ -248,7 +248,7 @@ PARTS = (
 
 RECORDS = ("*.tlog", "*.msp")
 
-ENDING, MOST = (
+ENDING, MOST_BYTES = (
     ".zip",
     2 << 30,
 )  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
@@ -292,10 +292,10 @@ def opened(path: str | Path) -> Iterator[Path]:
                     for entry in bundle.infolist()
                     if Path(entry.filename).name == entry.filename
                 ]
-                if sum(entry.file_size for entry in entries) > MOST:
+                if sum(entry.file_size for entry in entries) > MOST_BYTES:
                     raise RunError(
-                        f"{path}: unpacks to more than {MOST >> 30} GiB; expected the bundle of"
-                        " a run"
+                        f"{path}: unpacks to more than {MOST_BYTES >> 30} GiB; expected the"
+                        " bundle of a run"
                     )
                 for entry in entries:
                     bundle.extract(entry, folder)

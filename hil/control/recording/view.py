@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.recording.flightlogs import Samples, events, meta_of, read
+from hil.control.recording.flightlogs import TickLogger, events, meta_of, read
 from hil.control.recording.playback import Playback, Tick
 from hil.control.recording.record import (
     CONFIG,
@@ -37,7 +37,7 @@ from visthrow import config
 from visthrow.onboard.policy import Policy
 
 ENDINGS = (".rrd", ".mcap")  # of recordings: for rerun, for Foxglove
-EVERY = 0.1  # between two looks at the folder [s]
+POLL_INTERVAL = 0.1  # between two looks at the folder [s]
 MOST_SHOWN = 100  # ticks sent at a time; of more, where the viewer fell behind, the last ones
 TRAIL = 300  # poses whose places stay drawn: three seconds at 100 Hz
 
@@ -55,7 +55,7 @@ class Show:
 
         self._stream, self._view = stream, rerun_view
         self._meta = meta_of(playback, provenance, start)
-        self._samples = Samples(playback, self._meta)
+        self._samples = TickLogger(playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
         self._said: list | None = None
         rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
@@ -156,7 +156,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
                 show.take(ticks[-MOST_SHOWN:])
             elif finished:
                 break
-            time.sleep(EVERY)
+            time.sleep(POLL_INTERVAL)
     finally:
         follower.close()
     return dropped
@@ -170,7 +170,7 @@ def write(folder: str | Path, path: str | Path) -> None:
 
     played = read(folder)
     if Path(path).suffix == ".mcap":
-        samples = Samples(
+        samples = TickLogger(
             played.playback,
             meta_of(played.playback, played.provenance, played.ticks[0].line["time"]),
         )
@@ -196,7 +196,7 @@ def start_viewer(folder: Path) -> subprocess.Popen:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the live view, or write files: ``visthrow hil view``."""
-    from hil.control.recording.report import finish
+    from hil.control.recording.run_report import finish
 
     folder = Path(args.folder)
     if args.live:

@@ -3,7 +3,7 @@
 from collections import deque
 
 from hil.control.safety import failed_checks, fence_violation
-from hil.control.states import Inputs, OperatorInput, State, TickRecord
+from hil.control.state_machine import Inputs, OperatorInput, State, TickRecord
 from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
 from hil.links.backends.base import FAILED, FOLLOW, PENDING, Status

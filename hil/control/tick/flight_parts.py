@@ -8,7 +8,7 @@ from hil.control.calibrating import Calibrating
 from hil.control.hovering import Hovering
 from hil.control.latch import Latch
 from hil.control.response import Response
-from hil.control.states import Machine
+from hil.control.state_machine import Machine
 from hil.control.tick.body_estimate import Estimate
 from hil.links.backends.base import Backend
 from hil.params import HilParams
@@ -58,8 +58,8 @@ class FlightParts:
         """Return whether nothing moves, at the hover point or where the autopilot holds the vehicle
         by itself (``holding``).
         """
-        away = math.dist(estimate.vehicle.pos, self.params.home_w)
-        if not holding and away > CALM_OFFSET:
+        distance = math.dist(estimate.vehicle.pos, self.params.home_w)
+        if not holding and distance > CALM_OFFSET:
             return False
         bodies = [VEHICLE]
         if self.latch.at is None and estimate.payload is not None:

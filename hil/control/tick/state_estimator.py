@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 
-from hil.control.states import FLYING, State, TickRecord
+from hil.control.state_machine import FLYING, State, TickRecord
 from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
 from hil.poses.detection import Detection

@@ -37,10 +37,10 @@ class Strangers:
 
     def __init__(self, host: str) -> None:
         """Take the host's IPv4 address."""
-        wanted = struct.unpack("!I", socket.inet_aton(host))[0]
+        address = struct.unpack("!I", socket.inet_aton(host))[0]
         rows = (
             (LOAD, 0, 0, SENDER),
-            (EQUAL, 0, 1, wanted),
+            (EQUAL, 0, 1, address),
             (RETURN, 0, 0, 1 << 18),
             (RETURN, 0, 0, 0),
         )
@@ -66,12 +66,12 @@ class Strangers:
         return self._count - before
 
     def _guard(self, number: int) -> None:
-        found = socket.socket(fileno=os.dup(number))
-        if (found.family, found.type) == (socket.AF_INET, socket.SOCK_DGRAM):
-            found.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, self._filter)
-            self._guarded.append(found)
+        bodies = socket.socket(fileno=os.dup(number))
+        if (bodies.family, bodies.type) == (socket.AF_INET, socket.SOCK_DGRAM):
+            bodies.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, self._filter)
+            self._guarded.append(bodies)
         else:
-            found.close()
+            bodies.close()
 
 
 def _dropped(sock: socket.socket) -> int:
@@ -86,7 +86,7 @@ def listen(
     options: dict[str, str],
     names: list[str],
     put: Put,
-    more: Callable[[], bool] = lambda: True,
+    going: Callable[[], bool] = lambda: True,
     strangers: Strangers | None = None,
 ) -> None:
     """Connect, and put what comes: None once connected, the bodies of a frame, a text for what
@@ -97,13 +97,13 @@ def listen(
     """
     capture = connect(system, options)
     put(None)
-    while more():
+    while going():
         if strangers is not None and (count := strangers.look()):
             put(count)
         try:
             capture.waitForNextFrame()
-            found = capture.rigidBodies
-            ours = [name for name in found if name in names]
+            bodies = capture.rigidBodies
+            ours = [name for name in bodies if name in names]
         except Exception as error:  # of the package: a frame that it cannot read
             put(f"frame: {type(error).__name__}: {error}")
             time.sleep(PAUSE)
@@ -111,7 +111,7 @@ def listen(
         frame = {}
         for name in ours:
             try:
-                frame[name] = _numbers(found[name])
+                frame[name] = _numbers(bodies[name])
             except Exception as error:  # likewise: a body that is occluded
                 put(f"body {name}: {type(error).__name__}: {error}")
         if frame:

@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from camera.detectors.contours import Detector, DetectorParams, Known
-from camera.detectors.following import Following
+from camera.detectors.contours import Detector, DetectorParams, Prior
+from camera.detectors.following import BallGoalTracker
 from camera.detectors.learnt import LearntDetector
 from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb
@@ -101,18 +101,18 @@ class Eyes:
         self._position_b = np.array(mount.position_b)
         # From the camera of the pictures to that of training.
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
-        self._followed = Following(training.payload_radius, training.goal_side)
+        self._followed = BallGoalTracker(training.payload_radius, training.goal_side)
 
     def look(self, picture: np.ndarray, stamp: float) -> Detection:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of
         another size.
         """
-        prior, rot_wc, hint = Known(), None, self.hint
+        prior, rot_wc, hint = Prior(), None, self.hint
         if hint is not None:
             rot_wb = rotation_of(hint.quat)
             rot_wc = rot_wb @ self._rot_cb.T
             eye_w = np.array(hint.pos_w) + rot_wb @ self._position_b
-            prior = self._followed.known(rot_wc, rot_wb[:, 2], eye_w, hint.ball_distance, stamp)
+            prior = self._followed.prior(rot_wc, rot_wb[:, 2], eye_w, hint.ball_distance, stamp)
         try:
             frame = self._followed.take(self.detector.detect(picture, prior), rot_wc, stamp)
         except ValueError as error:
@@ -265,16 +265,16 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
                 f"{path}: the video names no rate; expected one, or {stamps.name} beside it"
             )
         times = [i / rate for i in range(int(video.get(cv2.CAP_PROP_FRAME_COUNT)))]
-    at = -1
+    position = -1
 
     def read(index: int) -> np.ndarray:
-        nonlocal at
+        nonlocal position
         good, picture = True, None
-        while at < index and good:  # seeking would land on key frames
+        while position < index and good:  # seeking would land on key frames
             good, picture = video.read()
-            at += 1
+            position += 1
         if not good or picture is None:
-            raise SourceError(f"{path}: frame {index} cannot be read; it has {at}")
+            raise SourceError(f"{path}: frame {index} cannot be read; it has {position}")
         return picture
 
     return read, times

@@ -17,7 +17,7 @@ from hil.links.mavlink_link import (
 from hil.links.pymav import mav
 from hil.links.roster import Address, MavlinkId, Seen
 from hil.poses.pose import Body, Pose
-from hil.poses.sources.base import Source
+from hil.poses.sources.pose_source import Source
 from visthrow.config.bounds import Bound, Bounded
 
 ATTITUDES = ("ATTITUDE_QUATERNION", "ATTITUDE")
@@ -83,8 +83,8 @@ class MavlinkDecoder:
         """Return why a message of a body is no pose."""
         if paired:
             return f"no {' or '.join(ATTITUDES)} within {1e3 * PAIR_AGE:g} ms of it"
-        wanted = " or ".join(map(frame_name, LOCAL_FRAMES))
-        return f"frame {frame_name(message.frame_id)} is not taken; expected {wanted}"
+        accepted = " or ".join(map(frame_name, LOCAL_FRAMES))
+        return f"frame {frame_name(message.frame_id)} is not taken; expected {accepted}"
 
     def _paired(
         self, message: Any, sender: tuple[int, int], body: str, arrival: float
@@ -131,10 +131,10 @@ class MavlinkSource(Source):
         link: Link,
         bodies: tuple[BodyIds, ...],
         clock: Callable[[], float],
-        beside: Link | None = None,
+        autopilot_link: Link | None = None,
     ) -> None:
         """Listen to a link; ``clock`` gives the arrivals. ``beside`` is another link to serve."""
-        super().__init__((link,) if beside is None else (link, beside), clock)
+        super().__init__((link,) if autopilot_link is None else (link, autopilot_link), clock)
         self._link, self._decoder = link, MavlinkDecoder(bodies, self._drop)
         self._waiting: list[Pose] = []
         link.listen(self._hear)

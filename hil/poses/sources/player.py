@@ -1,9 +1,9 @@
 """Poses of recordings: tables and flight logs by their channels, autopilots' logs by their
 messages.
 
-All files are read by ``visthrow.logs``. Autopilots write world north, east, down (or forward,
-right, down where PX4 was told so), body forward, right, down, quaternions wxyz; poses keep that, so
-that ``hil.poses.frames`` converts them as it does live ones.
+``visthrow.logs`` reads all files. Autopilots write world north, east, down (PX4 optionally forward,
+right, down), body forward, right, down, quaternions wxyz; poses keep that, and ``hil.poses.frames``
+converts them like live ones.
 
 | log | message | what it is |
 |---|---|---|
@@ -49,7 +49,7 @@ CHANNELS = {
 EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
 BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
 
-Names = tuple[tuple[str, ...], ...]  # fields; of several sets the first that is there is taken
+Names = tuple[tuple[str, ...], ...]  # fields; the first set that exists counts
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class PoseMessage:
     vel: Names = ()
     rate: Names = ()
     resets: tuple[str, ...] = ()  # counters; their sum is the pose's
-    # what says that the body is not seen where it is below a number
+    # field, and the least value with which the body is seen
     valid: tuple[tuple[str, float], ...] = ()
     attitude: str = ""  # message of its attitude, of the same vehicle
     rates: str = ""  # likewise of its rates
@@ -125,7 +125,7 @@ class LogBody(Bounded):
 
 @contextmanager
 def _as_source() -> Iterator[None]:
-    """Raise what a log's reader says as `SourceError`."""
+    """Raise a reader's `LogError` as `SourceError`."""
     try:
         yield
     except LogError as error:
@@ -143,39 +143,37 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
         raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
     poses = [pose for body in BODIES for pose in _of_channels(logs[0], body)]
     if not poses:
-        known = ", ".join(names[0] for names in CHANNELS.values())
+        positions = ", ".join(names[0] for names in CHANNELS.values())
         raise LogError(
-            f"{path}: no row with a position of a body; expected one of the channels {known}; it"
-            f" has {', '.join(logs[0].channels)}"
+            f"{path}: no row with a position of a body; expected one of the channels {positions};"
+            f" it has {', '.join(logs[0].channels)}"
         )
     return poses
 
 
 def _of_channels(log: FlightLog, body: str) -> list[Pose]:
     """Return poses of one body; of a sample that is not valid the numbers are NaN."""
-    place = CHANNELS[body][0]
-    if place not in log or not len(log[place].time):
+    position = CHANNELS[body][0]
+    if position not in log or not len(log[position].time):
         return []
-    times, rows = log[place].time, []
+    times, parts = log[position].time, []
     for name in CHANNELS[body]:
-        found: list[tuple | None] = [None] * len(times)
+        column: list[tuple | None] = [None] * len(times)
         if name in log:
-            values = np.where(
-                log[name].valid[:, None], log[name].values.astype(float), np.nan
-            ).tolist()
-            found = [tuple(values[i]) if i >= 0 else None for i in _before(log[name].time, times)]
-        rows.append(found)
+            values = log[name].values.astype(float)
+            values[~log[name].valid] = np.nan
+            rows = list(map(tuple, values.tolist()))
+            column = [rows[i] if i >= 0 else None for i in _latest(log[name].time, times)]
+        parts.append(column)
     start = min(float(channel.time[0]) for channel in log.channels.values() if len(channel.time))
     return [
-        Pose(t, t - start, body, *parts, valid=valid)
-        for t, valid, *parts in zip(times.tolist(), log[place].valid.tolist(), *rows)
+        Pose(time, time - start, body, *numbers, valid=valid)
+        for time, valid, *numbers in zip(times.tolist(), log[position].valid.tolist(), *parts)
     ]
 
 
-def _before(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
-    """Return the index of the last time at or before each stamp; -1 where there is none, or an old
-    one.
-    """
+def _latest(times: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    """Return the index of the last time at or before each stamp; -1 without a recent one."""
     index = np.searchsorted(times, stamps, side="right") - 1
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= PAIR_AGE), index, -1)
 
@@ -206,42 +204,43 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
     raises `SourceError` for no such file, a missing package, or a message that carries no pose or
     is not in the log.
     """
-    known, reader = {
-        "bin": (DATAFLASH, messages.read_dataflash),
-        "ulg": (ULOG, messages.read_ulog),
-    }[kind]
+    table, reader = DATAFLASH, messages.read_dataflash
+    if kind == "ulg":
+        table, reader = ULOG, messages.read_ulog
     if not bodies:
         raise SourceError(
-            f"source.logs is empty; expected a body and one of the messages {', '.join(known)}"
+            f"source.logs is empty; expected a body and one of the messages {', '.join(table)}"
         )
     poses: list[Pose] = []
     for body in bodies:
-        if body.message not in known:
+        if body.message not in table:
             raise SourceError(
                 f"message '{body.message}' of the {body.body} carries no pose;"
-                f" {suggest(body.message, known)}"
+                f" {suggest(body.message, table)}"
             )
-        found = _of_messages(reader(body.file or path, [*known, *_COMPANIONS]), body, known)
-        if not found:
+        file = body.file or path
+        log = reader(file, [*table, *_COMPANIONS])
+        body_poses = _of_messages(log, body, table)
+        if not body_poses:
             raise SourceError(
-                f"{body.file or path}: {body.message} (instance {body.instance}) holds no pose of"
-                f" the {body.body}"
+                f"{file}: {body.message} (instance {body.instance}) holds no pose of the"
+                f" {body.body}"
             )
-        poses += [replace(pose, arrival=pose.arrival + body.time_offset) for pose in found]
+        poses += [replace(pose, arrival=pose.arrival + body.time_offset) for pose in body_poses]
     start = min(pose.arrival for pose in poses)
     return [replace(pose, arrival=pose.arrival - start) for pose in poses]
 
 
-def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) -> list[Pose]:
+def _of_messages(log: Messages, body: LogBody, table: dict[str, PoseMessage]) -> list[Pose]:
     if body.message not in log.names:
-        names = ", ".join(name for name in known if name in log.names) or "none"
+        names = ", ".join(name for name in table if name in log.names) or "none"
         raise LogError(
             f"{log.path}: no {body.message} in this log; of the messages with poses it has: {names}"
         )
     data = log.fields.get((body.message, body.instance))
     if data is None:
         return []
-    kind = known[body.message]
+    kind = table[body.message]
     if body.message == "POS":
         data = data | _from_globe(data, log.first("ORGN"))
     try:
@@ -250,15 +249,16 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
         )
         count, arrivals, stamps = len(pos), data["arrival"], data["time"]
         if kind.attitude:
-            other = log.first(kind.attitude)
-            if other is None:
+            attitude = log.first(kind.attitude)
+            if attitude is None:
                 raise LogError(
                     f"{log.path}: {body.message} gives no attitude, and the log holds no"
                     f" {kind.attitude}"
                 )
-            quat = _paired(other, _COMPANIONS[kind.attitude], "quat", stamps)
-        if kind.rates and (other := log.first(kind.rates)) is not None:
-            rate = _paired(other, _COMPANIONS[kind.rates], "rate", stamps)
+            quat = _paired(attitude, _COMPANIONS[kind.attitude], "quat", stamps)
+        rates = log.first(kind.rates)
+        if rates is not None:
+            rate = _paired(rates, _COMPANIONS[kind.rates], "rate", stamps)
     except KeyError as error:
         listed = ", ".join(sorted(data.keys() - {"time", "arrival"}))
         raise LogError(f"{log.path}: no field {error}; {body.message} has {listed}") from error
@@ -266,35 +266,34 @@ def _of_messages(log: Messages, body: LogBody, known: dict[str, PoseMessage]) ->
     counters = [data[name].astype(int) for name in kind.resets if name in data]
     resets = sum(counters) if counters else np.zeros(count, int)
     valid = np.ones(count, bool)
-    for name, least in kind.valid:
-        valid &= data[name] >= least if name in data else True
+    for name, threshold in kind.valid:
+        if name in data:
+            valid &= data[name] >= threshold
     return [
         Pose(
             float(stamps[i]),
             float(arrivals[i]),
             body.body,
             tuple(pos[i].tolist()),
-            _known(quat, i),
-            _known(vel, i),
-            _known(rate, i),
+            _row(quat, i),
+            _row(vel, i),
+            _row(rate, i),
             int(resets[i]),
             valid=bool(valid[i]),
         )
         for i in range(count)
-        if not kind.attitude or _known(quat, i) is not None
+        if not kind.attitude or _row(quat, i) is not None
     ]
 
 
-def _columns_of(data: Fields, message: PoseMessage, what: str) -> np.ndarray | None:
-    """Return columns of what a message tells, shape (T, 3 or 4); None where it tells
-    nothing of it.
-    """
-    if what == "quat" and message.angles:
+def _columns_of(data: Fields, message: PoseMessage, part: str) -> np.ndarray | None:
+    """Return the columns of a part of a pose, shape (T, 3 or 4); None where there are none."""
+    if part == "quat" and message.angles:
         from scipy.spatial.transform import Rotation
 
         angles = _columns(data, message.angles)
         return Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat()[:, [3, 0, 1, 2]]
-    names = getattr(message, what)
+    names = getattr(message, part)
     return _columns(data, names) if names else None
 
 
@@ -303,12 +302,10 @@ def _columns(data: Fields, choices: tuple[tuple[str, ...], ...]) -> np.ndarray:
     return np.column_stack([data[name] for name in names]).astype(float)
 
 
-def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) -> np.ndarray:
-    """Return another message's last value at or before each stamp, NaN where there is none or an
-    old one.
-    """
-    index = _before(other["time"], stamps)
-    values = _columns_of(other, message, what)[np.maximum(index, 0)]
+def _paired(data: Fields, message: PoseMessage, part: str, stamps: np.ndarray) -> np.ndarray:
+    """Return a message's last value at or before each stamp; NaN without a recent one."""
+    index = _latest(data["time"], stamps)
+    values = _columns_of(data, message, part)[np.maximum(index, 0)]
     values[index < 0] = np.nan
     return values
 
@@ -316,35 +313,34 @@ def _paired(other: Fields, message: PoseMessage, what: str, stamps: np.ndarray) 
 def _in_world(
     vel: np.ndarray | None, quat: np.ndarray | None, frame: np.ndarray | None
 ) -> np.ndarray | None:
-    """Return velocities in the world, those of the body turned; NaN where the attitude is not
-    known.
-    """
+    """Return velocities in the world frame; NaN for a body's without an attitude."""
     if vel is None or frame is None:
         return vel
     from scipy.spatial.transform import Rotation
 
     body_frame = frame == BODY_FRAME
     usable = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
-    turned = np.where((body_frame & ~usable)[:, None], np.nan, vel)
-    turned_rows = body_frame & usable
-    if np.any(turned_rows):
-        turned[turned_rows] = Rotation.from_quat(quat[turned_rows][:, [1, 2, 3, 0]]).apply(
-            vel[turned_rows]
-        )
-    return turned
+    vel_w = np.where((body_frame & ~usable)[:, None], np.nan, vel)
+    rows = body_frame & usable
+    if np.any(rows):
+        vel_w[rows] = Rotation.from_quat(quat[rows][:, [1, 2, 3, 0]]).apply(vel[rows])
+    return vel_w
 
 
-def _known(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
-    """Return a row; None where there is none or it holds NaN, PX4's word for unknown."""
-    return None if values is None or np.isnan(values[i]).any() else tuple(values[i].tolist())
+def _row(values: np.ndarray | None, i: int) -> tuple[float, ...] | None:
+    """Return a row; None without values or with NaN, which PX4 writes for unknown."""
+    if values is None or np.isnan(values[i]).any():
+        return None
+    return tuple(values[i].tolist())
 
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
     """Return north, east and down [m] from the estimator's origin, else from the first position."""
-    index = (
-        np.flatnonzero(origins["Type"] == 0.0) if origins is not None and "Type" in origins else []
-    )
-    lat, lng = (origins[n][index[-1]] if len(index) else data[n][0] for n in ("Lat", "Lng"))
+    lat, lng = data["Lat"][0], data["Lng"][0]
+    if origins is not None and "Type" in origins:
+        index = np.flatnonzero(origins["Type"] == 0.0)
+        if len(index):
+            lat, lng = origins["Lat"][index[-1]], origins["Lng"][index[-1]]
     return {
         "N": np.radians(data["Lat"] - lat) * EARTH_RADIUS,
         "E": np.radians(data["Lng"] - lng) * EARTH_RADIUS * math.cos(math.radians(lat)),

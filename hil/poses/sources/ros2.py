@@ -20,7 +20,7 @@ from typing import Any
 from hil.errors import SourceError
 from hil.links.mavlink_link import Link
 from hil.poses.pose import Pose
-from hil.poses.sources.mocap import MocapParams, MocapSource, RigidBody, body_names
+from hil.poses.sources.motion_capture import MocapParams, MocapSource, RigidBody, body_names
 from visthrow.common.extras import load_extra
 
 KINDS = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry", "tf2_msgs/TFMessage")
@@ -136,8 +136,8 @@ def placed(
 
 def _topic(name: str) -> tuple[str, str, str]:
     """Return type, topic and, of TF, ``PARENT/CHILD`` of a body's name."""
-    kind, _, rest = name.partition(":")
-    place, _, frames = rest.partition(":")
+    kind, _, address = name.partition(":")
+    place, _, frames = address.partition(":")
     if kind not in KINDS or not place.startswith("/") or (kind == KINDS[2]) != ("/" in frames):
         raise SourceError(
             f"body named '{name}'; expected TYPE:TOPIC with a type of {', '.join(KINDS)}, such as"
@@ -159,8 +159,9 @@ class Ros2Source(MocapSource):
         link: Link | None = None,
         tell: Callable[[str], None] | None = None,
     ) -> None:
-        """Subscribe; arguments and errors as `hil.poses.sources.mocap.MotionCaptureSource`, and a
-        name that is no ``TYPE:TOPIC``.
+        """Subscribe; arguments and errors as
+        `hil.poses.sources.motion_capture.MotionCaptureSource`, and a name that is no
+        ``TYPE:TOPIC``.
         """
         super().__init__(clock, link, tell)
         topics = [(*_topic(name), body) for name, body in body_names(bodies).items()]

@@ -154,7 +154,7 @@ def test_fit_is_not_stretched_past_what_the_image_sees():
 
 
 def test_basalt_refusals(tmp_path):
-    with pytest.raises(ValueError, match=r"camera 2 asked for; expected a number below 2,"):
+    with pytest.raises(ValueError, match=r"camera 2 was requested; expected a number below 2,"):
         files.read(DATA / "euroc_ds_calib.json", 2)
     path = tmp_path / "short.json"
     path.write_text((DATA / "euroc_ds_calib.json").read_text()[:900])

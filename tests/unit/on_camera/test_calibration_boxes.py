@@ -367,7 +367,7 @@ def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
     assert read(path)[1].fx == FX
     assert "of 2 in the file (cam0, cam1)" in read(path)[2].remarks[0]
     assert read(path, camera=1)[1].fx == read(path, camera="cam1")[1].fx == 200.0
-    with pytest.raises(ValueError, match=r"camera cam7 asked for.*cam0, cam1"):
+    with pytest.raises(ValueError, match=r"camera cam7 was requested.*cam0, cam1"):
         read(path, camera="cam7")
 
 

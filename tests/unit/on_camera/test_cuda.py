@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from camera.history import push
+from camera.keypoint_noise import StepDraw, apply_noise
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
-from camera.noise import StepDraw, apply_noise
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 ENVIRONMENTS = 4096

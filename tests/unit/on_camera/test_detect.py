@@ -12,9 +12,9 @@ import torch
 from camera.detectors.contours import (
     BallSeen,
     Detector,
+    FrameDetections,
     GoalSeen,
-    Known,
-    Seen,
+    Prior,
     detected_keypoints,
     ordered_corners,
 )
@@ -75,12 +75,12 @@ def cluttered():
     return rendered(CLUTTER, *far)
 
 
-def known() -> Known:
+def known() -> Prior:
     eye = POS[0] + ROT[0] @ CAMERA.position_b
-    return Known((CAMERA.rot_cb @ ROT[0].T)[:, 2].numpy(), float(eye[2]), (0.25, 0.6))
+    return Prior((CAMERA.rot_cb @ ROT[0].T)[:, 2].numpy(), float(eye[2]), (0.25, 0.6))
 
 
-def off(seen: Seen) -> np.ndarray:
+def off(seen: FrameDetections) -> np.ndarray:
     """How far the keypoints are from the true ones [px], shape (8,)."""
     true, valid = keypoints(CAMERA, POS, ROT, GOAL, BALL)
     assert valid.all()
@@ -150,7 +150,7 @@ def test_wrong_pictures():
         DETECTOR.detect(np.zeros((400, 300, 3), np.uint8))
     with pytest.raises(ValueError, match="float64"):
         DETECTOR.detect(np.zeros((400, 400, 3)))
-    assert DETECTOR.detect(np.zeros((400, 400, 3), np.uint8)) == Seen(None, None)
+    assert DETECTOR.detect(np.zeros((400, 400, 3), np.uint8)) == FrameDetections(None, None)
 
 
 def cone(axis, half_angle, n=64):
@@ -203,7 +203,7 @@ def test_exact_rays_give_the_keypoints_of_training():
     ball = to_c @ (BALL[0] - eye).numpy()
     corners = (goal_square(0.25).numpy() + [*GOAL[0].tolist(), 0.0] - eye.numpy()) @ to_c.T
     distance = np.linalg.norm(ball)
-    seen = Seen(
+    seen = FrameDetections(
         BallSeen(ball / distance, math.asin(0.033 / distance), 1.0),
         GoalSeen(
             corners[[3, 0, 1, 2]] / np.linalg.norm(corners[[3, 0, 1, 2]], axis=1, keepdims=True),
@@ -214,7 +214,7 @@ def test_exact_rays_give_the_keypoints_of_training():
     found, valid = detected_keypoints(camera, seen, ROT[0].numpy())
     assert valid.all()
     np.testing.assert_allclose(found.numpy(), true[0].numpy(), atol=2e-6)
-    found, valid = detected_keypoints(camera, Seen(None, None), ROT[0].numpy())
+    found, valid = detected_keypoints(camera, FrameDetections(None, None), ROT[0].numpy())
     assert not valid.any()
     assert not found.any()
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import GATE, BallSeen, GoalSeen, Known, Seen
-from camera.detectors.following import LOST, MEMORY, READ, Following
+from camera.detectors.contours import GATE, BallSeen, FrameDetections, GoalSeen, Prior
+from camera.detectors.following import LOST, MEMORY, READ, BallGoalTracker
 from camera.detectors.learnt import LearntDetector
 from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
@@ -49,18 +49,18 @@ def followed(rots, rays, blind, seed=0):
     """By frame [rad]: angle from the truth of what is read (NaN: not seen) and of what is expected,
     and within which it is looked for.
     """
-    rng, following = np.random.default_rng(seed), Following(RADIUS, SIDE, LENGTH * rays[0])
+    rng, following = np.random.default_rng(seed), BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])
     read, off, within = [], [], []
     for i, (rot, ray) in enumerate(zip(rots, rays)):
         stamp = i * PERIOD
-        known = following.known(rot, rot[:, 2], EYE, (0.2, 0.6), stamp)
+        known = following.prior(rot, rot[:, 2], EYE, (0.2, 0.6), stamp)
         noisy = rot.T @ ray + READ * rng.standard_normal(3)
         ball = (
             None
             if i in blind
             else BallSeen(noisy / np.linalg.norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
         )
-        seen = following.take(Seen(ball, None), rot, stamp)
+        seen = following.take(FrameDetections(ball, None), rot, stamp)
         angle = lambda of: math.acos(min(1.0, float(of @ rot.T @ ray)))  # noqa: E731, B023
         read.append(math.nan if seen.ball is None else angle(seen.ball.ray_c))
         off.append(angle(known.ball_ray_c))
@@ -103,10 +103,10 @@ def test_what_is_lost_for_long_is_not_seen():
 
 def test_without_an_attitude_nothing_is_followed():
     rots, rays = throw(4)
-    following = Following(RADIUS, SIDE, LENGTH * rays[0])
-    following.known(rots[0], rots[0][:, 2], EYE, (0.2, 0.6), 0.0)
-    assert following.take(Seen(None, None), None, 0.0) == Seen(None, None)
-    assert following.known(rots[1], rots[1][:, 2], EYE, (0.2, 0.6), 0.02).ball_ray_c is None
+    following = BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])
+    following.prior(rots[0], rots[0][:, 2], EYE, (0.2, 0.6), 0.0)
+    assert following.take(FrameDetections(None, None), None, 0.0) == FrameDetections(None, None)
+    assert following.prior(rots[1], rots[1][:, 2], EYE, (0.2, 0.6), 0.02).ball_ray_c is None
 
 
 def square(rot, place, score, eye=EYE):
@@ -128,13 +128,13 @@ def goals(frames, eyes=None):
     `PERIOD`; None: missed.
     """
     rots, _ = throw(len(frames))
-    following, told = Following(RADIUS, SIDE), []
+    following, told = BallGoalTracker(RADIUS, SIDE), []
     for i, (rot, frame) in enumerate(zip(rots, frames)):
         eye = EYE if eyes is None else eyes[i]
-        following.known(rot, rot[:, 2], eye, None, i * PERIOD)
+        following.prior(rot, rot[:, 2], eye, None, i * PERIOD)
         squares = tuple(square(rot, *one, eye) for one in sorted(frame, key=lambda one: -one[1]))
         goal = following.take(
-            Seen(None, squares[0] if squares else None, squares), rot, i * PERIOD
+            FrameDetections(None, squares[0] if squares else None, squares), rot, i * PERIOD
         ).goal
         told.append(None if goal is None else goal.score)
     return told
@@ -142,20 +142,20 @@ def goals(frames, eyes=None):
 
 def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed():
     rots, _ = throw(6)
-    following, place = Following(RADIUS, SIDE), np.array([1.3, 0.2])
+    following, place = BallGoalTracker(RADIUS, SIDE), np.array([1.3, 0.2])
     for i, rot in enumerate(rots):
         eye = EYE + [0.1 * i, 0.0, 0.05 * i]
-        known = following.known(rot, rot[:, 2], eye, None, i * PERIOD)
+        known = following.prior(rot, rot[:, 2], eye, None, i * PERIOD)
         if i == 0:
             assert known.goal_ray_c is None
             goal = square(rot, place, 0.9, eye)
-            assert following.take(Seen(None, goal, (goal,)), rot, 0.0).goal is goal
+            assert following.take(FrameDetections(None, goal, (goal,)), rot, 0.0).goal is goal
             continue
         to = rot @ known.goal_ray_c
         assert np.linalg.norm(eye[:2] - to[:2] * eye[2] / to[2] - place) < 0.02, (
             "the vehicle flies, the goal lies"
         )
-        assert following.take(Seen(None, None), rot, i * PERIOD).goal is None
+        assert following.take(FrameDetections(None, None), rot, i * PERIOD).goal is None
 
 
 HERE, THERE = (2.0, 0.0), (0.7, 1.4)
@@ -224,11 +224,11 @@ def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
     seen in a throw on pictures.
     """
     here, there, within = toward(0.0), toward(math.radians(25.0)), math.radians(28.0)
-    assert chosen(learnt, [0.4], [here], Known()) is None
-    ball = chosen(learnt, [0.66, 0.4], [there, here], Known(ball_ray_c=here, ball_within=within))
+    assert chosen(learnt, [0.4], [here], Prior()) is None
+    ball = chosen(learnt, [0.66, 0.4], [there, here], Prior(ball_ray_c=here, ball_within=within))
     np.testing.assert_allclose(ball.ray_c, here)
     assert ball.score == pytest.approx(bayes(learnt, 0.4, 0.0, within), abs=1e-6)
-    assert chosen(learnt, [0.66], [there], Known(ball_ray_c=here, ball_within=within)) is None
+    assert chosen(learnt, [0.66], [there], Prior(ball_ray_c=here, ball_within=within)) is None
     assert bayes(learnt, 0.66, math.radians(25.0), within) < 0.5
 
 
@@ -241,23 +241,23 @@ def test_where_a_goal_is_expected_a_faint_square_counts_with_its_own_probability
         np.array([one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]),
         dtype=torch.float32,
     )
-    known = Known(goal_ray_c=toward(0.8), goal_within=math.radians(10.0))
+    known = Prior(goal_ray_c=toward(0.8), goal_within=math.radians(10.0))
 
     def scores(known, *p):
         return [one.score for one in learnt._squares(torch.tensor(p), things, known)]
 
     assert scores(known, 0.9, 0.6) == pytest.approx([0.9, 0.6])
     assert scores(known, 0.3, 0.2) == pytest.approx([0.2])
-    assert scores(Known(), 0.3, 0.2) == []
+    assert scores(Prior(), 0.3, 0.2) == []
 
 
 def test_a_thing_that_is_seen_elsewhere_is_followed_anew():
     rots, rays = throw(8)
-    following = Following(RADIUS, SIDE, LENGTH * rays[0])
+    following = BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])
     ball = lambda ray: BallSeen(ray, math.asin(RADIUS / LENGTH), 1.0)  # noqa: E731
     for i, rot in enumerate(rots):
-        known = following.known(rot, rot[:, 2], EYE, None, i * PERIOD)
+        known = following.prior(rot, rot[:, 2], EYE, None, i * PERIOD)
         at = toward(0.6) if i >= 4 else rot.T @ rays[0]
-        following.take(Seen(ball(at), None), rot, i * PERIOD)
+        following.take(FrameDetections(ball(at), None), rot, i * PERIOD)
         if i >= 6:
             assert math.acos(min(1.0, known.ball_ray_c @ at)) < known.ball_within

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from camera.history import at_latency, push
-from camera.noise import StepDraw, apply_latency, apply_noise
+from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
 from camera.params import KeypointNoiseParams
 
 SAMPLES = 20_000

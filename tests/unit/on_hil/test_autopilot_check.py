@@ -6,11 +6,11 @@ import pytest
 
 from hil.check import AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
-from hil.control.recording.record import CONFIG, TICKS, Recorder
+from hil.control.recording.record import CONFIG, TICKS, RunRecorder
 from hil.control.runner import Runner
-from hil.control.states import OperatorInput
+from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
-from hil.flight import autopilot_record
+from hil.fly_run import autopilot_record
 from hil.links.backends.base import DryRun
 from hil.links.backends.betaflight import Betaflight
 from hil.links.backends.thrust import LEAST_SHARES
@@ -37,7 +37,7 @@ def run(tmp_path_factory):
     """The folder of a run that hovers for some seconds, and what its summary keeps."""
     folder = tmp_path_factory.mktemp("hover") / "run"
     runner, source, clock, _ = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)
-    recorder = Recorder(folder, runner.params)
+    recorder = RunRecorder(folder, runner.params)
     summary = Loop(runner, source, clock, Nobody(), recorder).fly(4.0)
     summary["autopilot"] = autopilot_record(runner.backend, source._link)
     recorder.close(summary)

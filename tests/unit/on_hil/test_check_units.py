@@ -6,7 +6,7 @@ import pytest
 
 from hil.cli import ACTIONS
 from hil.poses.pose import Pose
-from hil.poses.sources.base import Recorded
+from hil.poses.sources.pose_source import RecordedSource
 from tests.hil_flight import OURS
 from visthrow.cli import main
 
@@ -19,7 +19,7 @@ def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
         for i in range(200)
         for body, z in (("vehicle", 1.333), ("payload", 0.95))
     ]
-    monkeypatch.setattr("hil.check.open_source", lambda *args: (Recorded(poses), None, True))
+    monkeypatch.setattr("hil.check.open_source", lambda *args: (RecordedSource(poses), None, True))
     settings = [word for setting in OURS for word in ("--set", setting)]
     assert main(["hil", "check", "--seconds", "1.9", *settings]) == 1
     out = capsys.readouterr().out
@@ -48,7 +48,7 @@ def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):
         t = 0.01 * i
         for body, z in (("vehicle", 1333.0), ("payload", 900.0)):
             poses.append(Pose(t, t, body, (300.0 * t, 0.0, z), (0.0, 0.0, 0.0, 1.0)))
-    opened = (Recorded(poses), None, True)
+    opened = (RecordedSource(poses), None, True)
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened)
     command = [
         "hil",

@@ -19,7 +19,7 @@ from hil.control.latch import PayloadFlight, separation
 from hil.control.recording import flightlogs, view
 from hil.control.recording.flightlogs import read, throws
 from hil.control.recording.record import load_run
-from hil.control.recording.report import finish
+from hil.control.recording.run_report import finish
 from hil.errors import RunError
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy

@@ -10,9 +10,9 @@ import pytest
 from hil.errors import RunError
 from hil.links.clock import ManualClock
 from hil.poses.frames import FrameParams, Frames
-from hil.poses.handcarry import MOVES, Step, collect, find_steps, judge, summary_text
+from hil.poses.handcarry import MOVES, MeasuredMove, collect, find_steps, judge, summary_text
 from hil.poses.pose import Pose
-from hil.poses.sources.base import Recorded
+from hil.poses.sources.pose_source import RecordedSource
 from visthrow.cli import main
 from visthrow.common.rotations import multiply
 from visthrow.logs.axes import TURNS as AXES
@@ -78,7 +78,7 @@ def steps(track):
 
 def check(steps, true: FrameParams, config: FrameParams):
     source = Frames(true).source_from_pose
-    return judge([Step(source(step.before), source(step.after)) for step in steps], config)
+    return judge([MeasuredMove(source(step.before), source(step.after)) for step in steps], config)
 
 
 @pytest.mark.parametrize("axes", AXES)
@@ -164,12 +164,12 @@ def test_moves_that_were_left_out_are_counted():
 def test_a_live_source_is_told_the_next_move_and_left_when_all_are_made(track):
     told, clock = [], ManualClock()
     later = Pose(99.0, 99.0, "vehicle", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    steps = collect(Recorded([*track, later]), clock, 60.0, told.append)
+    steps = collect(RecordedSource([*track, later]), clock, 60.0, told.append)
     assert judge(steps, OURS).passed
     assert [text.split(":")[0] for text in told] == [f"{i} of 8" for i in range(1, 9)]
     assert clock.time < 20.0
     clock = ManualClock()
-    assert len(collect(Recorded(track), clock, 8.0)) < 8
+    assert len(collect(RecordedSource(track), clock, 8.0)) < 8
     assert clock.time == pytest.approx(8.0, abs=0.3)
 
 

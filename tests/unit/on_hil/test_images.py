@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from camera.detectors.contours import BallSeen, Detector, GoalSeen, Seen
+from camera.detectors.contours import BallSeen, Detector, FrameDetections, GoalSeen
 from camera.detectors.following import GATE, LOST
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
@@ -82,9 +82,9 @@ def pictures():
 class Blind(Detector):
     """A detector of somebody else's: it reports a ball on the axis, whatever it is shown."""
 
-    def detect(self, image, known=None):
+    def detect(self, image, prior=None):
         self.check(image)
-        return Seen(BallSeen(np.array([0.0, 0.0, 1.0]), 0.1, 1.0), None)
+        return FrameDetections(BallSeen(np.array([0.0, 0.0, 1.0]), 0.1, 1.0), None)
 
 
 def test_a_detector_of_ones_own_is_named_by_the_configuration(pictures, monkeypatch):
@@ -104,7 +104,7 @@ class Known(Blind):
         [[0.1, 0.1, 1.0], [0.1, -0.1, 1.0], [-0.1, -0.1, 1.0], [-0.1, 0.1, 1.0]]
     ) / np.sqrt(1.02)
 
-    def detect(self, image, known=None):
+    def detect(self, image, prior=None):
         return dataclasses.replace(super().detect(image), goal=GoalSeen(self.corners, 1.0))
 
 
@@ -189,9 +189,9 @@ def told(looker, picture, stamp, hint, blind=False):
     """A detection, and what the detector was told for it; a blind one sees nothing."""
     kept, detect = [], looker.detector.detect
 
-    def listen(image, known):
-        kept.append(known)
-        return Seen(None, None) if blind else detect(image, known)
+    def listen(image, prior):
+        kept.append(prior)
+        return FrameDetections(None, None) if blind else detect(image, prior)
 
     looker.detector.detect = listen
     looker.hint = hint
@@ -208,26 +208,26 @@ def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
     looker = Eyes(params(folder), training())
     assert told(looker, pictures[0], 0.0, None)[1].ball_ray_c is None
     hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
-    detection, known = told(looker, pictures[0], 0.0, hint)
-    assert known.ball_ray_c is None
+    detection, prior = told(looker, pictures[0], 0.0, hint)
+    assert prior.ball_ray_c is None
     assert detection.ball is not None
     for k in range(1, 5):
         told(looker, pictures[0], 0.02 * k, hint)
     turned = torch.tensor([[0.0, 0.4, 0.0]], dtype=torch.float64)
-    missed, known = told(
+    missed, prior = told(
         looker, pictures[0], 0.1, Hint(tuple(pos.tolist()), quaternion(turned), None), blind=True
     )
     camera = KeypointCamera(training(), dtype=torch.float64)
     rot = rotation_from_vector(turned)[0]
     eye = torch.tensor(pos) + rot @ camera.position_b
     there = (camera.rot_cb @ rot.T @ (torch.tensor(ball) - eye)).numpy()
-    cosine = there @ known.ball_ray_c / np.linalg.norm(there)
-    assert math.acos(cosine) < known.ball_within, "but for the lens's own way of 1 cm"
-    np.testing.assert_allclose(known.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
-    assert known.height == pytest.approx(float(eye[2]), abs=1e-6)
+    cosine = there @ prior.ball_ray_c / np.linalg.norm(there)
+    assert math.acos(cosine) < prior.ball_within, "but for the lens's own way of 1 cm"
+    np.testing.assert_allclose(prior.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
+    assert prior.height == pytest.approx(float(eye[2]), abs=1e-6)
     np.testing.assert_allclose(
         missed.ball[:3],
-        known.ball_ray_c,
+        prior.ball_ray_c,
         atol=1e-9,
         err_msg="missed, it reads where it is expected",
     )
@@ -243,13 +243,13 @@ def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_w
         first, _ = told(looker, pictures[0], 0.02 * k, hint)
     before = 0.0
     for stamp in (0.1, 0.12, 0.14, 0.4):
-        detection, known = told(looker, pictures[0], stamp, hint, blind=True)
-        assert known.ball_within > before
-        before = known.ball_within
+        detection, prior = told(looker, pictures[0], stamp, hint, blind=True)
+        assert prior.ball_within > before
+        before = prior.ball_within
         assert detection.corners is None, "a goal that is missed is not held"
-        assert (detection.ball is not None) == (known.ball_within < GATE * LOST) == (stamp < 0.2)
+        assert (detection.ball is not None) == (prior.ball_within < GATE * LOST) == (stamp < 0.2)
         if detection.ball is not None:
-            np.testing.assert_allclose(detection.ball[:3], known.ball_ray_c, atol=1e-9)
+            np.testing.assert_allclose(detection.ball[:3], prior.ball_ray_c, atol=1e-9)
             np.testing.assert_allclose(detection.ball, first.ball, atol=0.03)
     assert told(looker, pictures[0], 0.42, hint)[0].ball == pytest.approx(first.ball), (
         "and it is found again"

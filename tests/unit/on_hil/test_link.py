@@ -20,7 +20,7 @@ from hil.links.pymav import Parser, mav
 from hil.links.roster import Roster
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
-from hil.poses.sources.opening import open_source
+from hil.poses.sources.open_source import open_source
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from visthrow import config
 

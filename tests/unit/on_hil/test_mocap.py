@@ -15,8 +15,13 @@ import pytest
 from bench.processes import free_port
 from hil.errors import LinkError, SourceError
 from hil.params import HilParams
-from hil.poses.sources.mocap import MocapParams, MotionCaptureSource, NatNetSource, RigidBody
-from hil.poses.sources.opening import open_mocap
+from hil.poses.sources.motion_capture import (
+    MocapParams,
+    MotionCaptureSource,
+    NatNetSource,
+    RigidBody,
+)
+from hil.poses.sources.open_source import open_mocap
 from visthrow import config
 from visthrow.common.errors import ConfigError
 
@@ -126,7 +131,7 @@ def package(tmp_path, monkeypatch):
 
 def test_a_package_that_crashes_is_started_again_on_the_ground_alone(package, monkeypatch):
     package(CRASHES)
-    monkeypatch.setattr("hil.poses.sources.mocap.AGAIN", 0.05)
+    monkeypatch.setattr("hil.poses.sources.motion_capture.RESTART_DELAY", 0.05)
     said = []
     patient = dataclasses.replace(PARAMS, timeout=30.0)
     source = MotionCaptureSource(patient, BODIES, time.monotonic, tell=said.append)

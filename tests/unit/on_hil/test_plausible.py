@@ -12,7 +12,7 @@ from hil.errors import SourceError
 from hil.links.clock import MonotonicClock
 from hil.params import HilParams
 from hil.poses.pose import Pose
-from hil.poses.sources.opening import open_source, read_poses, unit_problems
+from hil.poses.sources.open_source import open_source, read_poses, unit_problems
 from visthrow import config
 from visthrow.cli import main
 from visthrow.common import toml_text

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.processes import free_port
-from hil.control.recording.record import Recorder, lines, load_run
+from hil.control.recording.record import RunRecorder, lines, load_run
 from hil.control.runner import OperatorInput, Runner
 from hil.errors import RunError
 from hil.links.backends.base import Status
@@ -22,7 +22,7 @@ def recorded(folder, policy="state", seconds=8.0, spoil=lambda time, poses: pose
     """A run of a shipped policy on the simple vehicle, recorded tick by tick."""
     wanted = params(f"policy={policy}", "observe=true")
     runner = Runner(wanted, Policy.load(find_policy(policy)), Spy())
-    recorder = Recorder(folder, wanted)
+    recorder = RunRecorder(folder, wanted)
     inputs = []
 
     def keep(time, poses, status, words, recording=True):
@@ -162,7 +162,7 @@ def test_the_folder_holds_config_policy_and_hash(run_folder):
     assert {pose.body for group in poses.values() for pose in group} == {"vehicle", "payload"}
     assert len(ticks) > 200
     with pytest.raises(StorageError, match="holds a run already"):
-        Recorder(run_folder, wanted)
+        RunRecorder(run_folder, wanted)
 
 
 def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
@@ -176,7 +176,7 @@ def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
         def close(self):
             pass
 
-    recorder = Recorder(tmp_path / "a", params())
+    recorder = RunRecorder(tmp_path / "a", params())
     for writer in recorder._writers.values():
         writer._file.close()
         writer._file = Full()

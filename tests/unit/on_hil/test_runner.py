@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hil.control.runner import OperatorInput, Runner
-from hil.control.states import Inputs, Machine
+from hil.control.state_machine import Inputs, Machine
 from hil.control.tick.commander import WARM_CALLS, Commander
 from hil.errors import RunError
 from hil.links.backends.base import Status

@@ -16,9 +16,9 @@ from hil.links.roster import Party, Roster
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.poses.pose import Pose
-from hil.poses.sources.base import Recorded
 from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.poses.sources.player import read_table, read_tlog
+from hil.poses.sources.pose_source import RecordedSource
 from tests.loopback.wire import pipe
 from visthrow import config
 from visthrow.common.errors import ConfigError
@@ -125,7 +125,7 @@ def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
         "no ATTITUDE_QUATERNION or ATTITUDE within 50 ms of it": 1,
     }
     with pytest.raises(SourceError, match=r"1 ODOMETRY of system 1.*frame LOCAL_FLU is not taken"):
-        Recorded([], roster)
+        RecordedSource([], roster)
 
 
 def test_senders_that_clash_are_refused():
@@ -297,7 +297,7 @@ def test_wrong_mappings(settings, message):
 
 
 def test_recorded_poses_come_when_their_time_has_come():
-    source = Recorded(Pose(0.0, t, "vehicle", (t, 0.0, 0.0)) for t in (0.3, 0.1, 0.2))
+    source = RecordedSource(Pose(0.0, t, "vehicle", (t, 0.0, 0.0)) for t in (0.3, 0.1, 0.2))
     assert source.start == 0.1
     assert [pose.arrival for pose in source.poll(0.25)] == [0.1, 0.2]
     assert not source.ended
@@ -305,4 +305,4 @@ def test_recorded_poses_come_when_their_time_has_come():
     assert len(source.poll(1.0)) == 1
     assert source.ended
     with pytest.raises(SourceError, match="holds no pose"):
-        Recorded([])
+        RecordedSource([])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from hil.control.states import Inputs, Machine, State, StateParams
+from hil.control.state_machine import Inputs, Machine, State, StateParams
 from hil.poses.gate import ABORT, HOLD, OK, WARN
 
 TICK = 0.125  # [s]; a power of two, so that times are exact

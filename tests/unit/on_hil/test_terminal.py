@@ -9,11 +9,11 @@ import time
 
 import pytest
 
-from hil.control.states import OperatorInput, TickRecord
+from hil.control.state_machine import OperatorInput, TickRecord
 from hil.errors import RunError
-from hil.flight import require_fake
+from hil.fly_run import require_fake
+from hil.operator_terminal import ENDING, PAUSING, Console, Terminal
 from hil.params import HilParams
-from hil.terminal import ENDING, PAUSING, Console, Terminal
 from visthrow import config
 
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from hil.control.recording.report import finish
+from hil.control.recording.run_report import finish
 from tests.hil_runs import record_run, saved_policy
 from visthrow.cli import main
 from visthrow.common.errors import LogError

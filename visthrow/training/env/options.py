@@ -12,7 +12,7 @@ from torch import Tensor
 
 from camera import history as hist
 from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints, keypoints
-from camera.noise import StepDraw, apply_latency, apply_noise
+from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
 from camera.params import CameraParams
 from visthrow.onboard import observations as ob
 from visthrow.task import ObservationParams, TaskParams

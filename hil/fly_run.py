@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from hil.control.calibrating import CalibrationSolver
-from hil.control.loop import Lander, Loop
+from hil.control.loop import LandAfterCalibration, Loop
 from hil.control.realtime import keep, prepare
 from hil.control.recording.latency import Stages
-from hil.control.recording.record import Recorder, begun, pack
-from hil.control.recording.report import finish, summary_text
+from hil.control.recording.record import RunRecorder, begun, pack
+from hil.control.recording.run_report import finish, summary_text
 from hil.control.recording.view import start_viewer
 from hil.control.runner import Runner
 from hil.errors import ConfigError, RunError
@@ -22,10 +22,10 @@ from hil.links.clock import ManualClock, MonotonicClock
 from hil.links.crtp import CFLIB
 from hil.links.device import check_device
 from hil.links.pymav import read_key
+from hil.operator_terminal import Console, Terminal
 from hil.params import HilParams
 from hil.poses.sources.images import open_images
-from hil.poses.sources.opening import open_source
-from hil.terminal import Console, Terminal
+from hil.poses.sources.open_source import open_source
 from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 
@@ -100,7 +100,7 @@ def fly(args: argparse.Namespace) -> int:
             if params.keypoints == "detector"
             else None
         )
-        recorder = Recorder(folder, params)
+        recorder = RunRecorder(folder, params)
     for text in refused or keep(
         params.realtime
     ):  # the recorder's thread holds what the flying one waits for; others do not
@@ -119,7 +119,7 @@ def fly(args: argparse.Namespace) -> int:
         if runner.calibrating is None
         else CalibrationSolver(params.camera, policy.contract, params.calibration.spreads)
     )
-    operator = Lander(operator, runner.calibrating) if calibrates else operator
+    operator = LandAfterCalibration(operator, runner.calibrating) if calibrates else operator
     loop = Loop(runner, source, clock, operator, recorder, console.decision, stages, eyes, solver)
     summary = loop.fly(args.seconds or float("inf"))
     summary["speed"] = args.speed

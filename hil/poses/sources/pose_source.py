@@ -67,7 +67,7 @@ class Source:
             link.close()
 
 
-class Recorded(Source):
+class RecordedSource(Source):
     """Recorded poses, each handed on when the runner's clock has reached its arrival."""
 
     def __init__(self, poses: Iterable[Pose], roster: Roster | None = None) -> None:
@@ -81,7 +81,9 @@ class Recorded(Source):
         self.poses = sorted(poses, key=lambda pose: pose.arrival)
         if not self.poses:
             why = (
-                "; ".join(f"{n} {seen.text()}" for seen, n in roster.seen.items()) if roster else ""
+                "; ".join(f"{n} {entry.text()}" for entry, n in roster.seen.items())
+                if roster
+                else ""
             )
             raise SourceError(
                 "the recording holds no pose of a body that the config names"

@@ -16,10 +16,9 @@ from hil.links.roster import Party, Roster
 from hil.links.writer import POSES_TLOG, TLOG, TlogWriter
 from hil.params import LIVE, HilParams
 from hil.poses.frames import FrameParams, Frames
-from hil.poses.pose import Pose, known
-from hil.poses.sources.base import Recorded
+from hil.poses.pose import Pose, has_attitude
 from hil.poses.sources.mavlink import COMPANIONS, MavlinkSource
-from hil.poses.sources.mocap import (
+from hil.poses.sources.motion_capture import (
     MocapParams,
     MocapSource,
     MotionCaptureSource,
@@ -27,6 +26,7 @@ from hil.poses.sources.mocap import (
     RigidBody,
 )
 from hil.poses.sources.player import CHANNELS, read_autopilot, read_table, read_tlog
+from hil.poses.sources.pose_source import RecordedSource
 from hil.poses.sources.ros2 import Ros2Source
 from visthrow.logs.check import physics
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -87,7 +87,7 @@ def open_source(
             raise SourceError(
                 f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)"
             )
-        return Recorded(poses, roster), None, True
+        return RecordedSource(poses, roster), None, True
     has_port = source.kind == "mavlink" and source.device is not None
 
     def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
@@ -144,7 +144,7 @@ def open_mocap(
 SENDER = (  # of a port that is taken
     "and that port in what sends the poses (visthrow hil fake --device udpout:127.0.0.1:PORT)"
 )
-LEAST = 50  # poses below which nothing is said
+FEWEST_POSES = 50  # poses below which nothing is said
 _KINDS = {
     "pos": ("m", "world"),
     "quat": ("1", "world"),
@@ -184,12 +184,12 @@ def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict
         if len(times)
         else np.zeros(0, bool)
     )
-    if np.sum(rest_of_path) < LEAST:
+    if np.sum(rest_of_path) < FEWEST_POSES:
         return {}
     channels = {}
     for name, (kind, (unit, frame)) in zip(names, _KINDS.items()):
         values = [getattr(p, kind) for p, good in zip(ours, rest_of_path) if good]
         unknown = any(value is None or not np.all(np.isfinite(value)) for value in values)
-        if not unknown and (kind != "quat" or all(map(known, values))):
+        if not unknown and (kind != "quat" or all(map(has_attitude, values))):
             channels[name] = Channel(times[rest_of_path], np.array(values), unit, frame)
     return channels

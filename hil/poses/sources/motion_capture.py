@@ -28,16 +28,16 @@ from hil.links.mavlink_link import Link
 from hil.links.roster import Roster
 from hil.poses.pose import BODIES, Body, Pose
 from hil.poses.sources import capture
-from hil.poses.sources.base import Source
 from hil.poses.sources.capture import PAUSE, listen
+from hil.poses.sources.pose_source import Source
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.extras import load_extra
 
 MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
 HEADER = struct.Struct("<HH")  # of NatNet's datagrams: message and length of what follows
-SERVER_INFO, FRAME, OTHERS = 1, 7, (1, 3, 5, 8, 100)  # messages; those that are passed over
-AGAIN = 1.0  # after which a capture that has ended is started again, on the ground [s]
+SERVER_INFO, FRAME, IGNORED = 1, 7, (1, 3, 5, 8, 100)  # messages; those that are passed over
+RESTART_DELAY = 1.0  # after which a capture that has ended is started again, on the ground [s]
 QUIET = 5.0  # without a frame, after which it is started again on the ground: it may hang [s]
 ENDING = 2.0  # that threads and processes are given to end [s]
 
@@ -172,7 +172,7 @@ class MotionCaptureSource(MocapSource):
             if first or stopping:
                 return
             self._say(f"motion capture stopped: {self.failure}; it is started again on the ground")
-            self._stop.wait(AGAIN)
+            self._stop.wait(RESTART_DELAY)
             while self.roster.flying and not self._stop.wait(0.1):
                 pass
 
@@ -219,10 +219,10 @@ class MotionCaptureSource(MocapSource):
                 self._take(json.loads(line))
             status = process.wait()
             words.seek(0)
-            said = words.read().strip().splitlines()
+            lines = words.read().strip().splitlines()
         if self._heard == math.inf:
             raise SourceError(f"no frame for {QUIET:g} s")
-        raise SourceError(said[-1] if said and status > 0 else f"its process ended with {status}")
+        raise SourceError(lines[-1] if lines and status > 0 else f"its process ended with {status}")
 
     def _take(self, value: Any) -> None:
         """Take what `hil.poses.sources.capture.listen` puts."""
@@ -324,10 +324,10 @@ class NatNetSource(MocapSource):
             self.roster.drop(sender, "datagram", f"source.mocap.host is {self._params.host}")
             return
         kind, size = HEADER.unpack_from(data) if len(data) >= HEADER.size else (None, 0)
-        wanted = FRAME if self._client.server_info is not None else SERVER_INFO
-        if kind != wanted and kind in OTHERS and len(data) >= HEADER.size + size:
+        expected_kind = FRAME if self._client.server_info is not None else SERVER_INFO
+        if kind != expected_kind and kind in IGNORED and len(data) >= HEADER.size + size:
             return
-        if kind != wanted or len(data) < HEADER.size + size:
+        if kind != expected_kind or len(data) < HEADER.size + size:
             self.roster.drop(sender, "datagram", "no NatNet message, or cut short")
             return
         if kind == FRAME and not self.roster.claim("Motive", sender, self._clock()):
@@ -341,12 +341,16 @@ class NatNetSource(MocapSource):
 
     def _frame(self, frame: Any) -> None:
         arrival = self._clock()
-        for found in frame.rigid_bodies:
-            body = self._names.get(found.id_num)
+        for rigid_body in frame.rigid_bodies:
+            body = self._names.get(rigid_body.id_num)
             if body is not None:
-                stamp, pos, rot = float(frame.suffix.timestamp), tuple(found.pos), tuple(found.rot)
+                stamp, pos, rot = (
+                    float(frame.suffix.timestamp),
+                    tuple(rigid_body.pos),
+                    tuple(rigid_body.rot),
+                )
                 # None before NatNet 2.6, which does not say. Motive sends the last position on.
-                valid = found.tracking_valid is not False
+                valid = rigid_body.tracking_valid is not False
                 self.hand_over(Pose(stamp, arrival, body, pos, rot, valid=valid))
 
     def close(self) -> None:
@@ -358,13 +362,13 @@ class NatNetSource(MocapSource):
 def bounded_buffer(module: Any) -> Any:
     """Return the package's buffer, which believes no count that is larger than the datagram."""
 
-    class Bounded(module.packet_buffer.PacketBuffer):
+    class BoundedBuffer(module.packet_buffer.PacketBuffer):
         def read_float32_array(self, count: int) -> tuple[float, ...]:
             if 4 * count > len(self.data) - self.pointer:
                 raise ValueError(f"{count} numbers in {len(self.data)} bytes")
             return super().read_float32_array(count)
 
-    return Bounded
+    return BoundedBuffer
 
 
 def body_names(bodies: tuple[RigidBody, ...]) -> dict[str, str]:

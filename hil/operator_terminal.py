@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from hil.control.states import OperatorInput, TickRecord
+from hil.control.state_machine import OperatorInput, TickRecord
 from visthrow.onboard.calibration import Calibration
 
 ENDING = tuple(

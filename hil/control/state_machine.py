@@ -225,7 +225,9 @@ class Machine:
         if not inputs.missing():
             self._go(time, State.CHECK, "poses and autopilot are there")
         elif self._late(time) and not self.patient:
-            self._go(time, State.ABORT, f"{', '.join(inputs.missing())}, for {self.params.idle:g} s")
+            self._go(
+                time, State.ABORT, f"{', '.join(inputs.missing())}, for {self.params.idle:g} s"
+            )
 
     def _check(self, time: float, inputs: Inputs) -> None:
         good = not (inputs.missing() or inputs.failed_checks or inputs.streams)
