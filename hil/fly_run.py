@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.control.calibrating import CalibrationSolver
-from hil.control.loop import LandAfterCalibration, Loop
+from hil.control.loop import LandAfterCalibration, Loop, Operator
 from hil.control.realtime import keep, prepare
 from hil.control.recording.latency import Stages
 from hil.control.recording.record import RunRecorder, begun, pack
@@ -18,9 +18,10 @@ from hil.control.recording.view import start_viewer
 from hil.control.runner import Runner
 from hil.errors import ConfigError, RunError
 from hil.links.backends import make_backend, mechanism_lag, require_reach
-from hil.links.clock import ManualClock, MonotonicClock
+from hil.links.clock import Clock, ManualClock, MonotonicClock
 from hil.links.crtp import CFLIB
 from hil.links.device import check_device
+from hil.links.mavlink_link import Link
 from hil.links.pymav import read_key
 from hil.operator_terminal import Console, Terminal
 from hil.params import HilParams
@@ -45,15 +46,9 @@ def require_fake(params: HilParams) -> None:
     loopback address, or no MAVLink poses.
     """
     devices = [params.link.device, params.source.device or params.link.device]
-    devices += (
-        [getattr(params, params.backend).device]
-        if params.backend in ("betaflight", "crazyflie")
-        else []
-    )
-    loopback = lambda text: check_device(text, remote=True).host.startswith(("127.", "::1"))  # noqa: E731
-    remote = [
-        text for text in devices if text.startswith(("serial:", *CFLIB)) or not loopback(text)
-    ]
+    if params.backend in ("betaflight", "crazyflie"):
+        devices.append(getattr(params, params.backend).device)
+    remote = [device for device in devices if not _is_loopback(device)]
     if params.source.kind == "mocap":
         remote.append(f"source.kind {params.source.kind}")
     if remote:
@@ -63,92 +58,109 @@ def require_fake(params: HilParams) -> None:
         )
 
 
+def _is_loopback(device: str) -> bool:
+    if device.startswith(("serial:", *CFLIB)):
+        return False
+    return check_device(device, remote=True).host.startswith(("127.", "::1"))
+
+
 def fly(args: argparse.Namespace) -> int:
-    """Fly, or run dry, and write the run's folder; 1 for a run that was aborted or in which
+    """Fly, or run dry, and write the run's folder; return 1 for a run that was aborted or in which
     something raised, else 0.
     """
-    started, recording = time.monotonic(), args.action == "record"
+    start, params = time.monotonic(), run_params(args)
+    folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
+    console = Console()
+    with begun(folder):
+        loop, link = _prepare(args, params, folder, console)
+    delay = time.monotonic() - start
+    print(f"ready after {delay:.2f} s; waiting for poses", file=sys.stderr, flush=True)
+    viewer = start_viewer(folder) if args.view else None
+    if loop.runner.calibrating is not None:
+        policy, spreads = loop.runner.pilot.policy, params.calibration.spreads
+        loop.solver = CalibrationSolver(params.camera, policy.contract, spreads)
+    summary = loop.fly(args.seconds or float("inf"))
+    backend, source = loop.runner.backend, loop.source
+    rosters = [*source.rosters, *filter(None, [getattr(backend, "roster", None)])]
+    summary |= {
+        "speed": args.speed,
+        "autopilot": autopilot_record(backend, link),
+        "links": [roster.summary() for roster in rosters],
+    }
+    for part in (loop.eyes, loop.solver, backend, source):
+        if part is not None:
+            part.close()
+    loop.recorder.close(summary)
+    if viewer is not None:
+        viewer.terminate()
+    console.close()
+    _print(summary_text(summary, folder))
+    if not args.bare:
+        _print("\n".join(finish(folder, loop.stages, args.speed)))
+    return _exit_status(summary, folder)
+
+
+def run_params(args: argparse.Namespace) -> HilParams:
+    """Return the configuration of an action; raises `ConfigError`, `RunError` where they do not fit
+    together.
+    """
     params = params_of(args)
-    if recording:
-        params = dataclasses.replace(params, backend="dry-run", observe=True)
-    calibrates = args.action == "calibrate"
-    if calibrates and params.calibration is None:
+    if args.action == "record":
+        return dataclasses.replace(params, backend="dry-run", observe=True)
+    if args.action == "calibrate" and params.calibration is None:
         raise ConfigError(
             f"config '{args.config}' has no table [calibration]; expected one, as of"
             " configs/hil/detector.toml"
         )
-    auto_arm = args.action == "run" and args.auto_arm
-    if auto_arm:
+    if args.action == "run" and args.auto_arm:
         require_fake(params)
-    folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
-    policy, console = Policy.load(find_policy(params.policy)), Console()
-    with begun(folder):
-        source, link, recorded = open_source(
-            params, folder, MonotonicClock(args.speed), key_of(args), console.say
-        )
-        clock = ManualClock(source.start) if recorded else MonotonicClock(args.speed)
-        require_reach(params, policy.contract)
-        backend = make_backend(
-            params, link, args.action == "run" and args.write_parameters, console.say, folder
-        )
-        runner = Runner(params, policy, backend, mechanism_lag(params))
-        runner.estimator.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
-        refused = prepare(params.realtime)
-        runner.commander.warm_up()
-        eyes = (
-            open_images(params.images, params.camera, clock.now)
-            if params.keypoints == "detector"
-            else None
-        )
-        recorder = RunRecorder(folder, params)
-    for text in refused or keep(
-        params.realtime
-    ):  # the recorder's thread holds what the flying one waits for; others do not
+    return params
+
+
+def _prepare(
+    args: argparse.Namespace, params: HilParams, folder: Path, console: Console
+) -> tuple[Loop, Link | None]:
+    """Return the loop of a run, and the autopilot's link where there is one."""
+    flies = args.action == "run"
+    policy = Policy.load(find_policy(params.policy))
+    clock: Clock = MonotonicClock(args.speed)
+    source, link, recorded = open_source(params, folder, clock, key_of(args), console.say)
+    if recorded:
+        clock = ManualClock(source.start)
+    require_reach(params, policy.contract)
+    write = flies and args.write_parameters
+    backend = make_backend(params, link, write, console.say, folder)
+    runner = Runner(params, policy, backend, mechanism_lag(params))
+    runner.estimator.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
+    refused = prepare(params.realtime)
+    runner.commander.warm_up()
+    eyes = None
+    if params.keypoints == "detector":
+        eyes = open_images(params.images, params.camera, clock.now)
+    recorder = RunRecorder(folder, params)
+    # The recorder's thread has inherited the priority, as the flying one waits for it.
+    for text in refused or keep(params.realtime):
         console.say(f"note: {text}")
-    operator = Terminal(
-        auto_arm, lambda: any(one.roster.simulated for one in source.links), console.say
-    )
-    print(
-        f"ready after {time.monotonic() - started:.2f} s; waiting for poses",
-        file=sys.stderr,
-        flush=True,
-    )
-    viewer, stages = start_viewer(folder) if args.view else None, Stages()
-    solver = (
-        None
-        if runner.calibrating is None
-        else CalibrationSolver(params.camera, policy.contract, params.calibration.spreads)
-    )
-    operator = LandAfterCalibration(operator, runner.calibrating) if calibrates else operator
-    loop = Loop(runner, source, clock, operator, recorder, console.decision, stages, eyes, solver)
-    summary = loop.fly(args.seconds or float("inf"))
-    summary["speed"] = args.speed
-    summary["autopilot"] = autopilot_record(backend, link)
-    rosters = [*source.rosters, *filter(None, [getattr(backend, "roster", None)])]
-    summary["links"] = [roster.summary() for roster in rosters]
-    for part in (eyes, solver, backend, source):
-        if part is not None:
-            part.close()
-    recorder.close(summary)
-    if viewer is not None:
-        viewer.terminate()
-    console.close()
-    _show(summary_text(summary, folder))
-    if not args.bare:
-        _show("\n".join(finish(folder, stages, args.speed)))
-    if summary["aborted"] or summary["errors"]:
-        with contextlib.suppress(RunError):
-            _show(
-                f"{pack(folder)}  the run in one file: `visthrow hil replay` says where it went"
-                " wrong"
-            )
-        return 1
-    return 0
+    simulated = lambda: any(link.roster.simulated for link in source.links)  # noqa: E731
+    operator: Operator = Terminal(flies and args.auto_arm, simulated, console.say)
+    if args.action == "calibrate":
+        operator = LandAfterCalibration(operator, runner.calibrating)
+    return Loop(runner, source, clock, operator, recorder, console.decision, Stages(), eyes), link
+
+
+def _exit_status(summary: dict[str, Any], folder: Path) -> int:
+    """Return 1 for a failed run, after it was packed, else 0."""
+    if not (summary["aborted"] or summary["errors"]):
+        return 0
+    with contextlib.suppress(RunError):
+        path = pack(folder)
+        _print(f"{path}  the run in one file: `visthrow hil replay` says where it went wrong")
+    return 1
 
 
 def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
-    """Return what a run's summary keeps of its autopilot: parameters, the last release, texts,
-    clocks of the link's peers.
+    """Return the summary of a run's autopilot: parameters, the last release, texts, and the clocks
+    of the link's peers.
     """
     out: dict[str, Any] = {"backend": backend.name}
     if hasattr(backend, "audit"):
@@ -165,7 +177,7 @@ def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
     return out
 
 
-def _show(text: str) -> None:
-    """Print where somebody still reads: the terminal may have gone with the run."""
+def _print(text: str) -> None:
+    """Print, unless the terminal is gone."""
     with contextlib.suppress(OSError):
         print(text, flush=True)

@@ -31,14 +31,11 @@ from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
-# for which a command may wait [s]: beyond it the policy was trained for another link altogether
+# longest wait of a command [s]: a policy for a longer one was trained for another link
 MOST_HOLD = 0.05
 LIVE = ("mavlink", "mocap")  # kinds of source that are no recording
-ORDERS = {
-    "bin": "wxyz",
-    "ulg": "wxyz",
-    "mocap": "xyzw",
-}  # order of quaternions of the sources that know only one
+# order of quaternions of the sources that know only one
+ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}
 
 
 @dataclass(frozen=True)
@@ -49,9 +46,8 @@ class LinkParams(Bounded):
     remote: bool  # whether the device may leave this machine
     system: MavlinkId  # our own
     component: MavlinkId  # likewise
-    allow: tuple[
-        str, ...
-    ] = ()  # senders of datagrams that are heard, ADDRESS or ADDRESS:PORT; none: any
+    # accepted senders of datagrams, ADDRESS or ADDRESS:PORT; none: any
+    allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,20 +61,15 @@ class SourceParams:
     kind: Literal["mavlink", "tlog", "csv", "bin", "ulg", "mocap"]
     file: str | None  # of a recording: tlog, csv, bin or ulg
     senders: tuple[BodyIds, ...]  # of mavlink and tlog
-    columns: tuple[
-        ChannelMap, ...
-    ] = ()  # of csv: of hil.poses.sources.player.CHANNELS; none where the file names its channels
+    # of csv: of hil.poses.sources.player.CHANNELS; none where the file names its channels
+    columns: tuple[ChannelMap, ...] = ()
     time: TimeColumn | None = None  # of csv: its clock
     logs: tuple[LogBody, ...] = ()  # of bin and ulg
     bodies: tuple[RigidBody, ...] = ()  # of mocap
     mocap: MocapParams | None = None
-    device: str | None = (
-        # of mavlink poses that come on a port of their own, see hil.links.device; none: link.device
-        None
-    )
-    check_units: bool = (
-        True  # refuse recordings whose numbers no vehicle makes: a unit of the mapping is wrong
-    )
+    # of mavlink poses on a separate port, see hil.links.device; none: link.device
+    device: str | None = None
+    check_units: bool = True  # refuse recordings with impossible numbers: a wrong unit
 
     def __post_init__(self) -> None:
         if bool(self.columns) != (self.time is not None):
@@ -94,17 +85,15 @@ class SourceParams:
 class DelayParams(Bounded):
     """Ages of poses, and their compensation."""
 
-    source: Annotated[
-        float, Bound(0.0, 0.5)
-    ]  # of a pose when it arrives [s], where its sender's clock is not known
+    # of a pose when it arrives [s], where its sender's clock is not known
+    source: Annotated[float, Bound(0.0, 0.5)]
     # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
     synchronise: bool
-    compensate: bool  # carry poses forward to the age that the policy was trained with
-    # By which commands and releases act later than in the policy's training; poses are carried as
-    # much further [s].
+    compensate: bool  # predict poses to the age that the policy was trained with
+    # by which commands and releases act later than in training; poses are predicted as much
+    # further [s]
     command: Annotated[float, Bound(0.0, MOST_PREDICTION)] = 0.0
-    # For which each command waits: by so much the vehicle acts sooner than the policy was trained
-    # for [s].
+    # wait of each command: the vehicle acts sooner by this than in training [s]
     hold: Annotated[float, Bound(0.0, MOST_HOLD)] = 0.0
 
     def __post_init__(self) -> None:
@@ -125,8 +114,8 @@ class HilParams(Bounded):
     policy: str  # name of a shipped policy, or a file
     camera: CameraParams
     backend: Literal["dry-run", "ardupilot", "px4", "betaflight", "crazyflie"]
-    # Show the policy every tick, not only those of a throw; what it says then is recorded, never
-    # sent. Such a run waits for poses and checks for ever.
+    # Run the policy in every tick, not only in a throw; its output is then recorded, never sent.
+    # Such a run waits for poses and checks without a time-out.
     observe: bool
     throws: Annotated[int, Bound(1)]  # after which the run lands
     goal_w: tuple[float, float, float]  # target where no body is the goal [m]
@@ -146,48 +135,50 @@ class HilParams(Bounded):
     px4: Px4Params
     betaflight: BetaflightParams
     crazyflie: CrazyflieParams | None = None  # where it is the back-end
-    keypoints: Literal["projection", "detector"] = (
-        "projection"  # of the poses, or of what a camera sees
-    )
+    # projected from the poses, or detected in a camera's pictures
+    keypoints: Literal["projection", "detector"] = "projection"
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
     aim: AimParams | None = None  # which releases are held back; None: none
-    calibration: CalibrationParams | None = (
-        None  # of a camera, in the hover before the first throw; None: none
-    )
+    # of a camera, in the hover before the first throw; None: none
+    calibration: CalibrationParams | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        kind, fence = self.source.kind, self.fence
         if not {VEHICLE, PAYLOAD} <= set(self.frames) <= set(BODIES):
             raise ConfigError(
                 f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it"
                 " moves"
             )
-        home = box_violation(self.home_w, fence.vehicle_low, fence.vehicle_high)
-        goal = (
-            None
-            if GOAL in self.frames
-            else box_violation(self.goal_w, fence.payload_low, fence.payload_high)
-        )
-        for wrong, text in (
+        for wrong, text in (*self._missing_parts(), *self._misplaced()):
+            if wrong:
+                raise ConfigError(text)
+        angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
+        for name, frames in self.frames.items():
+            written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)
+            if written is not None and frames.quaternion != written:
+                raise ConfigError(
+                    f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind"
+                    f" {self.source.kind} writes '{written}'"
+                )
+
+    def _missing_parts(self) -> tuple[tuple[bool, str], ...]:
+        """Return rules on tables and their combinations: whether each is broken, and its error."""
+        kind, detects = self.source.kind, self.keypoints == "detector"
+        return (
             (
-                self.keypoints == "detector" and self.images is None,
-                (
-                    "keypoints of a detector, but no table [images]; expected its kind and path or"
-                    " device"
-                ),
+                detects and self.images is None,
+                "keypoints of a detector, but no table [images]; expected its kind and path or"
+                " device",
             ),
             (
-                self.calibration is not None and self.keypoints != "detector",
+                self.calibration is not None and not detects,
                 'calibration of a camera, but keypoints of poses; expected keypoints = "detector"',
             ),
             (
                 self.backend == "crazyflie" and self.crazyflie is None,
-                (
-                    "backend crazyflie without a table [crazyflie]; expected its device and thrust,"
-                    " as in crazyflie.toml"
-                ),
+                "backend crazyflie without a table [crazyflie]; expected its device and thrust, as"
+                " in crazyflie.toml",
             ),
             (
                 kind not in LIVE and self.source.file is None,
@@ -201,35 +192,25 @@ class HilParams(Bounded):
                 kind == "mocap" and self.source.mocap is None,
                 "source.mocap is missing; expected its system and host",
             ),
+        )
+
+    def _misplaced(self) -> tuple[tuple[bool, str], ...]:
+        """Return rules on places and fences: whether each is broken, and its error."""
+        fence, low, high = self.fence, self.fence.payload_low, self.fence.payload_high
+        goal_moves = GOAL in self.frames
+        return (
             (
-                home is not None,
-                (
-                    f"home_w {self.home_w} m; expected within the vehicle's fence,"
-                    f" {fence.vehicle_low} to {fence.vehicle_high} m"
-                ),
+                box_violation(self.home_w, fence.vehicle_low, fence.vehicle_high) is not None,
+                f"home_w {self.home_w} m; expected within the vehicle's fence,"
+                f" {fence.vehicle_low} to {fence.vehicle_high} m",
             ),
             (
-                not fence.payload_low[2] <= self.landing_height <= fence.payload_high[2],
-                (
-                    f"landing_height {self.landing_height} m; expected within the payload's fence,"
-                    f" {fence.payload_low[2]} to {fence.payload_high[2]} m of height"
-                ),
+                not low[2] <= self.landing_height <= high[2],
+                f"landing_height {self.landing_height} m; expected within the payload's fence,"
+                f" {low[2]} to {high[2]} m of height",
             ),
             (
-                goal is not None,
-                (
-                    f"goal_w {self.goal_w} m; expected within the payload's fence,"
-                    f" {fence.payload_low} to {fence.payload_high} m"
-                ),
+                not goal_moves and box_violation(self.goal_w, low, high) is not None,
+                f"goal_w {self.goal_w} m; expected within the payload's fence, {low} to {high} m",
             ),
-        ):
-            if wrong:
-                raise ConfigError(text)
-        angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
-        for name, frames in self.frames.items():
-            written = "xyzw" if CHANNELS[name][1] in angles else ORDERS.get(self.source.kind)
-            if written is not None and frames.quaternion != written:
-                raise ConfigError(
-                    f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind"
-                    f" {self.source.kind} writes '{written}'"
-                )
+        )

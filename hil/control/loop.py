@@ -40,22 +40,19 @@ class Operator(Protocol):
     """The source of the operator's commands."""
 
     def words(self, state: str) -> OperatorInput:
-        """Return what was said since the last tick; ``state`` is the runner's. Never waits."""
+        """Return the commands since the last tick in a ``state`` of the runner; never waits."""
 
 
 class LandAfterCalibration:
-    """Another operator, who lands too once the camera is calibrated: for a run that is flown for
-    nothing else.
-    """
+    """An operator who lands once the camera is calibrated, and never arms."""
 
     def __init__(self, operator: Operator, calibrating: Calibrating) -> None:
         self._operator, self._calibrating = operator, calibrating
 
     def words(self, state: str) -> OperatorInput:
         words = self._operator.words(state)
-        return replace(
-            words, arm=False, land=words.land or self._calibrating.calibration is not None
-        )
+        calibrated = self._calibrating.calibration is not None
+        return replace(words, arm=False, land=words.land or calibrated)
 
 
 @dataclass

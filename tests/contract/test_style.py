@@ -22,8 +22,6 @@ ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN = {
     "long: visthrow.training.first_order.algorithm.__init__",
-    "long: hil.fly_run.fly",
-    "long: hil.params.__post_init__",
     "long: sim.effects.firmware.controller_of",
     "long: sim.hybrid.__init__",
     "long: sim.kernels.replay.lanes.run",

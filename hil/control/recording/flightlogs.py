@@ -1,10 +1,8 @@
-"""Flight logs of a run, made of its folder: what later tools read of a flight on poses as they read
-a simulated one.
+"""Flight logs of a run, in the form of simulated ones, by playing its folder back.
 
-Times are those of the measurements, on the runner's clock: a source's stamps, moved by what lies
-between them and the arrivals less the transit (known by TIMESYNC, or the delay that the config
-states), as the median over some poses about each. Where the payload let go and came down is found
-in its own poses."""
+Times are those of the measurements, on the runner's clock: a source's stamps, shifted by the median
+difference from the arrivals less the transit (by TIMESYNC, or the config's delay) over neighbouring
+poses. Separation and landing come from the payload's own poses."""
 
 import json
 import math
@@ -26,22 +24,17 @@ from visthrow import config
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
-LEAD, AFTER = (
-    2.0,
-    0.5,
-)  # a throw's log begins this long before it and ends this long after its recovery [s]
-LEAST_STEP = (
-    1e-6  # between two samples of a channel [s]: poses that were taken in together keep their order
-)
+# a throw's log begins this long before it, and ends this long after its recovery [s]
+LEAD_TIME, TRAIL_TIME = 2.0, 0.5
+LEAST_STEP = 1e-6  # between two samples of a channel [s]: simultaneous poses keep their order
 SPUN_UP = math.log(100.0)
-"""After an autopilot begins to follow, rotors that stood turn as the commands ask, to 1 % [lags of
-a motor]; before that commands are no valid ones.
+"""Time in which standing rotors reach the commanded speed to 1 % [time constants of a motor], after
+an autopilot begins to follow; before it commands are not valid.
 """
 
-# poses on either side that a clock's offset is the median of: jitter of the transport goes, drift
-# stays
+# poses on either side of which a clock's offset is the median: jitter goes, drift stays
 HALF_WINDOW = 25
-AFTERWARDS = (State.THROW, State.RECOVER, State.ABORT)  # states that belong to a throw
+THROW_STATES = (State.THROW, State.RECOVER, State.ABORT)
 
 STATES = tuple(state.value for state in State)
 
@@ -53,38 +46,36 @@ class PlayedRun:
     playback: Playback
     ticks: list[Tick]
     provenance: dict[str, Any]
-    throws: list[tuple[int, int]] = field(
-        default_factory=list
-    )  # first tick in throw, last tick of its recovery
+    # first tick of each throw, last tick of its recovery
+    throws: list[tuple[int, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         states = [tick.decision.state for tick in self.ticks]
         for n, state in enumerate(states):
             if state == State.THROW and (n == 0 or states[n - 1] != State.THROW):
-                end = next(
-                    (k for k in range(n, len(states)) if states[k] not in AFTERWARDS),
-                    len(states) - 1,
-                )
+                end = n
+                while end + 1 < len(states) and states[end + 1] in THROW_STATES:
+                    end += 1
                 self.throws.append((n, end))
         by_body: dict[str, list[Sample]] = {}
         for tick in self.ticks:
             for sample in tick.samples:
                 by_body.setdefault(sample.body, []).append(sample)
         for samples in by_body.values():
-            stamps = np.array([sample.pose.stamp for sample in samples])
-            offsets = (
-                np.array([measured(sample, self.playback.params) for sample in samples]) - stamps
-            )
-            around = np.pad(offsets, HALF_WINDOW, mode="edge")
-            offset = np.median(
-                np.lib.stride_tricks.sliding_window_view(around, 2 * HALF_WINDOW + 1), axis=1
-            )
-            for sample, time in zip(samples, stamps + offset):
-                sample.time = float(time)
+            self._date(samples)
+
+    def _date(self, samples: list[Sample]) -> None:
+        """Set the times of a body's samples."""
+        stamps = np.array([sample.pose.stamp for sample in samples])
+        times = np.array([measured(sample, self.playback.params) for sample in samples])
+        padded = np.pad(times - stamps, HALF_WINDOW, mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WINDOW + 1)
+        for sample, time in zip(samples, stamps + np.median(windows, axis=1)):
+            sample.time = float(time)
 
 
 def measured(sample: Sample, params: HilParams) -> float:
-    """Return when a pose was measured by its arrival alone [s]."""
+    """Return the time of a pose's measurement by its arrival alone [s]."""
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
 
@@ -95,19 +86,14 @@ def read(folder: str | Path) -> PlayedRun:
     if not lines:
         raise RunError(f"{folder}: the run ended before its first tick; there is nothing to show")
     playback = Playback(params, policy)
-    provenance = _read_json(folder / PROVENANCE)
-    provenance["simulated"] = any(
-        link.get("simulated") for link in _read_json(folder / SUMMARY).get("links", [])
-    )
-    return PlayedRun(
-        playback, [playback.feed(line, poses.get(line["n"], [])) for line in lines], provenance
-    )
+    provenance, links = _read_json(folder / PROVENANCE), _read_json(folder / SUMMARY).get("links")
+    provenance["simulated"] = any(link.get("simulated") for link in links or [])
+    ticks = [playback.feed(line, poses.get(line["n"], [])) for line in lines]
+    return PlayedRun(playback, ticks, provenance)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Return what a file of a run says; nothing where the run was killed before it was written
-    whole.
-    """
+    """Return a file's content; empty where the run was killed before it was written."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -115,21 +101,22 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 class TickLogger:
-    """Fills a recorder with ticks."""
+    """Adds ticks to a flight log."""
 
     def __init__(self, playback: Playback, meta: dict) -> None:
-        self.params, self.runner = playback.params, playback.runner
+        """Start an empty log with its metadata."""
+        self.params = playback.params
         self.recorder = FlightRecorder(meta)
         self._declare()
-        self._last: dict[str, float] = {}
-        self._vehicle: Pose | None = None  # the last one: where the rope hangs
-        self._follows: float | None = None  # since when the autopilot does
-        contract = self.runner.pilot.policy.contract
-        self.spun_up = SPUN_UP * contract["vehicle"]["motor"]["time_constant"]
+        self._times: dict[str, float] = {}  # of each body's last sample [s]
+        self._vehicle: Pose | None = None  # last pose: where the rope hangs
+        self._follow_time: float | None = None  # when the autopilot began to follow [s]
+        contract = playback.runner.pilot.policy.contract
+        self._spin_up = SPUN_UP * contract["vehicle"]["motor"]["time_constant"]
         self._mount_b = np.array(contract["rope"]["mount"], dtype=float)
 
     def flush(self) -> FlightLog:
-        """Return the log of what was added since the last call."""
+        """Return the log of the ticks since the last call."""
         log, self.recorder = self.recorder.log(), FlightRecorder(self.recorder.meta)
         self._declare()
         return log
@@ -140,70 +127,67 @@ class TickLogger:
         self.recorder.declare("state", "1")
 
     def add(self, tick: Tick) -> None:
-        """Add all that one tick holds."""
-        attached = tick.attached
+        """Add a tick."""
         for sample in tick.samples:
-            self._pose(sample, attached)
-        d, time = tick.decision, tick.line["time"]
+            self._add_pose(sample, tick.attached)
+        record, time = tick.decision, tick.line["time"]
         values: dict[str, Any] = {
-            "mode": int(d.state == State.THROW),
-            "state": STATES.index(d.state),
-            "attached": attached,
-            "release_command": float(d.release),
+            "mode": int(record.state == State.THROW),
+            "state": STATES.index(record.state),
+            "attached": tick.attached,
+            "release_command": float(record.release),
         }
         values |= {f"age_{name}": age for name, age in tick.ages.items() if np.isfinite(age)}
         if tick.goal_w is not None:
             values["goal_w"] = tick.goal_w
         if Status(*tick.line["status"]).mode != FOLLOW:
-            self._follows = None
-        elif self._follows is None:
-            self._follows = time
-        if d.command is not None:
-            acts = self._follows is not None and time - self._follows >= self.spun_up - ROUNDING
-            self.recorder.add(time, acts, command=np.array(d.command, dtype=float))
+            self._follow_time = None
+        elif self._follow_time is None:
+            self._follow_time = time
+        if record.command is not None:
+            begin = math.inf if self._follow_time is None else self._follow_time + self._spin_up
+            command = np.array(record.command, dtype=float)
+            self.recorder.add(time, time >= begin - ROUNDING, command=command)
         for name in ("action", "observation", "keypoints"):
-            if getattr(d, name) is not None:
-                values[name] = np.array(getattr(d, name), dtype=float)
-        if d.valid is not None:
-            values["keypoints_valid"] = np.array(d.valid, dtype=bool)
+            if getattr(record, name) is not None:
+                values[name] = np.array(getattr(record, name), dtype=float)
+        if record.valid is not None:
+            values["keypoints_valid"] = np.array(record.valid, dtype=bool)
         for name, seconds in tick.line["times"].items():
             self.recorder.declare(f"tick_{name}", "s")
             values[f"tick_{name}"] = seconds
         self.recorder.add(time, **values)
 
-    def _pose(self, sample: Sample, attached: bool) -> None:
-        pose = sample.pose
+    def _add_pose(self, sample: Sample, attached: bool) -> None:
+        pose, body, add = sample.pose, sample.body, self.recorder.add
         time = measured(sample, self.params) if sample.time is None else sample.time
-        time = self._last[sample.body] = max(
-            time, self._last.get(sample.body, -np.inf) + LEAST_STEP
-        )
-        if sample.body == PAYLOAD:
-            self.recorder.add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
-            self._note(payload_vel_w=pose.vel)
+        time = max(time, self._times.get(body, -np.inf) + LEAST_STEP)
+        self._times[body] = time
+        if body == PAYLOAD:
+            add(time, payload_pos_w=pose.pos, payload_vel_w=sample.vel_w)
+            self._note_estimated(payload_vel_w=pose.vel)
             vehicle = self._vehicle
             if attached and vehicle is not None and vehicle.quat is not None:
                 mount_w = matrix_of_quat(np.array([vehicle.quat]))[0] @ self._mount_b
-                self.recorder.add(time, cable_points_w=np.stack([vehicle.pos + mount_w, pose.pos]))
-        elif sample.body == VEHICLE:
+                add(time, cable_points_w=np.stack([vehicle.pos + mount_w, pose.pos]))
+        elif body == VEHICLE:
             self._vehicle = pose
-            self.recorder.add(time, pos_w=pose.pos, vel_w=sample.vel_w)
+            add(time, pos_w=pose.pos, vel_w=sample.vel_w)
             if pose.quat is not None:
-                self.recorder.add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
-            self._note(vel_w=pose.vel, rate_b=pose.rate)
+                add(time, quat_wb=pose.quat, rate_b=sample.rate_b)
+            self._note_estimated(vel_w=pose.vel, rate_b=pose.rate)
 
-    def _note(self, **source_values: Any) -> None:
-        """Note in the metadata which channels are the runner's own, of what the source gave of
-        each.
-        """
+    def _note_estimated(self, **source_values: Any) -> None:
+        """Note in the metadata the channels that the source does not measure."""
         estimated = self.recorder.meta.setdefault("estimated", [])
-        estimated += [
-            name for name, value in source_values.items() if value is None and name not in estimated
-        ]
+        for name, value in source_values.items():
+            if value is None and name not in estimated:
+                estimated.append(name)
 
 
 def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
-    """Return what is known of a run from its beginning on; ``start`` [s] is the zero of its
-    pictures.
+    """Return the metadata that are known from a run's beginning on; ``start`` [s] is the zero of
+    its pictures.
     """
     params, policy = playback.params, playback.runner.pilot.policy
     goal_w = playback.runner.estimator.goal_w or params.goal_w
@@ -228,84 +212,75 @@ def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dic
 
 def events(ticks: list[Tick]) -> list[list]:
     """Return time, state and reason of each change."""
-    phases: list[list] = []
+    changes: list[list] = []
     for tick in ticks:
-        phase = [tick.line["time"], tick.decision.state, tick.decision.reason]
-        if not phases or phases[-1][1:] != phase[1:]:
-            phases.append(phase)
-    return phases
+        change = [tick.line["time"], tick.decision.state, tick.decision.reason]
+        if not changes or changes[-1][1:] != change[1:]:
+            changes.append(change)
+    return changes
 
 
 def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
-    """Return the log of the ticks from ``first`` to ``last``, both included; of one throw where its
-    number is given.
+    """Return the log of the ticks from ``first`` to ``last``, both included; of a throw by its
+    number.
     """
     ticks, runner = played.ticks[first : last + 1], played.playback.runner
-    start = (
-        played.ticks[played.throws[throw][0]].line["time"]
-        if throw is not None
-        else ticks[0].line["time"]
-    )
-    samples = TickLogger(played.playback, meta_of(played.playback, played.provenance, start))
-    landings = (
-        []
-        if throw is None
-        else [landing for landing in runner.latch.landings if abs(landing.start - start) < 1e-9]
-    )
-    landing = next(iter(landings), None)
-    latch = next(
-        (t.line["time"] for t in ticks if t.decision.release and t.line["time"] >= start), None
-    )
-    distance = (
-        np.inf
-        if latch is None
-        else (landing.separation if landing and landing.separation else latch + runner.latch.lag)
-    )
-    for tick in ticks:
-        samples.add(replace(tick, attached=tick.line["time"] < distance))
-    meta = samples.recorder.meta
-    meta["events"] = events(ticks)
-    meta["goal_w"] = list(
-        next(
-            (t.goal_w for t in ticks if t.line["time"] >= start and t.goal_w),
-            played.playback.params.goal_w,
-        )
-    )
+    begin = first if throw is None else played.throws[throw][0]
+    start = played.ticks[begin].line["time"]
+    logger = TickLogger(played.playback, meta_of(played.playback, played.provenance, start))
+    thrown = [tick for tick in ticks if tick.line["time"] >= start]
+    landing: Landing | None = None
     if throw is not None:
-        _judge(samples.recorder, landing, latch, ticks, start)
-    return samples.recorder.log()
+        same = (each for each in runner.latch.landings if abs(each.start - start) < 1e-9)
+        landing = next(same, None)
+    latch = next((tick.line["time"] for tick in thrown if tick.decision.release), None)
+    separation = np.inf
+    if latch is not None:
+        separation = (landing and landing.separation) or latch + runner.latch.lag
+    for tick in ticks:
+        logger.add(replace(tick, attached=tick.line["time"] < separation))
+    meta = logger.recorder.meta
+    meta["events"] = events(ticks)
+    goal_w = next((tick.goal_w for tick in thrown if tick.goal_w), played.playback.params.goal_w)
+    meta["goal_w"] = list(goal_w)
+    if throw is not None:
+        _add_result(logger.recorder, landing, latch, thrown, start)
+    return logger.recorder.log()
 
 
-def _judge(
+def _add_result(
     recorder: FlightRecorder,
     landing: Landing | None,
     latch: float | None,
     ticks: list[Tick],
     start: float,
 ) -> None:
-    """Note how a throw ended."""
-    after = [tick for tick in ticks if tick.line["time"] >= start]
-    ended = next((tick for tick in after if tick.decision.state != State.THROW), after[-1])
-    times: dict[str, Any] = {"policy_start": start, "latch": latch, "recovery": ended.line["time"]}
-    times["end"] = ticks[-1].line["time"]
-    landed = (
-        np.inf if landing is None else landing.time
-    )  # what happens once it is down takes nothing from the throw
-    stopped = next(
-        (
-            t.decision.reason
-            for t in after
-            if t.decision.state == State.ABORT and t.line["time"] < landed
-        ),
-        None,
+    """Add the result of a throw, whose ticks begin at its start [s]."""
+    recovery = next((tick for tick in ticks if tick.decision.state != State.THROW), ticks[-1])
+    times: dict[str, Any] = {
+        "policy_start": start,
+        "latch": latch,
+        "recovery": recovery.line["time"],
+        "end": ticks[-1].line["time"],
+    }
+    # An abort after the landing does not spoil the throw.
+    landed = np.inf if landing is None else landing.time
+    aborts = (
+        tick.decision.reason
+        for tick in ticks
+        if tick.decision.state == State.ABORT and tick.line["time"] < landed
     )
-    failure = stopped or (None if latch is not None else ended.decision.reason)
+    abort = next(aborts, None)
+    failure = abort or (None if latch is not None else recovery.decision.reason)
+    if failure is None and landing is None:
+        failure = "no landing was seen in the payload's poses"
     result: dict[str, Any] = {
-        "success": landing is not None and stopped is None,
+        "success": landing is not None and abort is None,
         "failure": failure,
     }
     if landing is not None:
-        times |= {"landing": landing.time, "separation": landing.separation or latch + landing.lag}
+        separation = landing.separation or latch + landing.lag
+        times |= {"landing": landing.time, "separation": separation}
         result |= {
             "landing_w": list(landing.landing_w),
             "error": landing.error,
@@ -313,27 +288,21 @@ def _judge(
             "separation_found": landing.separation is not None,
         }
         recorder.add(landing.time, landing=landing.landing_w)
-        recorder.add(times["separation"], separation=landing.separation_w or landing.landing_w)
-    elif failure is None:
-        result["failure"] = "no landing was seen in the payload's poses"
-    result["hovering_again"] = any(t.decision.reason == "hovering again" for t in after)
+        recorder.add(separation, separation=landing.separation_w or landing.landing_w)
+    reasons = {tick.decision.reason for tick in ticks}
+    result["hovering_again"] = "hovering again" in reasons
     recorder.meta |= {"times": times, "result": result}
 
 
 def throws(played: PlayedRun) -> list[FlightLog]:
     """Return a log a throw."""
-    logs, before = [], 0
-    for number, (first, last) in enumerate(played.throws):
-        period = played.playback.runner.pilot.period
-        begin = max(before, first - round(LEAD / period))
-        until = (
-            played.throws[number + 1][0] - 1
-            if number + 1 < len(played.throws)
-            else len(played.ticks) - 1
-        )
-        until = min(until, last + round(AFTER / period))
-        logs.append(log_of(played, begin, until, number))
-        before = until + 1
+    logs, begin = [], 0
+    period = played.playback.runner.pilot.period
+    begins = [first for first, _ in played.throws[1:]] + [len(played.ticks)]
+    for number, ((first, last), following) in enumerate(zip(played.throws, begins)):
+        end = min(following - 1, last + round(TRAIL_TIME / period))
+        logs.append(log_of(played, max(begin, first - round(LEAD_TIME / period)), end, number))
+        begin = end + 1
     return logs
 
 
