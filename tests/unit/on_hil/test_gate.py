@@ -218,7 +218,7 @@ def test_a_state_is_carried_forward():
     for i in range(5):
         half = 0.01 * i / 2
         body.update(pose(0.01 * i, 0.02 * i, (0.0, 0.0, math.sin(half), math.cos(half))))
-    state = body.state(0.05, ahead=0.02)
+    state = body.state(0.05, lead=0.02)
     np.testing.assert_allclose(state.pos, (0.08 + 0.04, 0.0, 1.0), atol=1e-9)
     np.testing.assert_allclose(2 * math.asin(state.quat[2]), 0.06, atol=1e-5)
     assert state.age == pytest.approx(0.01)
