@@ -15,10 +15,10 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 CEILINGS = {
-    "bound function words": 1358,
+    "bound function words": 1182,
     "first lines without a subject": 119,
-    "class names twice": 26,
-    "file names twice": 28,
+    "class names twice": 16,
+    "file names twice": 20,
     "wide lines": 1,
     "fmt: skip": 0,
     "tokens a line": 7.0,

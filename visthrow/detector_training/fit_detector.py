@@ -485,7 +485,9 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
     scores = {}
     for kind in KINDS:
         rays, sizes = places[kind]
-        views, out, rays, sizes = look_closely(networks, kind, frame, rays, sizes, lens, labels.north)
+        views, out, rays, sizes = look_closely(
+            networks, kind, frame, rays, sizes, lens, labels.north
+        )
         error = _angle_between(rays, labels.rays[kind])
         hit = (
             labels.seen[kind]

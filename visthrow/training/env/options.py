@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from camera import history as hist
-from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints, keypoints
 from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
+from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints, keypoints
 from camera.params import CameraParams
 from visthrow.onboard import observations as ob
 from visthrow.task import ObservationParams, TaskParams
