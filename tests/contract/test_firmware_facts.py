@@ -134,15 +134,11 @@ def test_a_constant_without_a_source_is_found():
 
 
 SAYINGS = [
-    ("betaflight", r"UDP (\d+)", "sensor_port"),
-    ("betaflight", r"UDP \d+ and (\d+)", "radio_port"),
-    ("betaflight", r"sticks count again\s+after ([\d.]+) s", "override_window"),
-    ("crazyflie", r"\(type (\d+) of the generic", "manual"),
-    ("crazyflie", r"CRTP protocol (\d+)", "protocol_state"),
+    ("betaflight", r"pilot's sticks after ([\d.]+) s", "override_window"),
     ("crazyflie", r"levels after ([\d.]+) s", "levels_after"),
-    ("crazyflie", r"locked after ([\d.]+) s", "stops_after"),
+    ("crazyflie", r"lock after ([\d.]+) s", "stops_after"),
     ("crazyflie", r"own controller over (\d+)", "manual_thrust"),
-    ("faults", r"2026\.6 and newer \| the pilot's after ([\d.]+) s", "override_window"),
+    ("faults", r"Since: the pilot's sticks after ([\d.]+) s", "override_window"),
 ]
 """Page, words with a number, and the row that has the number."""
 
