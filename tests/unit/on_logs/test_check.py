@@ -454,6 +454,16 @@ def test_command_line(tmp_path, capsys):
     assert len(whole[1].splitlines()) > len(short[1].splitlines())
 
 
+def test_the_plant_says_how_long_the_cable_must_be(tmp_path, capsys):
+    columns = flight(6.0)
+    hung = columns | {"payload_pos_w": columns["pos_w"] - [0.0, 0.0, 0.9]}
+    log_of(hung).save(tmp_path / "a.npz")
+    command = ["diagnose", "check", str(tmp_path / "a.npz"), "--no-pictures"]
+    for plant, told in (([], False), (["--plant", "state"], True)):
+        cli.main([*command, *plant])
+        assert ("another cable" in capsys.readouterr().out) == told
+
+
 def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, capsys):
     """A flying model's cable and mass are of use without a table; a mapping is not, and is not
     ignored in silence.

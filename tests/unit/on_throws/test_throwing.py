@@ -393,7 +393,10 @@ def test_names_are_made_unique(dropper):
         (["compare", "DROPPER", "--targets", "3.01"], "from 0 to 3 m"),
         (["compare", "DROPPER", "--targets", "-0.01"], "from 0 to 3 m"),
         (["compare", "DROPPER", "--plant", "real"], "no plant 'real'"),
-        (["compare", "DROPPER", "--calibrate", "--plant", "reference"], "--calibrate on plant"),
+        (
+            ["compare", "DROPPER", "--calibrate", "--plant", "reference", "--throws", "1"],
+            "--calibrate on plant",
+        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, capsys):
