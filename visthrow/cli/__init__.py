@@ -56,7 +56,7 @@ COMMANDS = {
     ),
     "cooperative": (
         "throw one load with several vehicles",
-        "visthrow.cooperative.commands",
+        "visthrow.cooperative.team_command",
     ),
     "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
 }

@@ -37,7 +37,7 @@ class TeamParams(Bounded):
     # control step before which no latch trips at the beginning of a training: else the load is
     # dropped at once; and the shares of the training between which it comes down to 0
     first_release: Annotated[int, Bound(0)] = 15
-    free: tuple[Share, Share] = (0.25, 0.45)
+    free: tuple[Share, Share] = (0.1, 0.3)
     # vehicle 0 of the worlds: thrust against the controller's map, delay of its latch
     weak: Range = (1.0, 1.0)  # [-]
     late: Range = (0.0, 0.0)  # [s]

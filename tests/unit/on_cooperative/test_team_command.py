@@ -1,0 +1,30 @@
+"""``visthrow cooperative``: the shipped policies throw; bad names are told."""
+
+import json
+
+import pytest
+
+from visthrow.cli import main
+
+
+def test_the_shipped_policy_lands_under_every_fault(tmp_path, capsys):
+    file = tmp_path / "table.json"
+    assert main(["cooperative", "compare", "--throws", "30", "--json", str(file)]) == 0
+    rows = {row["fault"]: row for row in json.loads(file.read_text())}
+    assert "late" in capsys.readouterr().out
+    assert all(row["landed"] == 1.0 and row["contact"] == 0.0 for row in rows.values())
+    assert rows["none"]["error_mean"] < 0.06
+    assert max(row["error_mean"] for row in rows.values()) < 0.12
+    assert rows["late"]["apart_mean"] == pytest.approx(0.03, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fly", "trio"], "no policy 'trio'"),
+        (["fly", "--fault", "broken"], "no fault 'broken'"),
+    ],
+)
+def test_a_name_that_is_not_there_is_told(words, message, tmp_path, capsys):
+    assert main(["cooperative", *words, *(["--out", str(tmp_path)])]) == 2
+    assert message in capsys.readouterr().err
