@@ -30,7 +30,7 @@ from visthrow.task import Experiment, plant_of
 from visthrow.throws.flight import Flight, Phase, Policies, hover
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.plants import make_plant
-from visthrow.throws.recorded import Recording
+from visthrow.throws.recorded import LogRecorder
 from visthrow.throws.reference_protocol import place_in_hover
 from visthrow.training.device import resolve
 
@@ -174,7 +174,7 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     )
     home = place_in_hover(plant, loaded.experiment, rng)
     meta = {"policy": loaded.name, "plant": plant.name}
-    recording = Recording(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
+    recording = LogRecorder(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
     flight, landed = Flight(plant, Policies([loaded], goals_w), recording, home), 0
 
     def over(flight: Flight) -> bool:

@@ -127,7 +127,7 @@ def yaw_rate(v: VehicleParams) -> float:
 
 
 def _calm(v: VehicleParams, share: float) -> VehicleParams:
-    """The vehicle with its yaw gains turned down to a share of them, if that is below 1."""
+    """Return the vehicle with its yaw gains turned down to a share of them, if that is below 1."""
     c = v.controller
     share = min(share, 1.0)
     names = ("p_gain", "i_gain", "feedforward_gain")
@@ -136,7 +136,7 @@ def _calm(v: VehicleParams, share: float) -> VehicleParams:
 
 
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
-    """A vehicle with the factors drawn."""
+    """Return a vehicle with the factors drawn."""
     arm = x["arm"]
     blade = x["arm"] * x["propeller"]
     lag = x["motor_lag"]
@@ -195,7 +195,7 @@ def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
 
 
 def _rope(r: RopeParams, x: dict[str, float]) -> RopeParams:
-    """A rope and its payload with the factors drawn."""
+    """Return a rope and its payload with the factors drawn."""
     length = r.length * x["rope"]
     size = x["payload_size"]
     mass = x["payload"]

@@ -65,8 +65,8 @@ def _kernels(
 
 
 def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
-    """The rope in ``tether_variants`` lengths that span +-``tether_spread``; its mass per metre is
-    kept.
+    """Return the rope in ``tether_variants`` lengths that span +-``tether_spread``; its mass per
+    metre is kept.
 
     Environment e gets entry ``e % tether_variants`` (the paper, Sec. III-C).
     """
@@ -216,7 +216,9 @@ class HybridSim:
         self.place(pos_w=np.zeros((count, 3)))
 
     def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
-        """The solver of the plant's bodies with what it exchanges; None for the fused kernel."""
+        """Return the solver of the plant's bodies with what it exchanges; None for the fused
+        kernel.
+        """
         params, build = self.params, self._solver()
         if build is None:
             params.rope.require_chain("sim.solver 'chain'")

@@ -54,7 +54,7 @@ def on_torch_stream(device: str):
 
 
 def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
-    """A CUDA graph of what ``work`` launches; ``options`` of `torch.cuda.graph`.
+    """Return a CUDA graph of what ``work`` launches; ``options`` of `torch.cuda.graph`.
 
     Python collects no garbage meanwhile: an array or graph of Warp that it frees ends the capture.
     """
@@ -72,7 +72,7 @@ def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
     return graph
 
 
-class Replayed:
+class ReplayedGraph:
     """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and
     replayed, on a stream of its own.
 

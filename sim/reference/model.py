@@ -68,7 +68,9 @@ def _add_joints(
 
 
 def new_spec(constraints: bool = False) -> "mujoco.MjSpec":
-    """An empty model without contacts, and without other constraints unless they are asked for."""
+    """Return an empty model without contacts, and without other constraints unless they are asked
+    for.
+    """
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.0, 0.0, -GRAVITY]
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -78,7 +80,7 @@ def new_spec(constraints: bool = False) -> "mujoco.MjSpec":
 
 
 def add_vehicle(spec: "mujoco.MjSpec", body: BodyParams) -> "mujoco.MjsBody":
-    """The quadrotor on a free joint, with actuators for force and torque in its own frame."""
+    """Add the quadrotor on a free joint, with actuators for force and torque in its body frame."""
     vehicle = spec.worldbody.add_body(name="vehicle")
     vehicle.add_freejoint(name="root")
     _set_inertial(vehicle, body.mass, 0.0, body.inertia)

@@ -22,7 +22,7 @@ from sim.reference.quadrotor import (
 )
 from sim.reference.rope import RopeDynamics
 from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
-from sim.reference.state import Landings, Snapshot
+from sim.reference.state import PayloadLandings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
 LARGEST_DECAY = 2.2
@@ -549,10 +549,10 @@ class ReferencePlant:
         )
 
     @property
-    def landing(self) -> Landings:
+    def landing(self) -> PayloadLandings:
         """Landing places and times of the payloads."""
         separated = np.where(self._attached, np.nan, self._separation)
-        return Landings(
+        return PayloadLandings(
             self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated
         )
 

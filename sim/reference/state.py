@@ -30,7 +30,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True)
-class Landings:
+class PayloadLandings:
     """Landing places and times of the payloads, on the plant's clock; NaN before the landing."""
 
     landed: np.ndarray  # shape (E,), bool

@@ -94,7 +94,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(quat: Quaternion) -> Quaternion:
-    """The inverse turn of a single unit quaternion."""
+    """Return the inverse turn of a single unit quaternion."""
     x, y, z, w = quat
     return (-x, -y, -z, w)
 

@@ -25,7 +25,7 @@ from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config import schema as _schema
 from visthrow.config.kinds import kinds_of
-from visthrow.config.schema import BASE_KEY, NONE_WORD, Leaf, Table, dataclass_of, merged
+from visthrow.config.schema import BASE_KEY, NONE_WORD, ConfigTable, Leaf, dataclass_of, merged
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str =
     return _built(schema, _parse(schema, text, name, configs_root(), ()), overrides)
 
 
-def _built(schema: type[T], tree: Table, overrides: Iterable[str]) -> T:
+def _built(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
     for override in overrides:
         _override(schema, tree, override)
     built: T = _schema.build(schema, tree)
@@ -156,7 +156,7 @@ def _display_path(path: Path) -> str:
     return str(resolved.relative_to(cwd)) if resolved.is_relative_to(cwd) else str(path)
 
 
-def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> Table:
+def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> ConfigTable:
     name = _display_path(path)
     resolved = path.resolve()
     if resolved in stack:
@@ -172,7 +172,9 @@ def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> Table:
     return _parse(schema, text, name, path.parent, (*stack, resolved))
 
 
-def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, ...]) -> Table:
+def _parse(
+    schema: type, text: str, name: str, folder: Path, stack: tuple[Path, ...]
+) -> ConfigTable:
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -188,7 +190,9 @@ def _parse(schema: type, text: str, name: str, folder: Path, stack: tuple[Path, 
     return merged(_read(schema, _lookup(schema, base, folder, name, BASE_KEY), stack), tree)
 
 
-def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], path: str) -> None:
+def _include(
+    schema: type, tree: ConfigTable, folder: Path, stack: tuple[Path, ...], path: str
+) -> None:
     """Replace each string that stands where the schema wants a table by the file that it names."""
     for key, annotation in _schema.hints(schema).items():
         table_type = dataclass_of(annotation)
@@ -196,7 +200,7 @@ def _include(schema: type, tree: Table, folder: Path, stack: tuple[Path, ...], p
         if table_type is None or node is None:
             continue
         place = f"{path}.{key}" if path else key
-        if isinstance(node, Table):
+        if isinstance(node, ConfigTable):
             _include(table_type, node, folder, stack, place)
         elif _names_file(node, annotation):
             tree.items[key] = _read(
@@ -228,7 +232,7 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
     )
 
 
-def _override(schema: type, tree: Table, override: str) -> None:
+def _override(schema: type, tree: ConfigTable, override: str) -> None:
     source = f"override '{override}'"
     path, equals, text = override.partition("=")
     keys = [key.strip() for key in path.split(".")]
@@ -253,8 +257,8 @@ def _override(schema: type, tree: Table, override: str) -> None:
             )
         if depth < len(keys) - 1:
             child = tree.items.get(key)
-            if not isinstance(child, Table):
-                child = tree.items[key] = Table(source)
+            if not isinstance(child, ConfigTable):
+                child = tree.items[key] = ConfigTable(source)
             tree = child
     node = _schema.as_node(_toml_value(text.strip()), source)
     tree.items[keys[-1]] = node
@@ -264,7 +268,7 @@ def _override(schema: type, tree: Table, override: str) -> None:
         )
 
 
-def _names_file(node: Leaf | Table, annotation: Any) -> TypeGuard[Leaf]:
+def _names_file(node: Leaf | ConfigTable, annotation: Any) -> TypeGuard[Leaf]:
     """Whether a string stands where a table is wanted, which is then the path of a file, unless it
     is the word for None.
     """

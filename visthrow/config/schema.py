@@ -26,11 +26,11 @@ class Leaf:
 
 
 @dataclass
-class Table:
+class ConfigTable:
     """A TOML table, with the file that opened it last."""
 
     source: str
-    items: dict[str, "Leaf | Table"] = field(default_factory=dict)
+    items: dict[str, "Leaf | ConfigTable"] = field(default_factory=dict)
 
 
 @cache
@@ -93,7 +93,7 @@ def fail(source: str, path: str, problem: str) -> typing.NoReturn:
     raise ConfigError(f"{source}: {path or 'top level'}: {problem}")
 
 
-def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
+def build(annotation: Any, node: Leaf | ConfigTable, path: str = "") -> Any:
     """Convert one node of the parsed tree, at a dotted path, into the type that the schema asks
     for.
 
@@ -107,13 +107,13 @@ def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
     origin = typing.get_origin(annotation)
     args = typing.get_args(annotation)
     if origin is dict:
-        if not isinstance(node, Table):
+        if not isinstance(node, ConfigTable):
             _wrong_type(annotation, node, path)
         return {
             key: build(args[1], item, _join(path, key))
             for key, item in _rows(args[1], node, path).items()
         }
-    if isinstance(node, Table):
+    if isinstance(node, ConfigTable):
         _wrong_type(annotation, node, path)
     if origin is tuple:
         return _build_tuple(annotation, node, path)
@@ -125,7 +125,7 @@ def build(annotation: Any, node: Leaf | Table, path: str = "") -> Any:
     return _build_scalar(annotation, node, path)
 
 
-def _build_union(annotation: Any, node: Leaf | Table, path: str) -> Any:
+def _build_union(annotation: Any, node: Leaf | ConfigTable, path: str) -> Any:
     options = typing.get_args(annotation)
     if type(None) in options and isinstance(node, Leaf) and node.value == NONE_WORD:
         return None
@@ -140,8 +140,8 @@ def _build_union(annotation: Any, node: Leaf | Table, path: str) -> Any:
     _wrong_type(annotation, node, path)
 
 
-def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
-    if not isinstance(node, Table):
+def _build_dataclass(schema: type, node: Leaf | ConfigTable, path: str) -> Any:
+    if not isinstance(node, ConfigTable):
         _wrong_type(schema, node, path)
     types_of = hints(schema)
     unset = dataclasses.MISSING
@@ -164,7 +164,7 @@ def _build_dataclass(schema: type, node: Leaf | Table, path: str) -> Any:
         fail(node.source, path, str(error))
 
 
-def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
+def _rows(annotation: Any, node: ConfigTable, path: str) -> dict[str, Leaf | ConfigTable]:
     """Return like tables of one table, each on top of the sibling that it names as its base; a
     field ``name`` is the heading.
     """
@@ -172,11 +172,11 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
     if schema is None or BASE_KEY in hints(schema):
         return node.items
 
-    def row(key: str, above: tuple[str, ...]) -> Leaf | Table:
+    def row(key: str, above: tuple[str, ...]) -> Leaf | ConfigTable:
         item = node.items[key]
-        if not isinstance(item, Table):
+        if not isinstance(item, ConfigTable):
             return item
-        table = Table(item.source, {k: v for k, v in item.items.items() if k != BASE_KEY})
+        table = ConfigTable(item.source, {k: v for k, v in item.items.items() if k != BASE_KEY})
         if "name" in hints(schema):
             base_name = table.items.get("name")
             if base_name is not None and not (
@@ -191,7 +191,7 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
         base = item.items.get(BASE_KEY)
         if base is None:
             return table
-        siblings = {k for k, v in node.items.items() if isinstance(v, Table)} - {key, *above}
+        siblings = {k for k, v in node.items.items() if isinstance(v, ConfigTable)} - {key, *above}
         if not isinstance(base, Leaf) or base.value not in siblings:
             value = _described(base)
             problem = f"got {value}; expected another table; {suggest(value, siblings)}"
@@ -201,16 +201,16 @@ def _rows(annotation: Any, node: Table, path: str) -> dict[str, Leaf | Table]:
     return {key: row(key, ()) for key in node.items}
 
 
-def _described(node: Leaf | Table) -> str:
+def _described(node: Leaf | ConfigTable) -> str:
     return repr(node.value) if isinstance(node, Leaf) else "a table"
 
 
-def merged(base: Table, override: Table) -> Table:
+def merged(base: ConfigTable, override: ConfigTable) -> ConfigTable:
     """Return one table with another's values on top of its own, table by table."""
-    combined = Table(override.source, dict(base.items))
+    combined = ConfigTable(override.source, dict(base.items))
     for key, item in override.items.items():
         below = combined.items.get(key)
-        if isinstance(item, Table) and isinstance(below, Table):
+        if isinstance(item, ConfigTable) and isinstance(below, ConfigTable):
             combined.items[key] = merged(below, item)
         else:
             combined.items[key] = item
@@ -244,18 +244,18 @@ def _build_scalar(annotation: Any, node: Leaf, path: str) -> Any:
     _wrong_type(annotation, node, path)
 
 
-def as_node(value: Any, source: str) -> Leaf | Table:
+def as_node(value: Any, source: str) -> Leaf | ConfigTable:
     """Wrap a parsed TOML value, tables recursively."""
     return as_table(value, source) if isinstance(value, dict) else Leaf(value, source)
 
 
-def as_table(values: dict[str, Any], source: str) -> Table:
+def as_table(values: dict[str, Any], source: str) -> ConfigTable:
     """Wrap a parsed TOML table, recursively."""
-    return Table(source, {key: as_node(item, source) for key, item in values.items()})
+    return ConfigTable(source, {key: as_node(item, source) for key, item in values.items()})
 
 
-def _wrong_type(annotation: Any, node: Leaf | Table, path: str) -> typing.NoReturn:
-    table = isinstance(node, Table)
+def _wrong_type(annotation: Any, node: Leaf | ConfigTable, path: str) -> typing.NoReturn:
+    table = isinstance(node, ConfigTable)
     if table:
         actual = f"a table with the keys {', '.join(node.items) or '(none)'}"
     else:

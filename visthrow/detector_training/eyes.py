@@ -164,7 +164,7 @@ class RenderedEyes:
         return lost
 
     def _hanging(self, rot_wb: np.ndarray) -> BallGoalTracker:
-        """A ball that hangs still below a vehicle: where it is looked for first."""
+        """Return a ball that hangs still below a vehicle: where it is looked for first."""
         from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
         return BallGoalTracker(
             self.params.payload_radius, self.params.goal_side, from_lens - [0.0, 0.0, self._below]
@@ -213,7 +213,7 @@ class RenderedEyes:
         return path
 
     def _scenes(self, snapshot: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
-        """The halls with vehicles, balls and squares where they are."""
+        """Return the halls with vehicles, balls and squares where they are."""
         tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
         rot = rotation_from_quat(tensor(snapshot.quat_wb))
         plain = posed_scenes(

@@ -117,7 +117,7 @@ def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Lab
 
 
 def other_lens(lens, generator: torch.Generator):
-    """A lens like this one with another scale and a bend, its picture of the same size."""
+    """Return a lens like this one with another scale and a bend, its picture of the same size."""
     scale = (1.0 + 0.35 * torch.rand(1, generator=generator)).item()
     bend = (0.06 * torch.rand(1, generator=generator) - 0.04).item()
     reach = 0.98 * min(lens.width, lens.height) / 2.0 / (lens.fx * scale)

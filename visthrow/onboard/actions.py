@@ -51,7 +51,7 @@ def release_asked(action: Tensor, threshold: float) -> Tensor:
 
 
 def hover_action(weight: float, max_thrust: float) -> list[float]:
-    """Action of hover under a weight [N] with the latch at rest: what stands as the previous action
-    when a policy starts.
+    """Return the action of hover under a weight [N] with the latch at rest: what stands as the
+    previous action when a policy starts.
     """
     return [2.0 * (weight / max_thrust) ** 0.5 - 1.0, 0.0, 0.0, 0.0, -1.0]

@@ -143,7 +143,7 @@ class Calibration:
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> "Calibration":
-        """The inverse of `values`."""
+        """Return the inverse of `values`."""
         return cls(
             **{
                 name: tuple(value) if isinstance(value, list) else value
@@ -201,7 +201,7 @@ def sway(
     return swung, swung if int(frequency * since + 1e-9) % 2 == 0 else -swung
 
 
-class Problem:
+class CalibrationProblem:
     """Residuals of a hover, over their spreads; all arguments carry a batch axis B in front, for
     differences.
     """
@@ -342,7 +342,9 @@ class Problem:
         return torch.cat(off, -1)
 
     def places(self, latency: Tensor) -> tuple[Tensor, Tensor]:
-        """Steps j that sightings fall behind, and the share of the way to j + 1, each (N,)."""
+        """Return the steps j that sightings fall behind, and the share of the way to j + 1, each
+        (N,).
+        """
         when = (self.time - self.age - latency).clamp(min=self.time[0], max=self.time[-1] - 1e-9)
         j = (torch.searchsorted(self.time, when, right=True) - 1).clamp(0, len(self.time) - 2)
         return j, (when - self.time[j]) / self.dt[j]
@@ -473,7 +475,7 @@ def calibrate(
         hovered: a hover of some 3 s that ends in a sway. camera, contract: see above.
         spreads: of noise and of what is known; left out, those of the training.
     """
-    problem = Problem(hovered, camera, contract, spreads or Spreads())
+    problem = CalibrationProblem(hovered, camera, contract, spreads or Spreads())
     x, c = problem.start()
     for _ in range(ROUNDS):
         try:
@@ -526,7 +528,7 @@ def solved(
         return str(error)
 
 
-def _linearised(problem: Problem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray, float]:
+def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray, float]:
     """Solver of the normal equations about unknowns, the gradient there, and the misfit of the
     sightings.
 

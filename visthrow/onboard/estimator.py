@@ -126,5 +126,5 @@ class Estimator:
         )
 
     def to(self, device: str | torch.device) -> "Estimator":
-        """The estimator with its tensors on another device."""
+        """Return the estimator with its tensors on another device."""
         return Estimator.of_parts({name: part.to(device) for name, part in self.parts().items()})

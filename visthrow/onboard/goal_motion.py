@@ -42,7 +42,7 @@ GRAZING = 0.1  # sine of the least angle below the horizon at which a ray is fol
 
 
 def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:
-    """Sums before the first step, shape (E, 7)."""
+    """Return the sums before the first step, shape (E, 7)."""
     return torch.zeros(count, SUMS, device=device)
 
 
@@ -152,7 +152,7 @@ def goal_by_corner(
     return goals, followed * (sharpness * sharpness)
 
 
-class Fitted(NamedTuple):
+class GoalEstimate(NamedTuple):
     """The sums that :func:`fitted_goal` adds for a frame."""
 
     sums: Tensor
@@ -170,13 +170,13 @@ def fitted_goal(
     sums: Tensor,
     time: Tensor,
     fresh: Tensor,
-) -> Fitted:
+) -> GoalEstimate:
     """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
     if layout.name == "state" or not layout.located:
         sums, velocity = fit(sums, time, *measured_goal(layout, frame, valid, camera), fresh)
         moves = velocity if layout.motion else None
         places = place(sums, time, moves) - frame[:, :2] if layout.located else None
-        return Fitted(sums, moves, places, frame, valid)
+        return GoalEstimate(sums, moves, places, frame, valid)
     return _located(layout, frame, valid, camera, sums, time, fresh)
 
 
@@ -188,7 +188,7 @@ def _located(
     sums: Tensor,
     time: Tensor,
     fresh: Tensor,
-) -> Fitted:
+) -> GoalEstimate:
     """:func:`fitted_goal` where the layout says where keypoints lie: of four points of goal or box
     a wrong one is outvoted.
 
@@ -215,7 +215,7 @@ def _located(
         ],
         dim=-1,
     )
-    return Fitted(
+    return GoalEstimate(
         sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, located)
     )
 
@@ -229,8 +229,8 @@ def predicted(
     goal_xy: Tensor,
     known: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The frame, and its validity, with corners that are not seen where the goal so far would be
-    seen.
+    """Return the frame, and its validity, with corners that are not seen where the goal so far
+    would be seen.
 
     Args:
         layout, frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame,

@@ -280,7 +280,8 @@ class Pilot:
         return late
 
     def _measured(self, *views: np.ndarray | bool) -> np.ndarray:
-        """The measurements of one step side by side, shape (E, 20): the columns of :data:`VIEWS`.
+        """Return the measurements of one step side by side, shape (E, 20): the columns of
+        :data:`VIEWS`.
 
         Raises ValueError: one of another shape.
         """

@@ -136,7 +136,8 @@ class Policy:
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Action as :meth:`act`, shape (E, A), and the memory for the next step, shape (E, H).
+        """Return the action as :meth:`act`, shape (E, A), and the memory for the next step, shape
+        (E, H).
 
         Raises PolicyError if the last axis of the observations is not D long.
         """
@@ -146,8 +147,8 @@ class Policy:
         return self.decide(fitted), memory
 
     def actor(self, count: int) -> Callable[[Tensor], Tensor]:
-        """Function of the observations of one throw after the other step, shape (E, D); it carries
-        the memory, where there is one.
+        """Return the function of the observations of one throw after the other step, shape (E, D);
+        it carries the memory, where there is one.
         """
         if self.estimator is None:
             return self.act
@@ -169,8 +170,8 @@ class Policy:
         return obs.to(self.weights[0].dtype)
 
     def decide(self, x: Tensor) -> Tensor:
-        """Action of the perceptron alone, shape (E, A), for what it looks at, shape (E, S);
-        differentiable.
+        """Return the action of the perceptron alone, shape (E, A), for what it looks at, shape (E,
+        S); differentiable.
         """
         if self.mean is not None and self.std is not None:
             x = (x - self.mean) / (self.std + self.eps)

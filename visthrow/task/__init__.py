@@ -454,7 +454,7 @@ def _no_vehicle(e: Experiment) -> Iterator[str]:
 
 
 def plant_of(experiment: Experiment) -> PlantParams:
-    """The plant of an experiment."""
+    """Return the plant of an experiment."""
     return PlantParams(
         experiment.vehicle,
         experiment.rope,

@@ -129,7 +129,7 @@ class Member:
         return float(value)  # type: ignore[arg-type]
 
     def setup(self, kind: str) -> list[float]:
-        """Set-up of a kind in :data:`visthrow.onboard.observations.SETUPS`."""
+        """Return the set-up of a kind in :data:`visthrow.onboard.observations.SETUPS`."""
         return {"none": [], "told": self.told, "exact": self.exact}[kind]
 
 
@@ -161,8 +161,8 @@ def members(experiment: Experiment) -> list[Member]:
 
 
 def alone(experiment: Experiment, number: int = 0) -> Experiment:
-    """The experiment of one vehicle of the fleet, stated in SI units, vehicle and task alike; no
-    fleet any more.
+    """Return the experiment of one vehicle of the fleet, stated in SI units, vehicle and task
+    alike; no fleet any more.
     """
     chosen = members(experiment)[number]
     inverse_units = chosen.units.inverse

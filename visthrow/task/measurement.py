@@ -18,7 +18,7 @@ LANDED = 0.95  # share of throws that must land before their mean error says any
 
 
 def pilots_hover() -> RandomizationParams:
-    """The variation of starts in a pilot's hover, ``configs/start/hover.toml``."""
+    """Return the variation of starts in a pilot's hover, ``configs/start/hover.toml``."""
     return config.load(RandomizationParams, config.find("start", "hover"))
 
 

@@ -109,7 +109,7 @@ def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
 
 
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
-    """The calibration of each hover; None where it shows too little."""
+    """Return the calibration of each hover; None where it shows too little."""
     solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
     estimates = dict(done(solve, hovered, cores() if len(hovered) > TOO_FEW else 1, "calibrations"))
     return [

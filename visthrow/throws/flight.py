@@ -168,14 +168,14 @@ class Policies(Pilots):
         return Decision(*(np.concatenate([getattr(out, name) for out in outs]) for name in names))
 
 
-class Recorder:
+class FlightObserver:
     """Keeps nothing of a flight; the children do."""
 
     def before(self, flight: "Flight", snapshot: Snapshot, sent: Decision) -> None:
-        """Called each period with what was measured and is sent, before the plant moves."""
+        """Take each period's measurement and command, before the plant moves."""
 
     def after(self, flight: "Flight", snapshot: Snapshot, sent: Decision) -> None:
-        """Called after it, with the new state in ``flight.now``."""
+        """Take the period's end, with the new state in ``flight.now``."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Flight:
         self,
         plant: Plant,
         pilots: Pilots,
-        recorder: Recorder | None = None,
+        recorder: FlightObserver | None = None,
         home_w: np.ndarray | None = None,
     ) -> None:
         """Take over a plant at its start; each period is told to the recorder.
@@ -234,7 +234,7 @@ class Flight:
         count = plant.count
         self.plant = plant
         self.pilots = pilots
-        self.recorder = recorder or Recorder()
+        self.recorder = recorder or FlightObserver()
         self._now: Snapshot | None = None
         self.home_w = self.now.pos_w if home_w is None else home_w
         self.begin = math.nan
@@ -376,7 +376,7 @@ class Smoothness:
         return np.sqrt(self._sum / np.maximum(self._steps, 1.0))
 
 
-class Scores(Recorder):
+class Scores(FlightObserver):
     """Measures what :class:`visthrow.task.measurement.Throws` holds.
 
     Attributes:
@@ -400,7 +400,7 @@ class Scores(Recorder):
         self.clearance = np.where(flying, np.minimum(self.clearance, distance), self.clearance)
 
     def columns(self, flight: Flight) -> dict[str, np.ndarray]:
-        """A row a throw, NaN where it failed; ``goal_w`` where goals move."""
+        """Return a row a throw, NaN where it failed; ``goal_w`` where goals move."""
         landing = flight.plant.landing
         success = landing.landed & ~flight.failed
         blank = np.where(success, 1.0, np.nan)

@@ -25,7 +25,9 @@ TICKS = "ticks.jsonl"  # of a run, a tick a line
 
 
 def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
-    """Logs of all throws of some runs; LogError for a folder without throws, or a damaged log."""
+    """Return logs of all throws of some runs; LogError for a folder without throws, or a damaged
+    log.
+    """
     logs: list[FlightLog] = []
     for folder in map(Path, folders):
         paths = sorted(folder.glob(PATTERN))
@@ -47,8 +49,8 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
 
 
 def entries(logs: list[FlightLog]) -> list[Entry]:
-    """An entry a policy, its throws by the distance of their goals; policies of one name and other
-    content are told apart.
+    """Return an entry a policy, its throws by the distance of their goals; policies of one name and
+    other content are told apart.
     """
     groups: dict[tuple[str, str, str], dict[float, list[FlightLog]]] = {}
     for log in logs:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sim.params import AirParams, RandomizationParams, RopeParams
-from sim.reference.state import Landings as Landings
+from sim.reference.state import PayloadLandings as PayloadLandings
 from sim.reference.state import Snapshot as Snapshot
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
@@ -81,8 +81,8 @@ class Plant(Protocol):
         """
 
     @property
-    def landing(self) -> Landings:
-        """Landings so far."""
+    def landing(self) -> PayloadLandings:
+        """PayloadLandings so far."""
 
 
 class HybridPlant:
@@ -290,8 +290,8 @@ class HybridPlant:
         )
 
     def measured(self) -> Snapshot:
-        """The truth, late and with the training's observation noise, which on the attitude is an
-        angle [rad].
+        """Return the truth, late and with the training's observation noise, which on the attitude
+        is an angle [rad].
         """
         if self.noise is not None:
             step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
@@ -324,11 +324,13 @@ class HybridPlant:
         )
 
     @property
-    def landing(self) -> Landings:
+    def landing(self) -> PayloadLandings:
         impact = self._separation + self._sim.get("time_to_impact")
         landed = ~np.isnan(self._separation) & (impact <= self.time + 1e-9)
         point = np.where(landed[:, None], self._sim.get("landing_w").astype(float), np.nan)
-        return Landings(landed, point, np.where(landed, impact, np.nan), self._separation.copy())
+        return PayloadLandings(
+            landed, point, np.where(landed, impact, np.nan), self._separation.copy()
+        )
 
 
 class ReferenceAdapter:
@@ -368,7 +370,7 @@ class ReferenceAdapter:
         return getattr(self._plant, name)
 
     def measured(self) -> Snapshot:
-        """The plant's latency is that of whole samples: what is told is the sample itself."""
+        """Return the newest sample: the plant's latency is that of whole samples."""
         self.sample = self._plant.measured()
         return self.sample
 

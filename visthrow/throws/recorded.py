@@ -11,7 +11,7 @@ from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog, FlightRecorder
-from visthrow.throws.flight import Decision, Flight, Phase, Policies, Recorder, Sight
+from visthrow.throws.flight import Decision, Flight, FlightObserver, Phase, Policies, Sight
 from visthrow.throws.loading import Loaded
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes
@@ -33,7 +33,7 @@ true, with their units.
 """
 
 
-class Recording(Recorder):
+class LogRecorder(FlightObserver):
     """A flight log of each vehicle, ``recorders``: what is true at each period's beginning, and
     what is sent then.
     """
@@ -52,7 +52,7 @@ class Recording(Recorder):
             )
 
 
-class _Full(Recording):
+class _Full(LogRecorder):
     """Everything of one vehicle: the rope down to the ground, what the camera sees, and when the
     release was asked for, ``latch`` [s].
     """
@@ -232,7 +232,7 @@ def _hovering(
 
 
 def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
-    """The log with the last state, and how the throw ended."""
+    """Return the log with the last state, and how the throw ended."""
     plant = flight.plant
     state = flight.now
     recorder = recording.recorders[0]

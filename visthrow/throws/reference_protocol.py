@@ -111,7 +111,7 @@ def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generato
 
 
 def batches(throws: int, size: int = BATCH) -> list[tuple[int, int]]:
-    """Number and size of each batch that throws are cut into."""
+    """Return the number and size of each batch that throws are cut into."""
     return [(first // size, min(size, throws - first)) for first in range(0, throws, size)]
 
 

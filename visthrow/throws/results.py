@@ -55,7 +55,7 @@ class Result:
         return self.columns["success"].astype(bool)
 
     def of(self, name: str) -> np.ndarray:
-        """A column without the failed throws."""
+        """Return a column without the failed throws."""
         return self.columns[name][self.good]
 
     @property
@@ -107,7 +107,7 @@ def policy_unit(
     train_seed: int | None = None,
     departures: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Unit of so many throws with a learnt policy at a target [m] along x.
+    """Return the unit of so many throws with a learnt policy at a target [m] along x.
 
     Args:
         policy, weights: what it is called, and :func:`hash_of` its file.

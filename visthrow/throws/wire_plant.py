@@ -53,7 +53,7 @@ class HybridWirePlant:
         return HybridPlant(self._fine(experiment))
 
     def _fine(self, experiment: Experiment) -> Experiment:
-        """The experiment with this plant's period, nothing measured late."""
+        """Return the experiment with this plant's period, nothing measured late."""
         observation = replace(experiment.task.observation, latency=(0.0, 0.0))
         sim = replace(experiment.sim, control_period=self.period)
         task = replace(experiment.task, observation=observation)
@@ -95,8 +95,8 @@ class HybridWirePlant:
 
 
 def make(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridWirePlant:
-    """The plant that a policy, a shipped name or a file, was trained on, with ``key=value`` changes
-    of its configuration.
+    """Return the plant that a policy, a shipped name or a file, was trained on, with ``key=value``
+    changes of its configuration.
     """
     return HybridWirePlant(load_policy(policy, None, changes).experiment, seed)
 

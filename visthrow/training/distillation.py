@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
-from sim.torch_bridge import Replayed
+from sim.torch_bridge import ReplayedGraph
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
@@ -38,7 +38,7 @@ AVERAGED = 100  # gradient steps that the exported weights are a mean of, at mos
 WATCHED = 50
 
 
-class Network(nn.Module):
+class EstimatorNetwork(nn.Module):
     """The estimator as it is trained; see :class:`visthrow.onboard.estimator.Estimator` for its
     parts and shapes.
     """
@@ -63,7 +63,7 @@ class Network(nn.Module):
         self.register_buffer("learnt", learnt.float())
 
     def frozen(self) -> Estimator:
-        """The estimator that flies; it shares the parameters."""
+        """Return the estimator that flies; it shares the parameters."""
         mask = self.learnt
         gru = self.gru
         normaliser = self.normalizer
@@ -125,7 +125,7 @@ class Distillation:
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
         passed, learnt = _passed(env.layout, self._layout)
-        self.network = Network(passed, learnt, env.layout.dimension, self.p).to(device)
+        self.network = EstimatorNetwork(passed, learnt, env.layout.dimension, self.p).to(device)
         ranks.share(self.network)
         widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
         scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
@@ -145,7 +145,7 @@ class Distillation:
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=self.p.learning_rate, fused=on_gpu
         )
-        self.rollout = Replayed(self._fly) if on_gpu else self._fly
+        self.rollout = ReplayedGraph(self._fly) if on_gpu else self._fly
 
     @torch.no_grad()
     def _fly(self) -> None:

@@ -66,7 +66,7 @@ class TrainLog:
         writer.writerows(rows)
         atomic_write(path, text.getvalue())
         self._before = float(rows[-1]["wall_s"]) if rows else 0.0
-        self._picture = Picture(rows) if sys.stdout.isatty() else None
+        self._picture = ProgressPicture(rows) if sys.stdout.isatty() else None
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(
@@ -117,7 +117,7 @@ class TrainLog:
         return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed_)
 
 
-class Picture:
+class ProgressPicture:
     """Landing error against wall time, and where the last evaluation's throws landed, drawn over
     itself.
     """
@@ -152,7 +152,7 @@ class Picture:
         self._lines = len(lines)
 
     def lines(self) -> list[str]:
-        """The picture without its head line."""
+        """Return the picture without its head line."""
         chart = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
         points = []
         last = self._last
@@ -179,7 +179,7 @@ def evaluated(throws: Throws) -> dict[str, float]:
 
 
 def figures_text(figures: dict) -> str:
-    """An evaluation in words."""
+    """Return an evaluation in words."""
     return (
         f"{figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s, landed"
         f" {100 * figures['landed_2m']:.1f} %"

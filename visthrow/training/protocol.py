@@ -16,8 +16,8 @@ from visthrow.training.env import ThrowEnv
 
 
 def hover_start(experiment: Experiment) -> Experiment:
-    """The experiment with its episodes started from hover; cables and payloads vary as in the
-    experiment.
+    """Return the experiment with its episodes started from hover; cables and payloads vary as in
+    the experiment.
     """
     fields = (
         "tether_variants",

@@ -41,7 +41,7 @@ def while_carrying(
     time: Array | float,
     landing_height: float,
 ) -> dict[str, Array]:
-    """Ends of a throw before the latch trips; the payload on the ground is not in the
+    """Return the ends of a throw before the latch trips; the payload on the ground is not in the
     paper, whose bounds leave it open.
 
     Args:

@@ -71,7 +71,7 @@ class Algorithm(Protocol):
         """
 
     def export(self, contract: dict, made_by: dict) -> Policy:
-        """The policy as a file's content."""
+        """Return the policy as a file's content."""
 
     def take_up(self, policy: Policy) -> None:
         """Start from a policy that :func:`fitted` found to fit: its weights, and its normaliser,
@@ -103,8 +103,8 @@ def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algor
 
 
 def fitted(experiment: Experiment, policy: Policy) -> Experiment:
-    """The experiment with the policy's layers as its actor's, for a training that starts from the
-    policy.
+    """Return the experiment with the policy's layers as its actor's, for a training that starts
+    from the policy.
 
     MismatchError where the experiment's task observes or acts otherwise; the message names every
     difference."""

@@ -68,8 +68,8 @@ def _look(series: int) -> tuple[str, str]:
 def _axes(
     count: int, columns: int, width: float, height: float, margin: float, sharex: bool = False
 ) -> tuple[Any, Any]:
-    """A figure so wide [inch] with axes for ``count`` panels, each row so high, and
-    some room more.
+    """Return a figure so wide [inch] with axes for ``count`` panels, each row so high, and some
+    room more.
     """
     style.use()
     import matplotlib.pyplot as plt

@@ -21,7 +21,7 @@ def _marked(text: str) -> str:
 
 
 def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """The whole page; it loads nothing from elsewhere."""
+    """Return the whole page; it loads nothing from elsewhere."""
     import jinja2
     import markupsafe
 

@@ -8,8 +8,8 @@ DPI = 150.0  # of pictures
 
 
 def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
-    """A table as Markdown, columns aligned: the first ``heads`` columns stand left, all of them
-    without it, the others right.
+    """Return a table as Markdown, columns aligned: the first ``heads`` columns stand left, all of
+    them without it, the others right.
     """
     cells = [header, *rows]
     width = [max(len(row[i]) for row in cells) for i in range(len(header))]
@@ -90,7 +90,7 @@ def section(
     missing: Sequence[str] = (),
     head: str = "Not thrown yet",
 ) -> Section:
-    """A section of the parts that there are; at its end what is missing."""
+    """Return a section of the parts that there are; at its end what is missing."""
     reasons = "; ".join(dict.fromkeys(missing))
     return Section(
         name,

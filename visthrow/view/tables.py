@@ -58,7 +58,7 @@ COLUMNS = (
 
 
 def of_paper(name: str, target: float) -> str:
-    """The paper's error and duration, mean and deviation, in words; "-" where it has none."""
+    """Return the paper's error and duration, mean and deviation, as text; "-" without them."""
     paper = PAPER.get((name, target))
     return "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
 

@@ -91,7 +91,7 @@ def side_by_side(first: Sequence[str], right: Sequence[str], gap: int = 3) -> li
 
 
 def clock(seconds: float) -> str:
-    """A duration as minutes and seconds, hours where there are any."""
+    """Return a duration as minutes and seconds, hours where there are any."""
     if not math.isfinite(seconds):
         return "-"
     minutes, seconds_left = divmod(round(seconds), 60)

@@ -49,11 +49,11 @@ class Scenes:
         return len(self.pose)
 
     def to(self, device: str | torch.device) -> "Scenes":
-        """The scenes on another device."""
+        """Return the scenes on another device."""
         return Scenes(*(getattr(self, item.name).to(device) for item in fields(self)))
 
     def part(self, rows: slice) -> "Scenes":
-        """Some of the scenes."""
+        """Return some of the scenes."""
         return Scenes(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
@@ -77,7 +77,7 @@ class Draw:
         return low + (high - low) * torch.rand(self.count, *shape, generator=self.generator)
 
     def normal(self, std: float, *shape: int) -> Tensor:
-        """Normal numbers, shape (E, ...)."""
+        """Return the normal numbers, shape (E, ...)."""
         return std * torch.randn(self.count, *shape, generator=self.generator)
 
     def one_of(self, count: int, *shape: int) -> Tensor:
@@ -333,7 +333,7 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
 
 
 def _quat(rot: Tensor) -> Tensor:
-    """Unit quaternions xyzw of rotation matrices, shape (E, 4)."""
+    """Return the unit quaternions xyzw of rotation matrices, shape (E, 4)."""
     return torch.from_numpy(Rotation.from_matrix(rot.double().numpy()).as_quat()).float()
 
 

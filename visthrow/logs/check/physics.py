@@ -262,7 +262,7 @@ def _disagrees(relation: relations.Relation) -> bool:
 
 
 def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
-    """The mean force on the body, turned to the world, must hold the vehicle up."""
+    """Check that the mean force on the body, turned to the world, carries the vehicle."""
     if "acc_b" not in log:
         return []
     (time_q, q) = log[quat].samples()
@@ -615,7 +615,7 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
 
 
 def _length(middle: float, expected: float, channels: str) -> list[Row]:
-    """The cable as measured against the model's."""
+    """Compare the measured cable with the model's."""
     off = middle / expected - 1.0
     figures = {"median_m": middle, "model_m": expected}
     text = f"apart by {100 * off:+.1f} % of the model's cable of {expected:g} m"

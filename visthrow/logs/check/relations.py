@@ -290,8 +290,8 @@ def unit_hint(ratio: float) -> str:
 def derivative(
     time: np.ndarray, values: np.ndarray, span: float = 0.06
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative over about ``span`` seconds, or two periods where these are longer; gaps are left
-    out.
+    """Return the derivative over about ``span`` seconds, or two periods where these are longer;
+    gaps are left out.
 
     Returns times [s] and derivatives.
     """

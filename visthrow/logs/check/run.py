@@ -188,8 +188,8 @@ def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
 
 
 def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[Row]]:
-    """Logs whose thrust stands to the force otherwise than in the others: another battery, vehicle,
-    payload or map.
+    """Report logs whose ratio of force to thrust differs from the others': another battery,
+    vehicle, payload or map.
     """
     masses = {
         i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, vehicle)) is not None
@@ -210,7 +210,7 @@ def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[
 
 
 def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
-    """Logs of several vehicles with one payload: how far their clocks are apart."""
+    """Compare the clocks of several vehicles that carry one payload."""
     rows_of: dict[int, list[Row]] = {}
     named = [
         i

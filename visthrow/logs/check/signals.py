@@ -61,7 +61,7 @@ _STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm",
 
 
 def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
+    """Return the standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
 
     Third differences of a motion that is smooth over four samples vanish; those of white noise have
     20 times its variance. ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: which
@@ -76,7 +76,8 @@ def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -
 
 
 def noise(channel: Channel) -> np.ndarray:
-    """Standard deviation of the sensor's noise, from third differences of evenly spaced samples.
+    """Return the standard deviation of the sensor's noise, from third differences of evenly spaced
+    samples.
 
     Returns one value a component, in the channel's unit; NaN where there are too few samples.
     """
@@ -278,7 +279,7 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
 
 
 def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[Row]:
-    """Steps that no motion makes, from sample to sample and across gaps."""
+    """Report steps that no motion makes, from sample to sample and across gaps."""
     if "quat" in name:
         values = continuous(values)
     size = np.linalg.norm(np.diff(values, axis=0), axis=1)

@@ -160,8 +160,8 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
 
 
 def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Times [s] and specific force along body z [m/s^2], shape (N, 1), by the accelerometer or by
-    the path.
+    """Return the times [s] and specific force along body z [m/s^2], shape (N, 1), by the
+    accelerometer or by the path.
     """
     if felt == "acc_b":
         if "acc_b" in log:

@@ -52,8 +52,8 @@ def _t(
     axes: str = NED,
     **options,
 ) -> Tap:
-    """A tap; of those to one channel the first that is there is used. ``good``: flags that are 1
-    where a sample is valid, or quality, which is 0 or more.
+    """Return a tap; of those to one channel the first that is there is used. ``good``: flags that
+    are 1 where a sample is valid, or quality, which is 0 or more.
     """
     columns = tuple(fields.split())
     turned = kind != "vector"

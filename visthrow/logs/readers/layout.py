@@ -120,7 +120,7 @@ def layout_of(text: str, name: str = "") -> Layout:
 
 
 def _separator(lines: list[str]) -> str:
-    """The mark that cuts most lines into the same number of cells, most of them numbers."""
+    """Return the mark that cuts most lines into the same number of cells, most of them numbers."""
     sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
     best, separator = 0.0, ","
     for mark in MARKS:
@@ -223,7 +223,7 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
 
 
 def _joined(name: str, last: str, unit: str, settings: dict[str, str]) -> str:
-    """A name with its unit; a subject that bears the name of its body is named once."""
+    """Return a name with its unit; a subject that bears the name of its body is named once."""
     parts = name.split(".")
     name = ".".join(p for i, p in enumerate(parts) if i == 0 or p != parts[i - 1])
     if not unit and UNIT_OF_LENGTH in settings and "Position" in parts:

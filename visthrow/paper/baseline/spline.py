@@ -132,7 +132,7 @@ class Spline:
 
 
 def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
-    """Derivatives of the monomials t^0 to t^7 at times, shape (T, derivatives, 8)."""
+    """Return the derivatives of the monomials t^0 to t^7 at times, shape (T, derivatives, 8)."""
     n = np.arange(derivatives)[:, None]
     k = np.arange(ORDER)
     return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
@@ -310,7 +310,7 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
 
 
 def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, np.ndarray]:
-    """The best of a path that is shortened step by step, each from the one before, till the
+    """Return the best of a path that is shortened step by step, each from the one before, till the
     objective is :data:`HOPELESS` times the best.
 
     From a long path down, the vehicle never turns over: short plans have local optima in which it
@@ -391,8 +391,8 @@ def _thrust(
 
 
 def _unit(*chain: np.ndarray) -> list[np.ndarray]:
-    """Unit vector of the first and its derivatives, from a vector and its derivatives, shape (T, D)
-    each.
+    """Return the unit vector of the first and its derivatives, from a vector and its derivatives,
+    shape (T, D) each.
     """
 
     def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

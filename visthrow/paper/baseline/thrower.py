@@ -60,7 +60,7 @@ def unit(
     overrides: Sequence[str] = (),
     batch: int = 0,
 ) -> dict[str, Any]:
-    """Unit of so many throws with the baseline at a target [m] along x.
+    """Return the unit of so many throws with the baseline at a target [m] along x.
 
     Args:
         plant: :data:`IDEAL`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the
@@ -123,7 +123,7 @@ def plan_of(
     rho: float,
     bounds: str,
 ) -> ThrowPlan:
-    """The plan of a unit, whose entries the arguments are."""
+    """Return the plan of a unit, whose entries the arguments are."""
     params = replace(PlanParams(), duration=w_t, energy=rho)
     params = params if bounds == BOUNDS[0] else payload_bounds_only(params)
     return plan_throw(

@@ -208,7 +208,7 @@ def sections(thrown) -> list:
 
 
 def summary(thrown) -> str:
-    """The table that is printed."""
+    """Return the table that is printed."""
     from visthrow.paper.report.throws import throws_section
     from visthrow.view.parts import Grid
 

@@ -134,8 +134,8 @@ def _rows(
 
 
 def paper_ratio(variant: str) -> st.Interval | None:
-    """The paper's ratio with a normal interval from its deviations and numbers of throws; None for
-    what it leaves out.
+    """Return the paper's ratio with a normal interval from its deviations and numbers of throws;
+    None for what it leaves out.
     """
     if variant not in PAPER_ABLATIONS:
         return None

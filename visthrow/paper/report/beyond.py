@@ -34,7 +34,7 @@ TITLES = {
 
 
 def section(thrown: ResultSet) -> Section:
-    """Moving targets, varied payloads, drag, far targets."""
+    """Report moving targets, varied payloads, drag and far targets."""
     lead = Text(
         "Each is a switch of the task's config, off by default. Policies trained with it stand"
         " beside those trained without."
@@ -294,7 +294,7 @@ def _run_row(run: dict) -> tuple[str, ...]:
 
 
 def origin_section(thrown: ResultSet) -> Section:
-    """A row for each command and commit that made throws, and seeds."""
+    """Return a row for each command and commit that made throws, and seeds."""
     groups: dict[tuple[str, ...], list] = defaultdict(list)
     for r in thrown.results:
         origin = r.provenance

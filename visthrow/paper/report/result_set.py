@@ -90,8 +90,8 @@ class ResultSet:
     def by_departure(
         self, policy: str, key: str, plant: str = "hybrid", target: float = 2.0
     ) -> list[tuple[Any, Result]]:
-        """A shipped policy's throws with one value of the config changed: the value and the throws,
-        ascending.
+        """Return a shipped policy's throws with one value of the config changed: the value and the
+        throws, ascending.
         """
         collected = [
             r

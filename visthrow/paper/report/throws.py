@@ -183,8 +183,8 @@ def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
 def _groups(
     thrown: ResultSet, plant: str, target: float
 ) -> tuple[tuple[list[Result], list[Result]], str] | None:
-    """Runs of both layouts: those trained for the comparison where two or more of each are there,
-    else the shipped ones.
+    """Return the runs of both layouts: those trained for the comparison where two or more of each
+    are there, else the shipped ones.
     """
     trained = [thrown.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
     if min(map(len, trained)) >= 2:
@@ -196,8 +196,8 @@ def _groups(
 
 
 def _paper(target: float) -> tuple[st.Interval, float] | None:
-    """The paper's differences: errors [m] with a normal interval from its deviations, ten throws
-    each, and durations [s].
+    """Return the paper's differences: errors [m] with a normal interval from its deviations, ten
+    throws each, and durations [s].
     """
     vision = PAPER.get(("vision", target))
     state = PAPER.get(("state", target))

@@ -184,8 +184,8 @@ def _bar(thrown: ResultSet) -> str:
 def front_section(
     thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
 ) -> Section:
-    """The sweep on each plant, as in :data:`PANELS`, with the policies of these names on it, and
-    who beats whom.
+    """Return the sweep on each plant, as in :data:`PANELS`, with the policies of these names on it,
+    and who beats whom.
     """
     panels = []
     sentences = []
@@ -404,7 +404,7 @@ def _count(points: Sequence) -> str:
 
 
 def _breakdown(thrown: ResultSet) -> Grid | None:
-    """The paper's table of settings, and ours of the own model."""
+    """Return the paper's table of settings, and ours of the own model."""
     selected = _swept(_of_baseline(thrown, thrower.IDEAL))
     if not selected:
         return None

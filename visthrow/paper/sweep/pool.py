@@ -35,7 +35,7 @@ class Task:
     gpu: bool  # goes to one of the devices; else to a CPU core
 
     def log(self, out: Path) -> Path:
-        """The process's output."""
+        """Return the process's output."""
         return out / "logs" / f"{self.name.replace('/', '_')}.txt"
 
 

@@ -24,7 +24,7 @@ CURVE_POINTS = 60  # points of a run's learning curve in the record
 
 
 def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
-    """A line a run, a last one with the sum, and whether all is done."""
+    """Return a line a run, a last one with the sum, and whether all is done."""
     lines = []
     seconds = 0.0
     remaining = 0
@@ -128,7 +128,7 @@ def _final(source: ResultSource, out: Path) -> dict[str, float | None]:
 
 
 def _run(source: ResultSource, out: Path) -> dict[str, Any]:
-    """A finished training for the record."""
+    """Return a finished training for the record."""
     rows = _progress(source, out)
     summary = _summary(source, out)
     experiment = source.experiment()

@@ -180,8 +180,8 @@ def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
 
 
 def load(unit: ThrowUnit, out: Path) -> Loaded:
-    """The policy with the experiment that it is to fly in; MismatchError where the list does not
-    allow what differs.
+    """Return the policy with the experiment that it is to fly in; MismatchError where the list does
+    not allow what differs.
     """
     layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
     name, changes = unit.flown_in(

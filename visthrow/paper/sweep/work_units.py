@@ -55,7 +55,7 @@ class ResultSource:
         return out / "train" / self.id
 
     def policy(self, out: Path) -> Path:
-        """The policy's path, existing or not."""
+        """Return the policy's path, existing or not."""
         return self.folder(out) / POLICY if self.config else find_policy(self.name)
 
     def done(self, out: Path) -> bool:
@@ -63,7 +63,7 @@ class ResultSource:
         return not self.config or (self.folder(out) / SUMMARY).is_file()
 
     def experiment(self) -> Experiment:
-        """The configuration of its training."""
+        """Return the configuration of its training."""
         return _experiment(self.config, self.changes)
 
     @property
@@ -121,7 +121,9 @@ class ThrowUnit:
         return unit if self.batch is None else {**unit, "batch": self.batch}
 
     def experiments(self, out: Path) -> tuple[dict, dict]:
-        """The policy's own config and the one it is flown in, without the learning parameters."""
+        """Return the policy's own config and the one it is flown in, without the learning
+        parameters.
+        """
         source = self.source
 
         def stated(name: str, changes: tuple[str, ...]) -> dict[str, Any]:
@@ -160,7 +162,7 @@ class SweepWork:
     checkpoint_every: int  # iterations
 
     def source(self, name: str) -> ResultSource:
-        """The training of that id; ConfigError where the list has changed."""
+        """Return the training of that id; ConfigError where the list has changed."""
         sources = {source.id: source for source in self.sources}
         if name not in sources:
             raise ConfigError(f"no run '{name}' in the list; {suggest(name, sources)}")
@@ -168,7 +170,7 @@ class SweepWork:
 
 
 def throws_folder(out: Path) -> Path:
-    """The folder of results of throws."""
+    """Return the folder of results of throws."""
     return out / "throws"
 
 

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from sim.torch_bridge import Replayed, on_torch_stream
+from sim.torch_bridge import ReplayedGraph, on_torch_stream
 from visthrow.common.errors import ConfigError
 from visthrow.common.free_fall import GRAVITY, fall_time
 from visthrow.onboard import actions as act
@@ -19,8 +19,8 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
 from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
-from visthrow.training.first_order.backward import Layers, Setting, backward
-from visthrow.training.first_order.surrogate import Course, Flights, course, fit
+from visthrow.training.first_order.backward import BackwardParams, Layers, backward
+from visthrow.training.first_order.surrogate import Course, FlightBatch, course, fit
 from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
@@ -92,7 +92,7 @@ class FirstOrder:
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
         self.flights, (self.adjoint, adjoint) = (
-            Flights(env, self.p.horizon),
+            FlightBatch(env, self.p.horizon),
             course(self.p.horizon, env.num_envs, device),
         )
         self.layers = Layers(self.network, self.flights.obs)
@@ -104,7 +104,7 @@ class FirstOrder:
             self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu
         )
         self.rollout, self.backward = (
-            Replayed(work) if on_gpu else work for work in (self._fly, self._run_backward)
+            ReplayedGraph(work) if on_gpu else work for work in (self._fly, self._run_backward)
         )
 
     @property
@@ -253,8 +253,8 @@ class FirstOrder:
         return (self.p.saturation * past.sum(0) - gain).mean() * p.scale, figures
 
     def derivatives(self) -> dict[str, Tensor]:
-        """Derivatives of the cost of the last rollout by the actions, as the layers hold them;
-        returns figures.
+        """Write the derivatives of the last rollout's cost by the actions into the layers; return
+        figures.
         """
         f = self.flights.x
         T = self.flights.last
@@ -279,11 +279,11 @@ class FirstOrder:
         return {name: figure.detach() for name, figure in (figures | {"cost": cost}).items()}
 
     def _recorded(self, adjoint: Course) -> list[wp.Launch]:
-        """Launches of the backward kernel, a step each."""
+        """Return the launches of the backward kernel, a step each."""
         env = self.env
         flights = self.flights
         action = self.cfg.task.action
-        p = Setting()
+        p = BackwardParams()
         p.max_thrust = action.max_thrust
         p.max_rate = wp.vec3(*action.max_rate)
         p.history = env.layout.history
@@ -296,7 +296,7 @@ class FirstOrder:
             "age": env.delay.age,
         }
         for name, tensor in (self.surrogate | plants).items():
-            setattr(p, name, wp.from_torch(tensor, dtype=Setting.vars[name].type.dtype))
+            setattr(p, name, wp.from_torch(tensor, dtype=BackwardParams.vars[name].type.dtype))
         remainder = map(
             wp.from_torch,
             (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action),

@@ -25,7 +25,7 @@ PREVIOUS_AT, GOAL_AT, LOAD_AT = (
 
 
 @wp.struct
-class Setting:
+class BackwardParams:
     """The dimensions of flights and policy."""
 
     response: wp.array(dtype=wp.vec4)
@@ -44,14 +44,14 @@ class Setting:
 
 @wp.func
 def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
-    """Derivative by the turn of what has the derivative ``grad_w`` by the world vector
+    """Return the derivative by the turn of what has the derivative ``grad_w`` by the world vector
     ``R arm_b``.
     """
     return wp.cross(arm_b, wp.quat_rotate_inv(quat, grad_w))
 
 
 @wp.func
-def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
+def step_back(p: BackwardParams, x: Course, adj: Course, k: int, e: int):
     """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k +
     1 make of them.
     """
@@ -117,13 +117,13 @@ def step_back(p: Setting, x: Course, adj: Course, k: int, e: int):
 
 @wp.func
 def three(by_seen: wp.array2d(dtype=float), e: int, i: int):
-    """Derivative by three columns of an observation."""
+    """Return the derivative by three columns of an observation."""
     return wp.vec3(by_seen[e, i], by_seen[e, i + 1], by_seen[e, i + 2])
 
 
 @wp.func
 def seen_back(
-    p: Setting,
+    p: BackwardParams,
     x: Course,
     adj: Course,
     by_seen: wp.array2d(dtype=float),
@@ -150,7 +150,7 @@ def seen_back(
 @wp.kernel(module="unique", enable_backward=False)
 def backward(
     # Params:
-    p: Setting,
+    p: BackwardParams,
     k: int,
     # State in:
     adj: Course,

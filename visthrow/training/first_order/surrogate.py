@@ -71,8 +71,8 @@ def course(steps: int, count: int, device: str) -> tuple[dict[str, Tensor], Cour
     return x, course_
 
 
-class Flights:
-    """Flights without release and the plants that make them.
+class FlightBatch:
+    """A batch of flights without release and the plants that make them.
 
     Attributes:
         x, course: states and commands; see :func:`course`. obs: what the actor observes, shape (T,
@@ -171,7 +171,7 @@ def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
     """
     period = env.cfg.sim.control_period
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
-    flights = Flights(env, steps)
+    flights = FlightBatch(env, steps)
     parts = []
     spread = torch.tensor(EXCITED, device=env.device)
     hover = env.previous_action.clone()
@@ -204,7 +204,7 @@ def _solve(features: Tensor, target: Tensor) -> Tensor:
     return torch.linalg.solve(scaled.mT @ scaled + ridge, scaled.mT @ target) / scale
 
 
-def _regressors(flights: Flights, lags: int, period: float) -> dict[str, Tensor]:
+def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Tensor]:
     """Rows of the three regressions from the whole steps of flights; those of the tension count
     where the rope is taut.
     """

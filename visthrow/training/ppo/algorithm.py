@@ -19,8 +19,8 @@ WARM_UP_RATE = 2e-3  # learning rate of a critic that learns alone; nothing that
 
 
 def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
-    """Configuration dictionary of rsl_rl 5.5 for our parameters; both observation
-    groups are named.
+    """Return the configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups
+    are named.
     """
     network = {
         "class_name": Network,

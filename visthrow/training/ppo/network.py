@@ -144,8 +144,8 @@ def cosine_rate(
 
 
 def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
-    """Running mean of a module's weights over the last quarter of its updates, ``window`` of them
-    at most.
+    """Return the running mean of a module's weights over the last quarter of its updates,
+    ``window`` of them at most.
 
     One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and
     Juditsky, SIAM J. Control and Optimization 30(4), 1992."""

@@ -271,7 +271,7 @@ class _Decoder:
         raise Corrupt
 
     def _skipped(self) -> int:
-        """Iterations since the last main frame that are left out on purpose."""
+        """Return the iterations since the last main frame that are left out on purpose."""
         if self.last_iteration is None:
             return 0
         following = range(self.last_iteration + 1, self.last_iteration + 1 + self.interval)
