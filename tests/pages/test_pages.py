@@ -11,7 +11,7 @@ LONGEST_README = 120
 """Lines: what a newcomer reads in two minutes."""
 MEAN_WORDS = 18
 """Of a sentence, in the mean of a page, at most."""
-MOST_WORDS = 15_500
+MOST_WORDS = 15_000
 """Of README and site together."""
 COMMENTS = r"<!--.*?-->"
 
