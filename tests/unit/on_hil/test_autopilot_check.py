@@ -1,10 +1,11 @@
 """What a recorded run says of its hover, and what its summary keeps of the autopilot."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
-from hil.check import AutopilotCheck, hover_of_run
+from hil.check import SETTLING, AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
 from hil.control.recording.record import CONFIG, TICKS, RunRecorder
 from hil.control.runner import Runner
@@ -15,10 +16,12 @@ from hil.links.backends.base import DryRun
 from hil.links.backends.betaflight import Betaflight
 from hil.links.backends.thrust import LEAST_SHARES
 from hil.params import HilParams
+from hil.poses.pose import VEHICLE
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers, pipe
 from visthrow import config
+from visthrow.cli import main
 from visthrow.onboard.policy import Policy, find_policy
 
 QUICK = ("states.check_hold=0.2",)
@@ -63,10 +66,39 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
     (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
     found, text = hover_of_run(tmp_path)
     assert found == good
+    assert main(["hil", "check", "--hover-of", str(tmp_path)]) == (0 if good else 1)
     ratio = float(text.split()[2])
     assert ratio == pytest.approx(factor, rel=0.01)
     share = float(text.split("the hover share is ")[1].split(",")[0])
     assert share == pytest.approx(0.1906 * ratio, rel=2e-3), "a straight line: as much more share"
+
+
+def test_a_hover_counts_once_it_has_settled(run, tmp_path):
+    """Neither the first second nor the one after a break is the hover's thrust."""
+    lines = [json.loads(line) for line in (run / TICKS).read_text().splitlines()]
+    flown = [i for i, line in enumerate(lines) if line["state"] == "ready" and line["command"]]
+    middle = flown[len(flown) // 2]
+    lines[middle]["state"] = "throw"
+    for i in (*flown[:SETTLING], *range(middle + 1, middle + 1 + SETTLING)):
+        lines[i]["command"][0] *= 3.0
+    for name in (CONFIG, "policy.npz"):
+        (tmp_path / name).write_bytes((run / name).read_bytes())
+    (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
+    assert hover_of_run(tmp_path)[1].startswith("hover took 1.0")
+
+
+@pytest.mark.parametrize(
+    ("height", "speed", "counted"), [(0.31, 0.14, 1), (0.29, 0.14, 0), (0.31, 0.16, 0)]
+)
+def test_each_report_of_a_steady_flight_counts_once(height, speed, counted):
+    params = config.load(HilParams, config.find("hil", "fake"))
+    backend = SimpleNamespace(share=0.2, service=lambda now: None)
+    check = AutopilotCheck(params, backend)
+    state = SimpleNamespace(pos=(0.0, 0.0, height))
+    track = SimpleNamespace(state=lambda now: state, calm_speed=lambda: speed)
+    for now in (0.0, 0.02, 0.04):
+        check.tick(now, SimpleNamespace(tracks={VEHICLE: track}))
+    assert f"not measured: {counted} of" in check.meter.summary_text(0.3)[1]
 
 
 def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
