@@ -16,7 +16,7 @@ import warp as wp
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
-from sim.params import GRAVITY, PlantParams
+from sim.params import GRAVITY, LawParams, PlantParams
 from sim.solvers.mujoco import _on_gpu
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
@@ -226,6 +226,13 @@ def test_what_a_solver_cannot_hold_is_refused():
     giving = dataclasses.replace(plant.rope, compliance=1e-3)
     with pytest.raises(ValueError, match="'exchanged_chain' with compliance"):
         HybridSim(dataclasses.replace(on(plant, "exchanged_chain", 0.002), rope=giving), 1)
+    in_joint = (LawParams("rope joint", (), "joint_rate", 1e-3),)
+    with pytest.raises(ValueError, match="law on the rope's joint"):
+        HybridSim(dataclasses.replace(on(plant, "exchanged_chain", 0.002), laws=in_joint), 1)
+    exact = on(plant, "mujoco_warp", 0.002)
+    exact = dataclasses.replace(exact, sim=dataclasses.replace(exact.sim, precision="float64"))
+    with pytest.raises(ValueError, match="precision 'float64'; expected 'float32'"):
+        HybridSim(exact, 1)
     with pytest.raises(ValueError, match="half the height of the box"):
         dataclasses.replace(plant.rope, payload_sides=(0.1, 0.1, 0.1))
     with pytest.raises(ValueError, match=r"expected a box .* and no gripper"):
