@@ -15,9 +15,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 CEILINGS = {
-    "bound function words": 1182,
+    "bound function words": 1181,
     "first lines without a subject": 119,
-    "class names twice": 16,
+    "class names twice": 8,
     "file names twice": 20,
     "wide lines": 1,
     "fmt: skip": 0,
