@@ -22,9 +22,9 @@ import numpy as np
 from bench import start
 from hil.control.hovering import Hovering
 from hil.params import HilParams
+from hil.poses.body_track import BodyState, Track
 from hil.poses.frames import FrameParams
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from hil.poses.track import BodyState, Track
 from hil.rehearsal.fake import SetPoints, WirePlant
 from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams, Mocap
 from hil.rehearsal.process import load_fake, load_plant

@@ -23,9 +23,9 @@ from hil.links.clock import Clock, ManualClock, MonotonicClock
 from hil.links.roster import Roster
 from hil.params import HilParams
 from hil.poses import handcarry
+from hil.poses.body_track import Track
 from hil.poses.pose import VEHICLE
 from hil.poses.sources.open_source import open_source, unit_problems
-from hil.poses.track import Track
 from visthrow import config
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.policy import Policy, find_policy

@@ -18,6 +18,7 @@ from hil.links.backends.betaflight import BetaflightParams
 from hil.links.backends.crazyflie import CrazyflieParams
 from hil.links.backends.px4 import Px4Params
 from hil.links.roster import MavlinkId, check_allowed
+from hil.poses.body_track import MOST_PREDICTION
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
@@ -26,7 +27,6 @@ from hil.poses.sources.images import ImageParams
 from hil.poses.sources.mavlink import BodyIds
 from hil.poses.sources.motion_capture import MocapParams, RigidBody
 from hil.poses.sources.player import CHANNELS, LogBody
-from hil.poses.track import MOST_PREDICTION
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn

@@ -8,8 +8,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
-from hil.poses.track import BodyState
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.hover import GRAVITY
 

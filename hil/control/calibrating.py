@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from camera.params import CameraParams
+from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
-from hil.poses.track import BodyState
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard import calibration
 from visthrow.onboard.calibration import Calibration, Hovered, Spreads

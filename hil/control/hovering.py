@@ -4,8 +4,8 @@ from collections import deque
 
 import numpy as np
 
+from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
-from hil.poses.track import BodyState
 from visthrow.onboard.hover import HoverController, HoverParams
 
 HOVER_TICKS = 50  # over which the hover's thrust is averaged: a second

@@ -14,7 +14,7 @@ from collections import deque
 
 import numpy as np
 
-from hil.poses.track import BodyState
+from hil.poses.body_track import BodyState
 from visthrow.common.rotations import rotate_one
 from visthrow.onboard.hover import GRAVITY
 

@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
-from hil.poses.track import BodyState
 from visthrow.common.errors import ConfigError
 from visthrow.common.rotations import tilt_and_heading
 from visthrow.config.bounds import Bounded, NotNegative, Positive

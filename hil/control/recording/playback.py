@@ -14,9 +14,9 @@ from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput, State, TickRecord
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
+from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection
 from hil.poses.pose import VEHICLE, Pose, Vector
-from hil.poses.track import BodyState
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.policy import Policy
 

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+from hil.poses.body_track import BodyState
 from hil.poses.gate import HOLD
 from hil.poses.pose import Vector
-from hil.poses.track import BodyState
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
 from hil.links.backends.base import FOLLOW, LAND, Status
 from hil.links.backends.base import HOLD as HOLDING
+from hil.poses.body_track import BodyState
 from hil.poses.gate import ABORT, HOLD
-from hil.poses.track import BodyState
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import PilotOutput

@@ -12,9 +12,9 @@ from hil.control.state_machine import Machine
 from hil.control.tick.body_estimate import Estimate
 from hil.links.backends.base import Backend
 from hil.params import HilParams
+from hil.poses.body_track import Track
 from hil.poses.detection import Detections
 from hil.poses.pose import PAYLOAD, VEHICLE
-from hil.poses.track import Track
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 

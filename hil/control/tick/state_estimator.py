@@ -6,11 +6,11 @@ from collections.abc import Callable
 from hil.control.state_machine import FLYING, State, TickRecord
 from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
+from hil.poses.body_track import BodyState, Track
 from hil.poses.detection import Detection
 from hil.poses.gate import HOLD, OK, Tether
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
 from hil.poses.sources.images import Hint
-from hil.poses.track import BodyState, Track
 
 # before the take-over a body that was refused or not seen for this long may reappear anywhere [s]
 REACQUIRE = 1.0

@@ -20,8 +20,8 @@ from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Rel
 from hil.links.backends.thrust import ThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import facts, values
+from hil.poses.body_track import Track
 from hil.poses.pose import VEHICLE
-from hil.poses.track import Track
 from visthrow.common.errors import ConfigError
 from visthrow.common.rotations import tilt_and_heading
 from visthrow.config.bounds import Bounded, NotNegative, Positive

@@ -12,7 +12,7 @@ from hil.control.aim import AimParams, ReleaseCheck
 from hil.control.runner import Runner
 from hil.errors import ConfigError
 from hil.params import HilParams
-from hil.poses.track import BodyState
+from hil.poses.body_track import BodyState
 from tests.hil_flight import Spy, fly, params, simple_policy
 from visthrow import config
 from visthrow.onboard.actions import hover_action

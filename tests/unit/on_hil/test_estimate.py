@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hil.poses.body_track import TRUST, Track
 from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
 from hil.poses.pose import Pose
-from hil.poses.track import TRUST, Track
 from visthrow.common.errors import ConfigError
 
 PERIOD = 0.01

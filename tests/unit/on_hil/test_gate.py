@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hil.links.clock import ManualClock, MonotonicClock, Ticker
+from hil.poses.body_track import Track
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import ABORT, HOLD, OK, WARN, Gate, GateParams, Tether
 from hil.poses.pose import Pose
-from hil.poses.track import Track
 from visthrow.common.errors import ConfigError
 
 PARAMS = GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from hil.control.safety import FenceParams, Guard, GuardParams, box_violation, fence_violation
-from hil.poses.track import BodyState
+from hil.poses.body_track import BodyState
 
 DECELERATION = 12.0  # m/s^2
 FENCE = FenceParams(
