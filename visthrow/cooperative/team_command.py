@@ -86,7 +86,7 @@ def _fault(name: str) -> str:
 def _fly(args: argparse.Namespace) -> int:
     """Throw once and write what came of it."""
     from visthrow.common.storage import writable
-    from visthrow.cooperative.track import record_throw, write
+    from visthrow.cooperative.throw_track import record_throw, write
 
     folder, fault = Path(args.out), _fault(args.fault)
     writable(folder)

@@ -18,7 +18,7 @@ from visthrow.onboard.observations import rotation_from_quat
 
 
 @dataclass(frozen=True)
-class Track:
+class ThrowTrack:
     """A throw of V vehicles whose cables have L segments, T steps until the last separation.
 
     World frame, [m] and [s].
@@ -39,7 +39,7 @@ class Track:
 
 def record_throw(
     experiment: TeamExperiment, policy: Callable[[torch.Tensor], torch.Tensor], **options: Any
-) -> Track:
+) -> ThrowTrack:
     """Fly one throw; options as of :func:`visthrow.cooperative.team_training.fly`."""
     rows: list[dict[str, np.ndarray]] = []
 
@@ -60,7 +60,7 @@ def record_throw(
     flight = np.linspace(0.0, max(float(values["time_to_impact"][0]), 0.0), 30)[:, None]
     fall = np.array([0.0, 0.0, -0.5 * GRAVITY]) * flight**2
     released = bool(values["released"][0])
-    return Track(
+    return ThrowTrack(
         time=period * np.arange(len(rows)),
         flight_time=period * len(rows) + flight[:, 0],
         flight_w=values["load_w"][0] + flight * values["load_vel_w"][0] + fall,
@@ -76,7 +76,7 @@ GHOSTS = 5
 """Times at which the picture shows vehicles and cables."""
 
 
-def picture(track: Track, path: Path) -> None:
+def picture(track: ThrowTrack, path: Path) -> None:
     """Write a picture: from the side, and from above."""
     style.use()
     import matplotlib.pyplot as plt
@@ -110,7 +110,7 @@ def picture(track: Track, path: Path) -> None:
     plt.close(figure)
 
 
-def write_recording(track: Track, path: Path, radius: float) -> None:
+def write_recording(track: ThrowTrack, path: Path, radius: float) -> None:
     """Write a recording for the rerun viewer; ``radius``: of the load [m]."""
     import rerun as rr
 
@@ -141,7 +141,7 @@ def write_recording(track: Track, path: Path, radius: float) -> None:
             stream.log("world/load", rr.Points3D([place], radii=radius, colors=[load]))
 
 
-def write(track: Track, folder: Path, radius: float) -> list[Path]:
+def write(track: ThrowTrack, folder: Path, radius: float) -> list[Path]:
     """Write picture, recording and arrays into a folder; the recording where rerun is there."""
     import importlib.util
 
