@@ -23,7 +23,7 @@ STROKES = (0.16, 0.32, 0.64)  # of the doublets, one way, then the other [s]
 LAGS = (0.05, 0.15, 0.45)  # time constants of an answer to a command that are tried [s]
 DEADS = 6
 """Dead times before an answer that are tried, in ticks: real autopilots are half way after 25 to
-100 ms. Of an axis the pair of time constant and dead time counts that explains most.
+100 ms. Of each sign of an axis the pair of time constant and dead time counts that explains most.
 """
 RATE_NOISE = 0.01  # least change of a reported rate from tick to tick in a hover [rad/s]
 GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
@@ -68,9 +68,13 @@ class Response:
         self._speed = self._height = 0.0  # expected from the commands, upwards [m/s], [m]
         self._heights: list[float] = []  # above the expected ones [m]
         tried = (len(LAGS), DEADS, 3)
-        self._agreement, self._noise = np.zeros(tried), np.full(tried, 1e-9)
-        # of changes that were reported and those that commands lead to: their product, the squares
+        # of changes of rates that were reported and those that commands lead to: their product,
+        # the squares
         self._sums = np.full((3, *tried), 1e-9)
+        self._angle = np.zeros(3)  # turned since the beginning, by poses [rad]
+        self._commanded_angles = np.zeros(tried)  # that commands lead to [rad]
+        self._angles: list[np.ndarray] = []
+        self._all_commanded_angles: list[np.ndarray] = []
         self._before = deque(maxlen=HOVERED)  # reported rates of the autopilot's own hover
         self._reported: np.ndarray | None = None
         self.reported = 0
@@ -112,8 +116,6 @@ class Response:
         self._commands.appendleft(np.array(command))
         change = self._shares * (np.array(self._commands) - self._responses)
         self._responses = self._responses + change
-        # sums of turns telescope: the noise of an attitude counts as often as the rate changes
-        self._noise += (ANGLE_NOISE * change[..., 1:]) ** 2
 
     def pause(self, rates: tuple[float, ...] | None = None) -> None:
         """Note a tick in which nothing of ours was followed, and the rates reported then."""
@@ -155,21 +157,7 @@ class Response:
         self.reported += 1
         if self.reported < FEWEST_RATES:
             return
-        right, reverse = self._misfit(GAINS), self._misfit(-GAINS)
-        fitted = np.minimum(right, reverse)
-        noise = np.maximum(self._wandering(), fitted / self.reported)
-        # how much better one sign explains what was reported, in squared deviations
-        better = (reverse - right) / noise
-        self._judge(np.sign(better) * np.sqrt(np.abs(better)))
-
-    def _misfit(self, gains: np.ndarray) -> np.ndarray:
-        """Return the squares that the best time constant, dead time and gain between two leave of
-        what was reported [rad^2/s^2], shape (3,).
-        """
-        product, expected, reported = self._sums
-        gain = np.clip(product / expected, gains.min(), gains.max())
-        misfit = reported - 2.0 * gain * product + gain**2 * expected
-        return misfit.reshape(-1, 3).min(axis=0)
+        self._judge(_scores(self._sums, self._wandering(), self.reported))
 
     def _wandering(self) -> np.ndarray:
         """Return the variance of a reported rate from tick to tick in the autopilot's own hover
@@ -179,13 +167,24 @@ class Response:
         return np.maximum((changes**2).mean(axis=0), RATE_NOISE**2)
 
     def _judge_turns(self, vehicle: BodyState) -> None:
-        """Judge by poses, whenever all of a doublet was answered."""
-        self._agreement += self._responses[..., 1:] * turn_between(self._last.quat, vehicle.quat)
+        """Judge by poses, whenever all of a doublet was answered: by the angle that the vehicle has
+        turned, in which the noise of each pose counts once.
+        """
+        self._angle = self._angle + turn_between(self._last.quat, vehicle.quat)
+        turn = self._period * self._responses[..., 1:]
+        self._commanded_angles = self._commanded_angles + turn
+        self._angles.append(self._angle)
+        self._all_commanded_angles.append(self._commanded_angles)
         if self._ticks not in self._ends:
             return
-        scores = self._agreement / np.sqrt(self._noise)
-        which = np.abs(scores).reshape(-1, 3).argmax(axis=0)
-        self._judge(scores.reshape(-1, 3)[which, np.arange(3)])
+        # the attitude at the beginning is as noisy as any: only differences from the mean count
+        angles = np.array(self._angles)
+        angles = (angles - angles.mean(axis=0))[:, None, None, :]
+        commanded = np.array(self._all_commanded_angles)
+        commanded = commanded - commanded.mean(axis=0)
+        squares = [angles * commanded, commanded**2, angles**2 + 0.0 * commanded]
+        sums = np.array([part.sum(axis=0) for part in squares])
+        self._judge(_scores(sums, np.full(3, ANGLE_NOISE**2), len(angles)))
         if self.running and self._ticks == self._ends[-1]:
             self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
 
@@ -197,6 +196,33 @@ class Response:
             self.problem = (
                 f"{_names(wrong)}: the vehicle turns against its commands; a sign is wrong"
             )
+
+
+def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
+    """Return how much better the commanded sign explains each axis than the reverse, in deviations,
+    shape (3,).
+
+    Args:
+        sums: over what was measured and what commands lead to, of their product, of the commanded
+            squares, of the measured squares, for each time constant, dead time and axis, shape
+            (3, lags, dead times, 3).
+        variance: of the noise, shape (3,). count: of what was measured.
+    """
+    right = _misfit(sums, GAINS)
+    reverse = _misfit(sums, -GAINS)
+    noise = np.maximum(variance, np.minimum(right, reverse) / count)
+    better = (reverse - right) / noise
+    return np.sign(better) * np.sqrt(np.abs(better))
+
+
+def _misfit(sums: np.ndarray, gains: np.ndarray) -> np.ndarray:
+    """Return the squares that the best time constant, dead time and gain between two leave, shape
+    (3,).
+    """
+    product, commanded, measured = sums
+    gain = np.clip(product / np.maximum(commanded, 1e-12), gains.min(), gains.max())
+    misfit = measured - 2.0 * gain * product + gain**2 * commanded
+    return misfit.reshape(-1, 3).min(axis=0)
 
 
 def _names(which: np.ndarray) -> str:
