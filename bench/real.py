@@ -30,9 +30,9 @@ from visthrow.common.storage import write_json
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting import report
-from visthrow.diagnose.reporting.explain_cli import explained
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.search import diagnose
 from visthrow.logs.check.run import check
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -465,7 +465,7 @@ def run(task: tuple[Case, Path]) -> dict:
         setup, known = setups.load(name), setups.known(name)
         logs = case.change(_read(case.files, data, name))
         try:
-            diagnosis = explained(setups.model_of(setup, logs), logs, known)
+            diagnosis = diagnose(logs, setups.model_of(setup, logs), known=known)
             said = report.summary(diagnosis)
         except Exception as error:  # what a user would be told
             said = f"error: {error}\n" + "\n".join(
@@ -513,7 +513,7 @@ def _unseen(diagnosis, name: str, setup, logs: Logs, folder: Path) -> dict[str, 
     base = str(Path(name).resolve()) if Path(name).is_file() else f"diagnose/{name}.toml"
     (folder / "extended.toml").write_text(patch.of_setup(base, setup, whole, name, ()))
     extended = setups.model_of(setups.load(folder / "extended.toml"), logs)
-    found = on_others(setups.model_of(setup, logs), extended, {}, diagnosis)
+    found = on_others(setups.model_of(setup, logs), extended, {}, diagnosis).errors
     return {channel: list(errors) for channel, errors in found.items()}
 
 

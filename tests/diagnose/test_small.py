@@ -196,7 +196,7 @@ def test_a_swirl_on_a_slung_load_is_won_back():
     written = [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
     for before, after, noise in on_others(
         others, others.with_laws(written), {}, diagnosis
-    ).values():
+    ).errors.values():
         assert before > 10.0 * noise
         assert before - after > 0.8 * (before - noise)
 

@@ -1,12 +1,10 @@
-"""Intervals of sizes are widened by what flights may differ by, as far as the flights do not say
-otherwise.
-"""
+"""What another flight may differ by, as far as the flights do not say otherwise."""
 
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import allowed, differences
+from visthrow.diagnose.select.scatter import allowed, between_flights
 
 SIZE, OTHER = 20.0, 0.3
 """Of the named effect and of one that is not named, in floors."""
@@ -38,16 +36,19 @@ def interval(statistics: Statistics) -> tuple[float, float]:
     """Estimate of the named effect and its deviation."""
     spread = covariance(statistics.information.sum(0), PRIORS.deviation([0]))
     size = spread[0] @ statistics.absolute.sum(0)
-    more = differences(statistics, PRIORS, [0], np.array([size, 0.0]))[0] * allowed(size) ** 2
+    unlike, kept = between_flights(statistics, PRIORS, [0], np.array([size, 0.0]))
+    more = unlike * kept[0] * allowed(size) ** 2
     return size, np.sqrt(spread[0, 0] + OWN_FLOOR**2 + more)
 
 
 def test_one_flight_alone_tells_a_size_to_a_floor_and_a_third():
     """Nothing tells how flights differ, so that the prior stands."""
-    unlike = differences(
+    unlike, kept = between_flights(
         flights(np.full(1, SIZE), np.random.default_rng(1)), PRIORS, [0], np.array([SIZE, 0.0])
     )
-    np.testing.assert_allclose(unlike, 1.0, rtol=0.05)  # of the half-normal's square, over the grid
+    np.testing.assert_allclose(
+        unlike * kept, 1.0, rtol=0.05
+    )  # of the half-normal's square, over the grid
 
 
 def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter():
@@ -75,6 +76,6 @@ def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
 
 def test_without_names_nothing_is_added():
     """Bounds of a model that explains its flights are those of its noise and its floors."""
-    assert not differences(
+    assert not between_flights(
         flights(np.zeros(3), np.random.default_rng(4)), PRIORS, [], np.zeros(2)
-    ).any()
+    )[0]

@@ -83,6 +83,30 @@ def test_names_that_held_out_flights_do_not_confirm_are_candidates(monkeypatch):
     assert "do not confirm effect_05 (they bear out 40 % [-20, 100]" in diagnosis.reasons[0]
 
 
+def test_the_test_that_failed_is_told_with_the_flight_that_would_settle_it(monkeypatch):
+    """Here the names bring the nats that they promise, and no channel's error falls for sure."""
+    monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
+    gain = result.ChannelGain("pos_w", "m", 0.02, 0.019, 0.01, float("nan"), 0.05, -0.1, 0.2, ())
+    diagnosis = judged(monkeypatch, {"effect_05": 40.0}, channels=(gain,), folds=2)
+    assert diagnosis["effect_05"].verdict == result.CANDIDATE
+    assert "no channel's error falls for sure: pos_w 5 % [-10, 20]" in diagnosis.reasons[0]
+    assert "fly once more, such as: swing" in diagnosis.reasons[0]
+
+
+def test_nothing_is_named_over_an_interval_that_holds_zero():
+    """Also where the evidence for it is overwhelming."""
+    diagnosis = search.explain(
+        SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
+        laws=False,
+    )
+    findings = [replace(f, low=-f.low) if f.name == "effect_05" else f for f in diagnosis.findings]
+    wide = held_out.judged(replace(diagnosis, findings=tuple(findings)))
+    assert (wide.overall, dict(wide.theta)) == (result.UNKNOWN, {})
+    assert wide["effect_05"].verdict == result.CANDIDATE
+    assert "holds 0" in wide.reasons[0]
+    assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
+
+
 def test_names_that_do_harm_are_withdrawn(monkeypatch):
     diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=-0.1, low=-0.3, high=0.1)
     assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})

@@ -10,11 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from bench.diagnose import beside_aeroid
+from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, attitude, ball_log, fly
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
+from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel
@@ -24,7 +25,7 @@ from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.diagnose.reporting.gain import on_others
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import result, search
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -123,7 +124,7 @@ class TestBall:
         )
         unseen = paths + np.random.default_rng(2).normal(0.0, 5e-4, paths.shape)
         others = beside_aeroid.model_of(stamps, unseen)
-        errors = on_others(others, others, diagnosis.theta, diagnosis)
+        errors = on_others(others, others, diagnosis.theta, diagnosis).errors
         before, after, noise = errors["payload_pos_w"]
         assert before > 20.0 * noise
         assert 0.7 * noise < after < 1.3 * noise
@@ -296,6 +297,25 @@ class TestFlyer:
             FlyerModel([fly(6.0, seed=i) for i in range(3)], replace(FLYER, command_delay=LATE))
         )
         assert diagnosis.overall == "NO EFFECT"
+
+    @pytest.mark.parametrize("stated", [(), ("wind_x=0", "wind_y=0")])
+    def test_wind_is_told_as_wind_unless_the_air_is_stated_to_stand(self, stated, monkeypatch):
+        plain = flown.attitude
+
+        def north(time):
+            return Rotation.from_euler("ZYX", plain(time).as_euler("ZYX") * [0.0, 0.1, 0.1])
+
+        monkeypatch.setattr(flown, "attitude", north)
+        logs = [fly(6.0, drag=0.03, wind=1.5, seed=seed) for seed in range(3)]
+        model = FlyerModel(logs, replace(FLYER, drag_xy=0.03))
+        model.choose(
+            ["wind_x", "wind_y", "frame_tilt_y", "marker_rot_y", "thrust_gain", "cmd_delay"]
+        )
+        model.effects = measures.narrowed(model.effects, measures.parsed(stated))
+        found = search.explain(model, laws=False)
+        named = {f.name for f in found.findings if f.verdict in result.NAMED}
+        assert stated or not named & {"frame_tilt_y", "marker_rot_y"}
+        assert ("wind_x" in named) != bool(stated)
 
     def test_wind_a_late_attitude_and_thrust_that_fades_are_found(self):
         log = fly(6.0, drag=0.03, wind=1.5, late=0.02, fade=-0.004)

@@ -144,10 +144,27 @@ def test_errors_are_those_of_the_samples_ahead_added_up(found):
                 assert own.square[row, c, h] == pytest.approx(
                     sum((left[at] ** 2).sum() for at, (_, left, _, _) in zip(rows, parts))
                 )
-                assert own.floor[row, c, h] == pytest.approx(
-                    sum(floor[at].sum() for at, (_, _, floor, _) in zip(rows, parts))
+                floor = sum(
+                    expected[at].sum()
+                    if expected[at].sum() <= forms.FAR_ABOVE * (left[at] ** 2).sum()
+                    else (left[at] ** 2).sum()
+                    for at, (_, left, expected, _) in zip(rows, parts)
                 )
+                assert own.floor[row, c, h] == pytest.approx(floor)
                 assert own.count[row, c, h] == sum(at.sum() for at in rows)
+
+
+def test_a_state_that_the_head_hardly_tells_is_no_floor(found):
+    """The floor of one such window was twenty times the errors of all."""
+    _, diagnosis = found
+    point = diagnosis.work.after
+    vague = [
+        replace(w, nuisance_sd=1e3 * w.nuisance_sd, nuisance=1e3 * w.nuisance**3)
+        for w in point.windows
+    ]
+    groups = [w.flight for w in vague]
+    errors = forms.errors(vague, groups, point.noise, [w.residual for w in vague], 2)
+    assert np.all(errors.floor <= forms.FAR_ABOVE * errors.square)
 
 
 def test_noise_that_lasts_leaves_more_than_white_noise_does(found):

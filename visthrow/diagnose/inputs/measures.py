@@ -23,6 +23,8 @@ class Measurement:
     seconds: float
 
 
+RIGHT = 1e-3  # deviation of a value that is stated to be right, in what is negligible
+
 MEASUREMENTS = (
     Measurement(
         "weigh the vehicle", "mass_quad", 3e-4, 60.0
@@ -41,8 +43,8 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
 
     ``measured``: effect -> deviation of the measurement that the configuration's value comes from,
     in its unit.
-    Raises DiagnoseError: no effect of that name, or a deviation that is not above 0.
-    """
+    A deviation of 0 says that the configured value is right, such as ``wind_x=0`` in a hall. Raises
+    DiagnoseError: no effect of that name, or a deviation below 0."""
     expect_known(
         measured,
         [e.name for e in effects],
@@ -50,9 +52,9 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
         DiagnoseError,
     )
     for name, sd in measured.items():
-        if not sd > 0.0:
-            raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected one above 0")
-    own = [(e, measured.get(e.name, np.inf)) for e in effects]
+        if not sd >= 0.0:
+            raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected 0 or more")
+    own = [(e, measured.get(e.name, np.inf) or RIGHT * e.floor) for e in effects]
     within = [(max(e.bounds[0], -WITHIN * sd), min(e.bounds[1], WITHIN * sd)) for e, sd in own]
     return tuple(
         replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd))

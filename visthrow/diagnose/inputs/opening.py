@@ -1,13 +1,16 @@
 """From command line arguments to a model: which logs, read how, held against which simulation."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import WHOLE, add_common
 from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.select.result import Diagnosis
+from visthrow.logs.check.rows import Known
 from visthrow.logs.check.run import label
 from visthrow.logs.flightlog import FlightLog
 
@@ -57,34 +60,80 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_common(parser)
 
 
+class Opened:
+    """Logs, and the model of them once it is asked for.
+
+    Attributes:
+        logs: as they were read; once the model is built, with their commands corrected.
+    """
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        """Read the logs.
+
+        Raises ConfigError, LogError: as what is read."""
+        from visthrow.diagnose.inputs import setup
+
+        self._args, self.logs = args, setup.read_logs(args.logs, args.config)
+
+    @cached_property
+    def model(self) -> Model:
+        """Build the model.
+
+        Raises ConfigError, LogError, DiagnoseError: as what is built; ``--set`` with a setup's own
+        model."""
+        from visthrow.diagnose.inputs import measures, setup
+
+        args, logs = self._args, self.logs
+        chosen = setup.load(args.config) if args.config else None
+        if chosen is None or not chosen.model:
+            model, self.logs = throw_model(args, logs)
+        elif args.overrides:
+            raise ConfigError(
+                f"--set changes the throw's plant; the setup '{args.config}' has the model"
+                f" {chosen.model}"
+            )
+        else:
+            model = setup.model_of(chosen, logs)
+            if args.only is not None:
+                model.choose(args.only.split(","))
+        if args.measured:
+            model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
+        # day of each flight, from 0: what its log says, else those of one folder are of one
+        names = [
+            str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs
+        ]
+        model.days = tuple(map(list(dict.fromkeys(names)).index, names))
+        return model
+
+    @property
+    def known(self) -> Known:
+        """Return what is known of the vehicle."""
+        from visthrow.diagnose.inputs import setup
+
+        return setup.known(self._args.config)
+
+    def diagnose(self, laws: bool = True, say: Callable[[str], None] | None = None) -> Diagnosis:
+        """Diagnose the flights, as the arguments say."""
+        from visthrow.diagnose.select.search import diagnose
+
+        without = numbers(self._args.without, self.logs)
+        return diagnose(
+            self.logs,
+            lambda: self.model,
+            known=self.known,
+            seed=self._args.seed,
+            without=without,
+            laws=laws,
+            progress=say,
+        )
+
+
 def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
     """Read the logs and build the model.
 
-    Raises ConfigError, LogError, DiagnoseError: as what is read and built; ``--set`` with a setup's
-    own model."""
-    from visthrow.diagnose.inputs import measures, setup
-
-    logs = setup.read_logs(args.logs, args.config)
-    chosen = setup.load(args.config) if args.config else None
-    if chosen is None or not chosen.model:
-        model, logs = throw_model(args, logs)
-    elif args.overrides:
-        raise ConfigError(
-            f"--set changes the throw's plant; the setup '{args.config}' has the model"
-            f" {chosen.model}"
-        )
-    else:
-        model = setup.model_of(chosen, logs)
-        if args.only is not None:
-            model.choose(args.only.split(","))
-    if args.measured:
-        model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
-    # day of each flight, from 0: what its log says, else those of one folder are of one
-    names = [
-        str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs
-    ]
-    model.days = tuple(map(list(dict.fromkeys(names)).index, names))
-    return model, logs
+    Raises ConfigError, LogError, DiagnoseError: as :class:`Opened`."""
+    opened = Opened(args)
+    return opened.model, opened.logs
 
 
 def made_with(args: argparse.Namespace) -> dict[str, Any]:

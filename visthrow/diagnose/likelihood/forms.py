@@ -27,6 +27,8 @@ HORIZONS = (
 )  # upper ends of the horizons [s]; what lies beyond the last belongs to it
 
 
+FAR_ABOVE = 9.0  # times the squares that are left, from which an expectation is no floor of them
+
 UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marker_pos_c": "m"}
 """Of residuals: an attitude's are rotation vectors, and the small models have channels of their
 own.
@@ -51,9 +53,9 @@ class Errors:
 
     square: np.ndarray  # of what is left, in sigmas
     count: np.ndarray  # of samples
-    floor: (
-        np.ndarray
-    )  # squares expected of sensor noise and of the initial state's uncertainty alone
+    # squares expected of sensor noise and of the initial state's uncertainty alone; of a window in
+    # which that is far more than is left, as of a state that the head hardly tells, what is left
+    floor: np.ndarray
 
 
 def errors(
@@ -76,8 +78,11 @@ def errors(
     for window, f, residual in zip(windows, row, residuals):
         left, expected, horizon = predicted(window, noise, residual)
         ahead = horizon >= 0
-        for total, own in zip(sums, (left**2, np.ones_like(left), expected)):
-            np.add.at(total[f], (window.channel[ahead], horizon[ahead]), own[ahead])
+        own = np.zeros((3, channels, len(HORIZONS)))
+        for total, values in zip(own, (left**2, np.ones_like(left), expected)):
+            np.add.at(total, (window.channel[ahead], horizon[ahead]), values[ahead])
+        own[2] = np.where(own[2] > FAR_ABOVE * own[0], own[0], own[2])
+        sums[:, f] += own
     return Errors(*sums)
 
 

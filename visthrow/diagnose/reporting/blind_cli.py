@@ -37,20 +37,12 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place, write_json
-    from visthrow.diagnose.inputs import opening, setup
+    from visthrow.diagnose.inputs import opening
     from visthrow.diagnose.reporting import blind, pictures
-    from visthrow.diagnose.reporting.explain_cli import explained
 
     check_place(Path(args.out) / "blind.json")
-    model, logs = opening.open_model(args)
-    diagnosis = explained(
-        model,
-        logs,
-        setup.known(args.config),
-        args.seed,
-        opening.numbers(args.without, logs),
-        laws=False,
-    )
+    opened = opening.Opened(args)
+    diagnosis = opened.diagnose(laws=False)
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     hidden = blind.hide(diagnosis, seed=args.seed)
@@ -71,9 +63,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"  hidden {t.name} {t.size:+.3g} {t.unit}: {said}")
     value = {**dataclasses.asdict(hidden), "trials": [dataclasses.asdict(t) for t in trials]}
     folder = Path(args.out)
-    atomic_write(
-        folder / "completeness.png", pictures.completeness(hidden, [e.floor for e in model.effects])
-    )
+    floors = [e.floor for e in opened.model.effects]
+    atomic_write(folder / "completeness.png", pictures.completeness(hidden, floors))
     write_json(folder / "blind.json", value)
     if args.json:
         write_json(args.json, value)

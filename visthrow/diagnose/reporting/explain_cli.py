@@ -1,18 +1,15 @@
 """``visthrow diagnose explain``: what the model gets wrong about measured flights."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from visthrow.common.arguments import add_out
-from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, OUT_OF_DOMAIN, UNKNOWN, Diagnosis
+from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
 
-MOST_SPOILED = 0.5
-"""Share of the logs that may contradict themselves and be left out; where more do, nothing is to be
-learnt from any.
-"""
+if TYPE_CHECKING:
+    from visthrow.diagnose.inputs.opening import Opened
 
 # exit status where no cause can be named: the data contradict themselves, or the simulation does
 # not follow them
@@ -51,34 +48,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
     from visthrow.common.storage import check_place, write_json
-    from visthrow.diagnose.inputs import opening, setup
+    from visthrow.diagnose.inputs import opening
     from visthrow.diagnose.reporting import report
 
     if not args.no_report:
         check_place(Path(args.out) / "report.html")
-    model, logs = opening.open_model(args)
-    without = opening.numbers(args.without, logs)
-    others = (
-        opening.open_model(argparse.Namespace(**{**vars(args), "logs": args.test}))[0]
-        if args.test
-        else None
-    )
-    diagnosis = explained(
-        model, logs, setup.known(args.config), args.seed, without, lambda x: print(x, flush=True)
-    )
+    opened = opening.Opened(args)
+    others = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
+    diagnosis = opened.diagnose(say=lambda line: print(line, flush=True))
     gain = None
     if not args.no_report and diagnosis.work is not None:
         gain = write_report(
             Path(args.out),
             diagnosis,
-            model,
-            logs,
+            opened.model,
+            opened.logs,
             args.seed,
             not args.no_blind,
             opening.made_with(args),
         )
     print("\n" + report.summary(diagnosis, gain))
-    tested = _tested(others, diagnosis) if others is not None and diagnosis.work is not None else {}
+    tested = _tested(others, diagnosis) if args.test and diagnosis.work is not None else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
@@ -89,66 +79,31 @@ def run(args: argparse.Namespace) -> int:
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
-def explained(
-    model,
-    logs,
-    known,
-    seed: int = 0,
-    without: Sequence[int] = (),
-    say: Callable[[str], None] = lambda _: None,
-    *,
-    laws: bool = True,
-) -> Diagnosis:
-    """Leave out what contradicts itself, or repeats another log, and search for causes in the rest.
-
-    ``laws``: see :func:`visthrow.diagnose.select.search.explain`.
-    """
-    from visthrow.diagnose.select import search
-    from visthrow.logs.check.run import check, contradictions, copies
-
-    checked = check(logs, known)
-    reasons, spoiled = (
-        contradictions(checked),
-        tuple(i for i, log in enumerate(checked) if contradictions([log])),
-    )
-    if len(spoiled) > MOST_SPOILED * len(logs):
-        return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
-    say(f"{len(logs)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
-    doubled = {i: other for i, other in copies(checked).items() if i not in spoiled}
-    reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in doubled]
-    for reason in reasons:
-        say(f"  left out: {reason}")
-    left_out = (*without, *spoiled, *doubled)
-    found = search.explain(
-        model, seed=seed, without=left_out, laws=laws, progress=lambda line: say(f"  {line}")
-    )
-    noted = [
-        f"check: {one.name}: {row.text}"
-        for one in checked
-        for row in one.rows
-        if (row.topic, row.verdict) == ("thrust", "warn")
-    ]
-    if (why := getattr(model, "lawless", "")) and found.overall in (UNKNOWN, IN_PART):
-        noted.append(f"no law outside the catalogue is looked for: {why}")
-    told = (*found.reasons, *(f"left out: {reason}" for reason in reasons), *noted)
-    return replace(found, reasons=told, duplicates=doubled)
-
-
-def _tested(after, diagnosis) -> dict[str, tuple[float, float, float]]:
-    """Prediction errors of other flights by the model as its setup has it without extensions, by
-    that with all that was found, and of noise alone; printed.
+def _tested(others: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[float, float, float]]:
+    """Return prediction errors of other flights by the model as its setup has it without
+    extensions, by that with all that was found, and of noise alone; print them.
     """
     from visthrow.diagnose.likelihood.forms import READABLE, unit_of
     from visthrow.diagnose.models.laws import term_of
     from visthrow.diagnose.reporting.gain import on_others
+    from visthrow.diagnose.select.search import refused_of
+    from visthrow.logs.check.run import check, contradictions
 
+    checked = check(others.logs, others.known)
+    for reason in contradictions(checked):
+        print(f"left out of the tested flights: {reason}")
+    after = others.model
     before = after.plain() if hasattr(after, "plain") else after
     if diagnosis.explanations and hasattr(after, "with_laws"):
         after = after.with_laws(
             [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
         )
-    errors = on_others(before, after, diagnosis.theta, diagnosis)
-    for channel, found in errors.items():
+    tested = on_others(before, after, diagnosis.theta, diagnosis, refused_of(checked))
+    print(
+        f"tested on {tested.windows} windows of {tested.flights} of {len(others.logs)} flights;"
+        f" {tested.outliers} of {tested.samples} samples are outliers, which weigh less"
+    )
+    for channel, found in tested.errors.items():
         factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
         before, after, floor = (factor * x for x in found)
         won = (
@@ -160,7 +115,7 @@ def _tested(after, diagnosis) -> dict[str, tuple[float, float, float]]:
             f"on the tested flights, {channel}: {before:.3g} -> {after:.3g} {unit}, noise alone"
             f" {floor:.3g}{won}"
         )
-    return errors
+    return tested.errors
 
 
 def write_report(

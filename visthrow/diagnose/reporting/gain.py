@@ -11,7 +11,10 @@ import numpy as np
 
 from visthrow.common.statistics import mean
 from visthrow.diagnose.likelihood.correlation import with_correlations
-from visthrow.diagnose.likelihood.forms import errors, predicted
+from visthrow.diagnose.likelihood.designs import grams_of
+from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predicted
+from visthrow.diagnose.likelihood.marginal import finite
+from visthrow.diagnose.likelihood.noise import without_outliers
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
@@ -131,19 +134,34 @@ def landing_gain(
     )
 
 
-def on_others(
-    before: Model, after: Model, theta: Mapping[str, float], found: Diagnosis
-) -> dict[str, tuple[float, float, float]]:
-    """Prediction errors of flights that nothing was estimated from.
+@dataclass(frozen=True)
+class Tested:
+    """What was found, on flights that nothing was estimated from."""
 
-    Returns channel -> root mean square error before and after, and of the sensors' noise and the
-    initial state's uncertainty alone, in the channel's unit; every component counts alike.
+    # channel -> root mean square error before and after, and of the sensors' noise and the initial
+    # state's uncertainty alone, in the channel's unit; every component counts alike
+    errors: dict[str, tuple[float, float, float]]
+    flights: int
+    windows: int
+    samples: int
+    outliers: int  # samples far outside, which weigh less as in the fit
+
+
+def on_others(
+    before: Model,
+    after: Model,
+    theta: Mapping[str, float],
+    found: Diagnosis,
+    without: Sequence[int] = (),
+) -> Tested:
+    """Return prediction errors of flights that nothing was estimated from.
 
     Args:
         before: model of these flights that says what is worth it.
-        after: model of these flights that was diagnosed, with the laws that were found. theta:
-            sizes that were found.
+        after: model of these flights that was diagnosed, with the laws that were found.
+        theta: sizes that were found.
         found: that diagnosis, whose noise is taken.
+        without: flights that are left out.
     """
     noise, rms = (
         replace(
@@ -152,20 +170,37 @@ def on_others(
         ),
         [],
     )
+    floors, channels = found.work.problem.priors.floor, len(after.channels)
+    outliers = 0
     for model, sizes in ((before, {}), (after, theta)):
-        sums = np.zeros((3, len(model.channels)))
-        finite = [w for w in model.windows(sizes) if np.all(np.isfinite(w.residual))]
-        for window in with_correlations(finite, found.work.problem.correlated):
+        sums = np.zeros((3, channels))
+        windows = [w for w in model.windows(sizes) if finite(w) and w.flight not in without]
+        own = floors[: windows[0].effects.shape[1]] if windows else floors
+        given = with_correlations(windows, found.work.problem.correlated)
+        mended = without_outliers(given, grams_of(given, own, channels, "cpu"), own)
+        outliers = 0
+        for plain, window in zip(given, mended):
             left, expected, horizon = predicted(window, noise, window.residual)
+            weight = (plain.sigma / window.sigma) ** 2
+            outliers += int((weight < 1.0).sum())
             squares = np.array([left**2, expected, window.sigma**-2.0]) * window.sigma**2
-            for total, own in zip(sums, squares[:, horizon >= 0]):
-                total += np.bincount(window.channel[horizon >= 0], own, len(total))
+            ahead = horizon >= 0
+            added = np.array(
+                [
+                    np.bincount(window.channel[ahead], values, channels)
+                    for values in (weight * squares)[:, ahead]
+                ]
+            )
+            added[1] = np.where(added[1] > FAR_ABOVE * added[0], added[0], added[1])
+            sums += added
         rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
     (plain, _), (named, floor) = rms
-    return {
+    errors = {
         name: tuple(map(float, row))
         for name, row in zip(after.channels, np.column_stack((plain, named, floor)))
     }
+    samples = sum(len(w.residual) for w in windows)
+    return Tested(errors, len({w.flight for w in windows}), len(windows), samples, outliers)
 
 
 def _blackbox(

@@ -58,25 +58,20 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.planning import design, excitation, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
     from visthrow.diagnose.reporting import pictures, report
-    from visthrow.diagnose.reporting.explain_cli import explained
 
     check_place(Path(args.out) / "plan.json")
     limits, chosen = _limits(args), _chosen(args.manoeuvres)
-    model, logs = opening.open_model(args)
-    diagnosis = explained(
-        model,
-        logs,
-        setup.known(args.config),
-        args.seed,
-        opening.numbers(args.without, logs),
-        laws=False,
-    )
+    opened = opening.Opened(args)
+    diagnosis = opened.diagnose(laws=False)
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     aim = plan.Aim(diagnosis, tuple(name for name in args.about.split(",") if name))
     simulate, flown = simulator_of(
-        model, diagnosis, lambda logs: setup.model_of(setup.load(args.config), logs), seed=args.seed
+        opened.model,
+        diagnosis,
+        lambda logs: setup.model_of(setup.load(args.config), logs),
+        seed=args.seed,
     )
     manoeuvres = [m for m in map(flown, chosen) if m is not None]
     told = [

@@ -37,7 +37,7 @@ from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
-from visthrow.diagnose.select.scatter import allowed, deviations, differences, freed
+from visthrow.diagnose.select.scatter import allowed, between_flights, deviations, freed
 from visthrow.diagnose.select.selector import MOST_NAMES
 from visthrow.diagnose.select.state import Work
 
@@ -220,7 +220,7 @@ def _channel(
         unit_of(name),
         rms(before),
         rms(error),
-        rms(own.floor[:, c]),
+        min(rms(own.floor[:, c]), rms(error)),
         float("nan") if box is None else rms(box),
         value,
         low,
@@ -269,6 +269,13 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     """A diagnosis as held-out flights leave it."""
     if diagnosis.overall == result.NO_EFFECT:
         return _innovations(diagnosis)
+    spanning = [n for n in diagnosis.theta if diagnosis[n].low <= 0.0 <= diagnosis[n].high]
+    if spanning:
+        why = "its interval holds 0"
+        diagnosis = _demoted(diagnosis, spanning, result.CANDIDATE, why)
+        if not diagnosis.theta:
+            reason = f"{', '.join(spanning)}: every interval holds 0"
+            return _unconfirmed(diagnosis, None, spanning, reason)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
     held, alone = measure(diagnosis), not compares_phases(diagnosis.work.after)
@@ -291,9 +298,13 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             names,
             reason,
         )
-    shown = not alone or not held.channels or any(c.low > 0.0 for c in held.channels)
+    falls = [c.low if alone else c.gain for c in held.channels]
+    shown = not held.channels or max(falls) > 0.0
     if not (held.low > 0.0 and shown):
-        reason = f"held-out {held.left_out} do not confirm {', '.join(names)} ({_share(held)})"
+        failed = _share(held) if not held.low > 0.0 else _no_gain(held)
+        reason = f"held-out {held.left_out} do not confirm {', '.join(names)} ({failed})"
+        if np.isnan(held.low) or held.folds < PARTS:
+            reason += f"; {_one_more(diagnosis, names)}"
         return _unconfirmed(
             _demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"),
             held,
@@ -360,7 +371,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def _unconfirmed(
-    diagnosis: Diagnosis, held: HeldOut, names: Sequence[str], reason: str
+    diagnosis: Diagnosis, held: HeldOut | None, names: Sequence[str], reason: str
 ) -> Diagnosis:
     """Something is there that no confirmed name explains: in the block of the name that promised
     most.
@@ -402,17 +413,17 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
 
 def sized(
     problem: Problem, point: Point, active: Sequence[int]
-) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], np.ndarray]:
+) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], float]:
     """Sizes with which named effects alone explain the flights, and their covariance with what
     numerics and differences among flights add.
 
-    Returns both in the effects' units, and the variance that the differences add to each effect,
-    see :func:`differences`, shape (K,)."""
+    Returns both in the effects' units, and the variance that effects may have among flights,
+    in what is allowed, see :func:`visthrow.diagnose.select.scatter.between_flights`."""
     priors, named = problem.priors, list(active)
     theta = estimate(point.information, point.score, priors, named)
-    unlike = differences(point.statistics, priors, named, theta)
+    unlike, kept = between_flights(point.statistics, priors, named, theta)
     spread = covariance(point.information, priors.deviation(named)) + np.diag(
-        OWN_FLOOR**2 + unlike * allowed(theta) ** 2
+        OWN_FLOOR**2 + unlike * kept * allowed(theta) ** 2
     )
     own = spread[np.ix_(named, named)] * np.outer(priors.floor[named], priors.floor[named])
     sizes = {problem.effects[j].name: float(theta[j] * priors.floor[j]) for j in named}
@@ -421,11 +432,26 @@ def sized(
 
 def _share(held: HeldOut) -> str:
     if np.isnan(held.low):
-        return "too few of them can tell"
+        return "only one of them can tell"
     return (
         f"they bear out {100 * held.share:.0f} % [{100 * held.low:.0f}, {100 * held.high:.0f}] of"
         " what it promises"
     )
+
+
+def _no_gain(held: HeldOut) -> str:
+    """Return the gains of all channels, of which none is sure."""
+    gains = (
+        f"{c.channel} {100 * c.gain:.0f} % [{100 * c.low:.0f}, {100 * c.high:.0f}]"
+        for c in held.channels
+    )
+    return f"no channel's error falls for sure: {', '.join(gains)}"
+
+
+def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
+    """Return which flight would settle it."""
+    wanted = list(dict.fromkeys(m for name in names for m in diagnosis[name].manoeuvres))
+    return f"fly once more{f', such as: {wanted[0]}' if wanted else ' like these'}"
 
 
 def _left(c: ChannelGain, work: Work) -> str:

@@ -55,7 +55,7 @@ class Finding:
     # size with all other effects free below their floors; of a class's member if it is the cause;
     # else 0 [unit]
     estimate: float
-    sd: float  # likewise, and what numerics add [unit]
+    sd: float  # likewise, of these flights, and what numerics add [unit]
     low: float  # 95 % interval [unit]
     high: float
     floor: float  # [unit]
@@ -65,6 +65,7 @@ class Finding:
     missing: tuple[str, ...] = ()  # channels that would show it
     manoeuvres: tuple[str, ...] = ()  # that would separate or show it
     sentence: str = ""
+    differs: float = 0.0  # deviation by which another flight may differ from these [unit]
 
 
 @dataclass(frozen=True)

@@ -424,29 +424,27 @@ def allowed(size: np.ndarray | float, share: float = INEXACT) -> np.ndarray | fl
     return np.hypot(1.0, share * size)
 
 
-def differences(
+def between_flights(
     statistics: Statistics, priors: Priors, active: Sequence[int], theta: np.ndarray
-) -> np.ndarray:
-    """Variance that differences among flights add to the estimates of effects, in that which is
-    :func:`allowed`, shape (K,).
+) -> tuple[float, np.ndarray]:
+    """Return the variance among flights that named effects may have, in that which is
+    :func:`allowed`, and the part of it that the mean of these flights keeps, shape (K,).
 
     In each flight a name may have a share of its own, whose deviation is u times what is allowed.
     What the flights say of u, which is half normal before, is integrated over: one flight alone
-    says nothing of it, and many that agree leave little. Where nothing is named, nothing is added.
+    says nothing of it, and many that agree leave little. Where nothing is named, nothing varies.
     ``theta``: their sizes, in floors.
 
     Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
     """
     own = statistics.information.diagonal(axis1=1, axis2=2)
-    alone = ((own / np.maximum(own.sum(0), 1e-300)) ** 2).sum(
-        0
-    )  # 1 for one flight, 1 / F for F that say as much
+    kept = ((own / np.maximum(own.sum(0), 1e-300)) ** 2).sum(0)  # 1 / F of F that say as much
     apart = [
         freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH
     ]
     value = np.array([_evidence(each, priors, active) for each in apart])
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
-    return weight @ REACH**2 / weight.sum() * alone * bool(active)
+    return float(weight @ REACH**2 / weight.sum()) * bool(active), kept
 
 
 def _evidence(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:

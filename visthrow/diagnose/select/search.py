@@ -14,12 +14,76 @@ from visthrow.diagnose.likelihood.threads import each, keep
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
-from visthrow.diagnose.select.result import Diagnosis
+from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 from visthrow.diagnose.throw import interface
 from visthrow.diagnose.throw.interface import Mistake
+from visthrow.logs.check.rows import NOTHING as UNKNOWN_VEHICLE
+from visthrow.logs.check.rows import Known
+from visthrow.logs.check.run import Checked, check, contradictions, copies
 from visthrow.logs.flightlog import FlightLog
+
+MOST_REFUSED = 0.5  # share of the logs that may contradict themselves; else none tells anything
+
+
+def diagnose(
+    flights: Sequence[FlightLog],
+    model: Model | Callable[[], Model],
+    *,
+    known: Known = UNKNOWN_VEHICLE,
+    seed: int = 0,
+    without: Sequence[int] = (),
+    laws: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Say what a model gets wrong about flights: check, select, validate, conclude.
+
+    Args:
+        flights: logs of what was measured.
+        model: a simulation of these flights with its catalogue of effects, or what builds it; it is
+            asked for once the logs were checked.
+        known: of the vehicle, for the checks.
+        seed: of the null worlds that the threshold is calibrated on.
+        without: numbers of flights that are left out.
+        laws: whether to look for laws outside the catalogue.
+        progress: called with a line at each step.
+
+    Returns one verdict for every effect, and one overall. Raises DiagnoseError: the model gives no
+    window, or contradicts itself."""
+    say = progress or (lambda _: None)
+    checked = check(flights, known)
+    refused, reasons = refused_of(checked), contradictions(checked)
+    if len(refused) > MOST_REFUSED * len(flights):
+        return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
+    model = model if hasattr(model, "windows") else model()
+    say(f"{len(flights)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
+    copied = {i: of for i, of in copies(checked).items() if i not in refused}
+    reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in copied]
+    for reason in reasons:
+        say(f"  left out: {reason}")
+    found = explain(
+        model,
+        seed=seed,
+        without=(*without, *refused, *copied),
+        laws=laws,
+        progress=lambda line: say(f"  {line}"),
+    )
+    notes = [f"left out: {reason}" for reason in reasons]
+    notes += [
+        f"check: {log.name}: {row.text}"
+        for log in checked
+        for row in log.rows
+        if (row.topic, row.verdict) == ("thrust", "warn")
+    ]
+    if (why := getattr(model, "lawless", "")) and found.overall in (UNKNOWN, IN_PART):
+        notes.append(f"no law outside the catalogue is looked for: {why}")
+    return replace(found, reasons=(*found.reasons, *notes), duplicates=copied)
+
+
+def refused_of(checked: Sequence[Checked]) -> tuple[int, ...]:
+    """Return the numbers of logs whose channels contradict each other."""
+    return tuple(i for i, log in enumerate(checked) if contradictions([log]))
 
 
 def explain(

@@ -88,7 +88,7 @@ def conclude(search: Selector) -> Diagnosis:
     )
     theta, spread, unlike = sized(search.problem, point, active)
     findings = tuple(
-        _finding(search, point, j, active, unlike[j], withdrawn) for j in range(len(model.effects))
+        _finding(search, point, j, active, unlike, withdrawn) for j in range(len(model.effects))
     )
     return Diagnosis(
         overall,
@@ -318,10 +318,10 @@ def _finding(
         point.information, priors.deviation([*rest, j])
     )  # as if it were named beside the others
     mean, sd = float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
-    own = float(np.sqrt(sd**2 + OWN_FLOOR**2 + unlike * allowed(mean) ** 2)) * effect.floor
-    blank = replace(
-        blank, sd=own, nats=point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
-    )
+    own = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
+    nats = point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
+    differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
+    blank = replace(blank, sd=own, nats=nats, differs=differs if j in active or partners else 0.0)
     if j in active or partners:
         return _named(search, point, blank, mean, sorted({j, *partners}), active)
     low, high = (
@@ -410,7 +410,7 @@ def _named(
     if len(members) < 2:
         sentence = (
             f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}),"
-            f" {blank.nats:.0f} nats."
+            f" {blank.nats:.0f} nats; another flight may differ by {blank.differs:.2g}."
         )
         return replace(blank, verdict=result.FOUND, sentence=sentence)
     names = tuple(name for name in map(search.name, members) if name != blank.name)
