@@ -995,8 +995,8 @@ def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLo
 
 
 def _carried(log: FlightLog) -> float | None:
-    """What a thrust in newtons carries, by the accelerometer or at the usual thrust of the flight
-    [kg]; None without one.
+    """Return the mass that a thrust in newtons carries, by the accelerometer or at the usual thrust
+    of the flight [kg]; None without a thrust.
     """
     if (mass := thrust.mass_of(log)) is not None or "thrust_command" not in log:
         return mass

@@ -94,7 +94,7 @@ class _Design:
         return _on_both(found, self._widths)
 
     def left(self, residuals: Sequence[np.ndarray], fits: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """What fits of the first columns leave of each window's residual, shape (N,)."""
+        """Return each window's residual after fits of the first columns, shape (N,)."""
         fit = np.zeros((len(fits), self._columns.shape[2]))
         for row, own in zip(fit, fits):
             row[: len(own)] = own
@@ -235,7 +235,7 @@ def left_by(
     fits: Sequence[np.ndarray],
     device: str,
 ) -> list[np.ndarray]:
-    """What initial states and latent forces leave of windows' residuals.
+    """Return windows' residuals after fits of initial states and latent forces.
 
     ``floors``: of the effects, shape (K,); ``fits``: of each window, its initial state in prior
     deviations and its latents at the knots, shape (D + L,). Returns for each window, shape (N,).

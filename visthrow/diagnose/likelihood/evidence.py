@@ -53,7 +53,7 @@ CALIBRATION_QUANTILE = 0.995
 
 @dataclass(frozen=True)
 class Priors:
-    """What is believed of each effect before the flights, in floors; arrays of shape (K,)."""
+    """Prior beliefs about each effect, in floors; arrays of shape (K,)."""
 
     floor: np.ndarray  # in the effects' units
     slab: np.ndarray  # deviation of a named effect
@@ -162,8 +162,7 @@ def additions(
 def pair_additions(
     information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
 ) -> np.ndarray:
-    """The same for each two effects, a change of two priors: of two that hide each other, neither
-    shows alone.
+    """Return the gain of log Z by naming each pair of effects: two that cancel show no gain alone.
 
     Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the
     diagonal."""

@@ -57,7 +57,7 @@ def through_latents(window: Window, known: Known, block: str) -> np.ndarray:
 
 
 def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:
-    """The same of one latent block."""
+    """Return the interpolation weights of one latent block."""
     out = np.zeros((len(window.latent_block), len(time), 3))
     rows = np.flatnonzero(window.latent_block == LATENT_BLOCKS.index(block))
     at = np.abs(window.latent_time[rows, None] - time).argmin(axis=1)

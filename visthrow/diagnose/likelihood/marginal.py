@@ -115,8 +115,8 @@ class Noise:
 
     @property
     def log_prior(self) -> float:
-        """Of the windows' shares: their squares follow an inverse gamma distribution; 0 where all
-        are 1.
+        """Return the log prior of the windows' shares: their squares follow an inverse gamma
+        distribution; 0 where all are 1.
         """
         square = self.share**2
         return float(-0.5 * TAIL * (np.log(square) + 1.0 / square - 1.0).sum())
@@ -150,7 +150,7 @@ class Statistics:
         )
 
     def only(self, keep: np.ndarray) -> "Statistics":
-        """The same of some flights; ``keep`` is a mask or indices into ``flights``."""
+        """Return the statistics of some flights; ``keep`` is a mask or indices into ``flights``."""
         return replace(
             self,
             flights=self.flights[keep],
@@ -178,7 +178,7 @@ def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
 
 
 def hidden_gram(window: Window, channels: int) -> Gram:
-    """The same of a window whose effects are not asked for.
+    """Return the Gram matrix of a window without its effects.
 
     Raises DiagnoseError: as :func:`gram_of`.
     """
@@ -186,7 +186,7 @@ def hidden_gram(window: Window, channels: int) -> Gram:
 
 
 def without_effects(gram: Gram) -> Gram:
-    """The same of nuisances and latents alone."""
+    """Return a Gram matrix of nuisances and latents alone."""
     size = gram.nuisances + gram.latents
     if not isinstance(gram.placed, There):
         return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
@@ -339,7 +339,9 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
 
 
 def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
-    """The same derivatives with the residuals of another size of the effects."""
+    """Return a Gram matrix of the same derivatives with the residuals of another size of the
+    effects.
+    """
     weighted = np.zeros((len(residual), len(gram.count)))
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
     weighted[np.arange(len(residual)), window.channel] = _back(window, white) / window.sigma
@@ -363,8 +365,8 @@ def _back(window: Window, white: np.ndarray) -> np.ndarray:
 
 
 def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
-    """What an initial state in prior deviations and latents at the knots, shape (D + L,), leave of
-    the residual, shape (N,).
+    """Return the residual after a fit of initial state in prior deviations and latents at the
+    knots, shape (D + L,); shape (N,).
     """
     states = window.nuisance.shape[1]
     left = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
@@ -372,8 +374,8 @@ def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
 
 
 def with_products(gram: Gram, cross: np.ndarray, square: np.ndarray) -> Gram:
-    """The same derivatives with other residuals, whose inner products with columns at the knots,
-    and with themselves, are known.
+    """Return a Gram matrix of the same derivatives with other residuals, whose inner products with
+    columns at the knots, and with themselves, are given.
     """
     part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), cross.copy()
     cross[:, part] = cross[:, part] @ gram.factor
@@ -391,7 +393,7 @@ class Share:
 
 @dataclass(frozen=True)
 class WindowStatistics(Share):
-    """The same, and what the window says of its latent forces as if they were effects."""
+    """A window's statistics, with those of its latent forces as if they were effects."""
 
     latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
     latent_score: np.ndarray  # G' V^-1 r, shape (L,)
@@ -434,7 +436,7 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
 def rescored(
     known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray
 ) -> Statistics:
-    """What windows say with other residuals: their information stays.
+    """Return statistics of windows with other residuals: their information stays.
 
     ``known``: of the same windows; ``theta``: linearisation point in floors, shape (K,).
     """

@@ -143,8 +143,8 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where each level stands among the parameters of the search: phases' levels, windows' shares
-    of them, sensor scales.
+    """The places of levels among the parameters of the search: phases' levels, windows' shares of
+    them, sensor scales.
     """
 
     keys: tuple[tuple[int, str], ...]  # (block, phase)
@@ -387,7 +387,8 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
 
 
 def _far(window: Window, left: np.ndarray) -> np.ndarray:
-    """How far samples are outside, in that which is far, shape (N,)."""
+    """Return how far samples lie outside, in the distance at which they count as far, shape (N,).
+    """
     normal = np.abs(left) / window.sigma
     return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
 

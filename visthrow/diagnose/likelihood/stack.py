@@ -56,7 +56,7 @@ class _Columns:
         self._begun, self._lock = {}, Lock()
 
     def begun(self, noise: tuple, shaped: Callable[[], T]) -> T:
-        """What belongs to noise levels at which several searches begin, calculated by the first of
+        """Return the start of several searches at the same noise levels, calculated by the first of
         them.
         """
         with self._lock:
@@ -138,8 +138,8 @@ def integrals(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> "Inte
 
 
 def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list[WindowStatistics]:
-    """What windows say of their effects, and of their latent forces at the knots as if they were
-    effects.
+    """Return the statistics of windows, with those of their latent forces at the knots as if they
+    were effects.
     """
     whole = Stack(grams, device).integrals(noise, latents=True)
     return each(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
@@ -247,8 +247,7 @@ class Stack:
         return tuple(self._in_order([part[i] for part in found]) for i in range(3))
 
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
-        """What is left of the effects' columns of each window, or of those of latent forces and
-        effects.
+        """Integrate initial states out of each window, and latent forces unless they are asked for.
 
         Raises DiagnoseError: as :meth:`values`.
         """
@@ -383,7 +382,7 @@ def _looked(
 
 @dataclass(frozen=True)
 class _Integrated:
-    """What is left of the last J columns of a batch."""
+    """The remainder of the last J columns of a batch."""
 
     left: list[np.ndarray]  # which of the J columns are a window's own
     at: _Shape
@@ -393,7 +392,7 @@ class _Integrated:
     information: list[np.ndarray]  # of each window
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
-        """With the residuals of grams of the same derivatives."""
+        """Return the windows' statistics with the residuals of grams of the same derivatives."""
         weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
         hidden, beside = np.zeros((count, n)), np.zeros((count, columns))
         for w, (gram, left) in enumerate(zip(grams, self.left)):
@@ -415,8 +414,7 @@ class _Integrated:
 
 
 class Integrals:
-    """What windows say of their effects, whatever their residuals are; it stays where it was
-    calculated.
+    """The part of windows' statistics that no residual changes; it stays where it was calculated.
 
     Attributes:
         gathered: by flights with some residuals, once it was asked for.
@@ -430,12 +428,12 @@ class Integrals:
 
     @property
     def log_dets(self) -> list[float]:
-        """Of each window's V."""
+        """Return the log determinant of each window's V."""
         return self._by_window([part.at.log_det.tolist() for part in self._parts])
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
-        """With the residuals of grams of the same derivatives; ``noise`` is what they were
-        integrated with.
+        """Return the windows' statistics with the residuals of grams of the same derivatives;
+        ``noise`` is what they were integrated with.
         """
         return self._by_window(
             [

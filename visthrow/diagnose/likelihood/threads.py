@@ -54,7 +54,7 @@ def keep() -> None:
 
 
 def aside() -> None:
-    """From now on, give this process's small work the threads that it needs beside a GPU."""
+    """Limit this process's small work to the threads that it needs beside a GPU."""
     _aside.set()
 
 

@@ -358,7 +358,9 @@ class _Dynamics:
     def _exerted(
         self, half: int, state: np.ndarray, force: np.ndarray, latent: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """What the laws exert in each latent block, at the cable's tension without them."""
+        """Return the forces and torques of the laws in each latent block, at the cable's tension
+        without them.
+        """
         vel, none, at = state[:, 3:6], np.zeros((len(state), 3)), half + self.model._spare
         turn = np.einsum(
             "bji,bjk->bik", self.model._rot[self.owner, at - 1], self.model._rot[self.owner, at + 1]

@@ -23,7 +23,7 @@ class CableParams:
 
 @dataclass(frozen=True)
 class TorqueParams:
-    """What turns commands of single motors into rates."""
+    """A map from commands of single motors to rates."""
 
     inertia: tuple[float, float, float]  # [kg m^2]
     arm_x: float  # of each rotor from the centre of mass, along x and along y [m]
@@ -70,16 +70,16 @@ class FlyerParams:
 
     @property
     def total_mass(self) -> float:
-        """Of vehicle and payload [kg]."""
+        """Return the mass of vehicle and payload [kg]."""
         return self.mass + (self.cable.mass if self.cable is not None else 0.0)
 
     @property
     def relative_mass(self) -> float:
-        """Of the vehicle, in 0.21 kg, of which the catalogue's forces are told."""
+        """Return the vehicle's mass in 0.21 kg, the mass that the catalogue's forces refer to."""
         return self.mass / 0.21
 
     def thrust(self, told: np.ndarray) -> np.ndarray:
-        """What the map gives for inputs [N]."""
+        """Return the thrust that the map gives for inputs [N]."""
         return sum(c * told**power for power, c in enumerate(self.thrust_map))
 
     def __post_init__(self) -> None:

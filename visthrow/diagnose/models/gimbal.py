@@ -28,7 +28,7 @@ MARGIN = (
 
 @dataclass(frozen=True)
 class GimbalParams:
-    """Where the camera is assumed to be before anything is found."""
+    """The assumed pose of the camera."""
 
     base_b: tuple[float, float, float]  # the gimbal's centre in the body frame [m]
     camera_offset: float  # of the camera along the gimbal's x axis [m]

@@ -62,8 +62,8 @@ class Window:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Where derivatives were taken, and what they are, so that initial states can follow the
-    effects from there.
+    """The point at which derivatives were taken, with the derivatives, so that initial states can
+    follow the effects from there.
 
     A window whose state stays behind begins with a transient that no derivative tells of, such as
     rotors out of balance."""

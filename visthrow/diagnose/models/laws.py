@@ -85,8 +85,8 @@ class Term:
 
     @property
     def unit(self) -> str:
-        """Of the coefficient, such that the term is a force [N] or, on the vehicle and in the
-        joint, a torque [N m].
+        """Return the coefficient's unit, such that the term is a force [N] or, on the vehicle and
+        in the joint, a torque [N m].
         """
         target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
         parts = [SCALARS[f].unit for f in self.factors] + [VECTORS[self.block][self.vector].unit]
@@ -124,8 +124,8 @@ def term_of(law: LawParams) -> Term:
 
 
 def exerted(laws: Sequence[LawParams], known: Knots) -> dict[str, np.ndarray]:
-    """What laws exert in each latent block at states with these quantities, shape (k, 3); without
-    laws nothing.
+    """Return the forces and torques of laws in each latent block at states with these quantities,
+    shape (k, 3); empty without laws.
     """
     known, total = Known(known), {}
     for law in laws:
@@ -167,7 +167,7 @@ def _swing(k: Known) -> np.ndarray:
 
 
 def _reach(k: Known) -> np.ndarray:
-    """From the mount to the payload's centre [m], world frame."""
+    """Return the vector from the mount to the payload's centre [m], world frame."""
     return k["payload_pos_w"] - k["pos_w"] - rotate(k["quat_wb"], k["mount_b"])
 
 
@@ -185,7 +185,9 @@ def _friction(k: Known) -> np.ndarray:
 
 
 def _spring(k: Known) -> np.ndarray:
-    """What turns the vehicle's axis against the rope, body frame; 0 where nothing hangs on it."""
+    """Return the direction that turns the vehicle's axis against the rope, body frame; 0 where
+    nothing hangs on it.
+    """
     return (k["tension"] > 0.0)[:, None] * cross(_EZ, k["cable_dir_b"])
 
 
@@ -393,8 +395,8 @@ class Layout:
 
 
 def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]:
-    """What terms exert in each latent block: a torque in the joint on the vehicle, on the rope and,
-    by it, on the payload.
+    """Return the loads of terms in each latent block: a torque in the joint acts on the vehicle, on
+    the rope and, by it, on the payload.
 
     ``values``: of the terms, shape (k, 3, T), in the block's frame.
     Returns the latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).

@@ -152,13 +152,13 @@ class NumericModel(ABC):
         self.effects = tuple(known[name] for name in names)
 
     def plain(self) -> "NumericModel":
-        """The same model without what it was extended by."""
+        """Return the model without its extensions."""
         other = copy(self)
         other._base, other.laws, other._flown = np.zeros_like(self._base), (), None
         return other
 
     def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
-        """The same model in which laws act besides its own."""
+        """Return the model with further laws."""
         if self._flown is None:  # its initial states follow from call to call
             self._flown = copy(self)
         self._flown.laws = (*self.laws, *laws)
@@ -173,7 +173,7 @@ class NumericModel(ABC):
 
     @abstractmethod
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
-        """What the sensors would have measured in lanes of one stretch, shape (L, N)."""
+        """Return the sensors' measurements in lanes of one stretch, shape (L, N)."""
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
         """Simulated quantities at the knots of the latent forces, for laws outside the catalogue;

@@ -53,7 +53,7 @@ class PendulumParams:
 
     @property
     def stiffness(self) -> float:
-        """Of small swings [1/s^2]."""
+        """Return the stiffness of small swings [1/s^2]."""
         return self.gravity / self.length
 
 

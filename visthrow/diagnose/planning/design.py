@@ -52,7 +52,7 @@ SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wan
 
 @dataclass(frozen=True)
 class Limits:
-    """What vehicle and hall allow.
+    """The limits of vehicle and hall.
 
     Raises DiagnoseError: one that is not above 0, or a ceiling below the floor.
     """
@@ -221,7 +221,7 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
 @dataclass(frozen=True)
 class Design:
-    """What was found.
+    """A designed manoeuvre with its worth.
 
     Attributes:
         start: expected nats a second of the manoeuvre that it began with.
@@ -302,7 +302,7 @@ def optimise(
 
 
 class _Search:
-    """What designs cost, and the best that can be flown."""
+    """The cost of designs, and the best that can be flown."""
 
     def __init__(self, aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits) -> None:
         self.aim, self.base, self.simulate, self.limits = aim, base, simulate, limits

@@ -181,9 +181,7 @@ def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Flight:
-    """What the simulator tells of one manoeuvre; arrays of :data:`SAMPLED`, without noise, every
-    ``SAMPLE_PERIOD``.
-    """
+    """A simulated manoeuvre; arrays of :data:`SAMPLED`, without noise, every ``SAMPLE_PERIOD``."""
 
     manoeuvre: Manoeuvre
     reference: Reference
@@ -194,7 +192,7 @@ class Flight:
 
     @property
     def time(self) -> np.ndarray:
-        """Of the samples [s]."""
+        """Return the times of the samples [s]."""
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
     def simulated(self, own: Callable[["Flight"], Model]) -> Simulated:
@@ -226,7 +224,7 @@ class Flight:
         return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
 
     def log(self, noise: Mapping[str, float]) -> FlightLog:
-        """As the throw's logs are: poses from motion capture, commands as sent."""
+        """Return a flight log like the throw's: poses from motion capture, commands as sent."""
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
         seen = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         channels = {
@@ -244,8 +242,8 @@ class Flight:
     def setup_log(
         self, params: FlyerParams, noise: Mapping[str, float], extra: Sequence[str] = ()
     ) -> FlightLog:
-        """As the logs of a setup are: its own names, inputs through its map of thrust, and what an
-        IMU on board tells.
+        """Return a flight log like those of a setup: its channel names, inputs through its map of
+        thrust, and what an IMU on board measures.
         """
         truth, time = self.truth, self.time
         force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
@@ -289,9 +287,7 @@ class Flight:
         )
 
     def _input(self, params: FlyerParams) -> Channel:
-        """What a setup's log holds as the input: the map of thrust, the lag and the
-        delay inverted.
-        """
+        """Return the input of a setup's log: the map of thrust, the lag and the delay inverted."""
         if params.input in ("command", "thrust_command"):
             told = command_of(params.thrust_map, self.commands[:, :1])
             values = np.hstack((told, self.commands[:, 1:])) if params.input == "command" else told

@@ -45,7 +45,7 @@ class Reference:
         return np.gradient(self.vel_w, PERIOD, axis=0)
 
     def limits(self) -> str:
-        """When to abort, in words."""
+        """Return when to abort, in words."""
         low, high = self.pos_w.min(0) - 0.5, self.pos_w.max(0) + 0.5
         floor = max(0.05, self.pos_w[:, 2].min() - min(0.3, 0.5 * self.pos_w[:, 2].min()))
         speed = np.linalg.norm(self.vel_w, axis=1).max()
@@ -110,7 +110,7 @@ class Manoeuvre:
 
 
 def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
-    """From 0 to 1 with speed and acceleration 0 at both ends."""
+    """Return a rise from 0 to 1 with speed and acceleration 0 at both ends."""
     s = np.clip((t - begin) / length, 0.0, 1.0)
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
 

@@ -49,7 +49,9 @@ class Proposal:
 
 
 class Aim:
-    """What the flights to come are to settle, and what the information of one is worth for that."""
+    """The question that the flights to come are to settle, and the worth of one flight's
+    information for it.
+    """
 
     def __init__(self, diagnosis: Diagnosis, about: Sequence[str] = ()) -> None:
         """Take the classes to be separated, or else what could not be identified, or else every
@@ -150,7 +152,7 @@ class Aim:
         )
 
     def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> Proposal:
-        """What a manoeuvre of this information promises."""
+        """Return the promise of a manoeuvre of this information."""
         separated, repeats = self.settled(new)
         separates = tuple(tuple(self.names[j] for j in group) for group in separated)
         return Proposal(
@@ -175,8 +177,8 @@ def propose(aim: Aim, told: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Prop
 
 
 def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
-    """What to do in one session: of ranked proposals, each that separates what none
-    before it does.
+    """Return the flights of one session: of ranked proposals, each that separates what none before
+    it does.
     """
     chosen, apart = [], set()
     for p in proposals:
@@ -187,7 +189,9 @@ def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
 
 
 def _worth(p: Proposal) -> tuple[float, float]:
-    """What settles the most comes first, soonest; what settles nothing by its nats a second."""
+    """Return the sort key of a proposal: settling most comes first, soonest; one that settles
+    nothing counts by its nats a second.
+    """
     return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
 
 
@@ -272,7 +276,7 @@ def expected_information(
 
 
 def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
-    """What the fewest flights settle that settle the most, and their number."""
+    """Return the most that the fewest flights settle, and their number."""
     best: tuple[list, int] = [], 0
     for count in range(1, MOST_REPEATS + 1):
         now = settled(count)

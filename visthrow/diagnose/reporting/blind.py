@@ -25,7 +25,7 @@ NAMED = 0.9
 
 @dataclass(frozen=True)
 class Completeness:
-    """How often one effect is named, by its size."""
+    """The share of trials in which one effect is named, by its size."""
 
     name: str
     unit: str

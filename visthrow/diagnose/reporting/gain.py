@@ -26,7 +26,7 @@ from visthrow.diagnose.throw.landing import Landings
 
 @dataclass(frozen=True)
 class LandingGain:
-    """What the named causes do to predicted landings; lengths in metres, intervals of 95 % by
+    """The change of predicted landings by the named causes; lengths in metres, intervals of 95 % by
     bootstrap over throws.
     """
 
@@ -91,7 +91,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
 def landing_gain(
     work: Work, theta: Mapping[str, float], trained: Mapping[int, Mapping[str, float]], seed: int
 ) -> LandingGain | None:
-    """What the named causes do to predicted landings.
+    """Measure the change of predicted landings by the named causes.
 
     ``trained``: flight -> their sizes by the other flights; empty where none were held out.
     None where the model has no throws whose landing was seen.
@@ -136,7 +136,7 @@ def landing_gain(
 
 @dataclass(frozen=True)
 class Tested:
-    """What was found, on flights that nothing was estimated from."""
+    """The errors of a diagnosed model on flights that nothing was estimated from."""
 
     # channel -> root mean square error before and after, and of the sensors' noise and the initial
     # state's uncertainty alone, in the channel's unit; every component counts alike

@@ -87,7 +87,7 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
 
 
 def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> bytes:
-    """What an optimised manoeuvre lays over the one that it began with, and what each manoeuvre
+    """Draw an optimised manoeuvre over the one that it began with, and what each manoeuvre
     promises.
 
     ``rates``: expected nats a second of manoeuvres by their name.
@@ -268,7 +268,7 @@ def horizons(gain: Gain) -> bytes:
 
 
 def landings(landing: LandingGain) -> bytes:
-    """Where each throw was predicted to land, seen from where it landed."""
+    """Draw where each throw was predicted to land, relative to where it landed."""
     figure, axes = _figure(1, 1, 3.6)
     axis = axes[0, 0]
     for off, colour, marker, label in (

@@ -24,7 +24,7 @@ def sentence_of(diagnosis: Diagnosis) -> str:
 
 
 def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
-    """What the command line prints."""
+    """Return the text that the command line prints."""
     lines = [sentence_of(diagnosis), *(f"  {reason}" for reason in diagnosis.reasons), ""]
     lines += [f"{word:6} {text}" for word, text in _statements(diagnosis, gain)]
     counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
@@ -43,7 +43,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
 
 
 def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]]:
-    """What was found, each with the word that it stands under."""
+    """Return the findings, each with its verdict."""
     moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
     moves = {name: f" It moves landings by {1e3 * size:.0f} mm." for name, size in moved.items()}
     named = [f for f in diagnosis.findings if f.verdict in result.NAMED]
@@ -88,7 +88,7 @@ def percent(share: float, digits: int = 0) -> str:
 
 
 def landing_sentence(landing: LandingGain) -> str:
-    """What the model's landings are worth, in millimetres."""
+    """Return a sentence on the model's predicted landings, in millimetres."""
     mm = [1e3 * x for x in (landing.before, landing.after, landing.low, landing.high)]
     released = f"{1e3 * landing.released_before:.0f} to {1e3 * landing.released_after:.0f} mm"
     if not landing.moved:
@@ -108,8 +108,8 @@ def landing_sentence(landing: LandingGain) -> str:
 
 
 def _event(diagnosis: Diagnosis, flight: int) -> str:
-    """What happened in a flight: of one that was left out, or of one with a window far rougher than
-    its phase.
+    """Return what happened in a flight: in one that was left out, or in one with a window far
+    rougher than its phase.
     """
     if diagnosis.work is not None and flight in {w.flight for w in diagnosis.work.after.windows}:
         return (

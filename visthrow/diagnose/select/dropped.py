@@ -36,8 +36,8 @@ From half of it as a deviation 0 and 1 are told apart: half way is two from both
 
 @dataclass(frozen=True)
 class Told:
-    """What windows say of K effects and T commands each, about 0; windows of fewer commands have
-    columns of 0.
+    """Statistics of windows of K effects and T commands each, about 0; windows of fewer commands
+    have columns of 0.
     """
 
     information: np.ndarray  # shape (W, K + T, K + T)

@@ -111,7 +111,7 @@ class _Phase:
         )
 
     def likelihood(self, block: int, level: float) -> float:
-        """Of the phase's residuals."""
+        """Return the log likelihood of the phase's residuals."""
         noise = replace(self.noise, latent_sd={**self.noise.latent_sd, (block, self.phase): level})
         return float(self.stack.values(noise).sum())
 

@@ -151,7 +151,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
 def borne_out(
     statistics: Statistics, trained: np.ndarray, theta: np.ndarray
 ) -> tuple[float, float, float]:
-    """What names bring to held-out flights, of what they promise there, with a 95 % interval.
+    """Return the part of what names promise on held-out flights that they bring there, with a 95 %
+    interval.
 
     A right size promises theta' I theta / 2 nats with a variance of twice that. The interval is
     that of the flights' scatter (Student, over flights that can tell), or of this chance where it
@@ -455,7 +456,7 @@ def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
 
 
 def _left(c: ChannelGain, work: Work) -> str:
-    """What is left of a channel's error, and of which kind."""
+    """Return a sentence on what remains of a channel's error, and of which kind it is."""
     factor, unit = READABLE.get(c.unit, (1.0, c.unit))
     said = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
     kind = _kind(work, work.problem.model.channels.index(c.channel))
@@ -466,8 +467,8 @@ def _left(c: ChannelGain, work: Work) -> str:
 
 
 def _kind(work: Work, channel: int) -> str:
-    """Where the error of a channel that is left lies: an axis, a flight, or growing with the time
-    in the flight.
+    """Return where a channel's remaining error lies: in an axis, in a flight, or growing with the
+    time in the flight.
     """
     point = work.after
     by_axis, by_flight, late, spans = np.zeros(3), Counter(), [], {}

@@ -49,7 +49,7 @@ sizes worth so many nats.
 
 @dataclass(frozen=True)
 class Problem:
-    """What stays the same during a search."""
+    """The part of a search that never changes."""
 
     model: Model
     kept: tuple[int, ...]  # windows that are looked at
@@ -77,7 +77,7 @@ class Problem:
 
     @cached_property
     def priors(self) -> Priors:
-        """Of the effects."""
+        """Return the priors of the effects."""
         return Priors.of(self.effects, tuple(self.model.channels))
 
     @property
@@ -91,7 +91,7 @@ class Problem:
         return np.array([e.switch for e in self.effects], dtype=bool)
 
     def only(self, windows: Sequence[int]) -> "Problem":
-        """The same of some of the windows that are looked at."""
+        """Return the problem of some of its windows."""
         return replace(self, kept=tuple(self.kept[w] for w in windows))
 
     def flown(self, theta: np.ndarray) -> Model | None:
@@ -135,17 +135,19 @@ class Point:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """What flights say of what they share: that which each has of its own is integrated out."""
+        """Return the statistics of what flights share: each flight's random shares are integrated
+        out.
+        """
         return freed(self.plain, self.varies)
 
     @cached_property
     def information(self) -> np.ndarray:
-        """Of all flights, shape (K, K)."""
+        """Return the information of all flights, shape (K, K)."""
         return self.statistics.information.sum(0)
 
     @cached_property
     def score(self) -> np.ndarray:
-        """Of all flights, about theta = 0, shape (K,)."""
+        """Return the score of all flights, about theta = 0, shape (K,)."""
         return self.statistics.absolute.sum(0)
 
     def sigma(self, channel: int) -> float:
@@ -259,7 +261,7 @@ def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
-    """The same of some of its windows, with noise levels estimated from these."""
+    """Return a point of some of its windows, with noise levels estimated from these."""
     own = {
         name: [getattr(point, name)[w] for w in windows]
         for name in ("windows", "grams", "commands")
@@ -354,8 +356,8 @@ def advantage(
 
 
 def bend(problem: Problem, origin: Point, there: Point, active: Sequence[int]) -> np.ndarray:
-    """What the simulation's distance from its linearisation would be taken for: sizes of all
-    effects, in floors, shape (K,).
+    """Return the sizes of all effects that the simulation's distance from its linearisation would
+    be taken for, in floors, shape (K,).
 
     ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same
     derivatives; ``active``: effects that are named."""
@@ -375,12 +377,13 @@ def curvature(problem: Problem, origin: Point, there: Point) -> float:
 
 
 def with_fitted_noise(point: Point) -> Point:
-    """The same with noise levels estimated from its residuals."""
+    """Return the point with noise levels estimated from its residuals."""
     return regathered(point, noise=levels.maximised(point.grams, point.noise, point.device)[0])
 
 
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
-    """The same with the noise levels that remain when every effect may have its linear estimate.
+    """Return the point with the noise levels that remain when every effect may have its linear
+    estimate.
 
     A large missing effect is taken for noise as long as it is not named; these levels show what may
     be hidden under it."""
@@ -389,8 +392,8 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
 
 
 def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
-    """The same with the noise levels that remain when every effect has its most probable size,
-    those not named below their floors.
+    """Return the point with the noise levels that remain when every effect has its most probable
+    size, those not named below their floors.
 
     What a dozen effects below their floors leave is no gust, but it is nothing that is missing
     either; nor is what an effect that varies has of its own in each flight. ``point``: whose
@@ -400,17 +403,15 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
 
 
 def with_varying(point: Point, varies: Varies) -> Point:
-    """The same in which other effects differ from flight to flight, with the noise levels that this
-    leaves.
-    """
+    """Return the point with other random effects, and the noise levels that this leaves."""
     return _with_noise_at(
         replace(point, varies=varies), point.theta, own_shares(point.plain, point.theta, varies)
     )
 
 
 def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = None) -> Point:
-    """The same with noise levels estimated from the residuals at ``theta``, and each flight's
-    ``own`` beside it, shape (F, K).
+    """Return the point with noise levels estimated from the residuals at ``theta``, and each
+    flight's ``own`` shares beside it, shape (F, K).
     """
     at = np.tile(theta - point.theta, (len(point.plain.flights), 1)) + (0.0 if own is None else own)
     row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
@@ -496,7 +497,7 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
 
 
 def candidates(problem: Problem, point: Point, sets: Sequence[Sequence[int]]) -> list[Point]:
-    """The same of several sets: side by side where they wait for a GPU, but for those that turn on
+    """Simulate several sets: side by side where they wait for a GPU, but for those that turn on
     another kind of block.
     """
     if point.device == "cpu":

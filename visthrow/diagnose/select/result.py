@@ -131,7 +131,7 @@ class ChannelGain:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What held-out flights say of a set of names."""
+    """The judgement of held-out flights on a set of names."""
 
     # what the names brought there, of the nats that they promise: 1 as promised, 0 nothing
     share: float

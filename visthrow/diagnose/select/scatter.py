@@ -96,13 +96,13 @@ class Varies:
 
     @property
     def by_flight(self) -> "Varies":
-        """The same as if every flight were a day: of days of which only some flights
-        are looked at.
+        """Return these random effects as if every flight were a day: of days of which only some
+        flights are looked at.
         """
         return Varies((), self.effects)
 
     def also(self, at: Sequence[int], size: Mapping[int, float], by: str = FLIGHT) -> "Varies":
-        """The same with shares of more effects."""
+        """Return these random effects with more of them."""
         new = {j: size[j] for j in at}
         return (
             replace(self, drifts={**self.drifts, **new})
@@ -111,8 +111,8 @@ class Varies:
         )
 
     def levels(self, statistics: Statistics) -> tuple[str, ...]:
-        """What may have shares: days too, where there are enough of them, each of
-        several flights.
+        """Return what may have shares: days too, where there are enough of them, each of several
+        flights.
         """
         days = {self.days[f] for f in statistics.flights.tolist()} if self.days else ()
         return (FLIGHT, DAY) if LEAST_FLIGHTS <= len(days) < len(statistics.flights) else (FLIGHT,)
@@ -474,8 +474,8 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
 def freed_beside(
     own: np.ndarray, score: np.ndarray, cross: np.ndarray, statistics: Statistics, varies: Varies
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of candidates that are no effects yet, each alone beside the effects, summed over
-    flights.
+    """Integrate out the flights' shares for candidates that are no effects yet, each alone beside
+    the effects, summed over flights.
 
     ``own``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``:
     information with the effects, shape (F, T, K)."""
@@ -564,7 +564,9 @@ def _shares(
 def deviations(
     scatter: Sequence[Scatter], priors: Priors, names: Sequence[str], days: Sequence[int]
 ) -> Varies:
-    """What was found to vary, of effects of these names; ``days`` are the flights'."""
+    """Return the random effects that were found, of effects of these names; ``days`` are the
+    flights'.
+    """
     known, found = list(names), Varies(days)
     for s in scatter:
         if s.found:

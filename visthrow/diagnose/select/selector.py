@@ -181,8 +181,8 @@ class Selector(SearchState):
         return []
 
     def _alike(self, j: int) -> list[int]:
-        """What the catalogue says looks like an effect: where a rope whips, derivatives may promise
-        far too little.
+        """Return what the catalogue says looks like an effect: where a rope whips, derivatives may
+        promise far too little.
         """
         names = self.problem.effects[j].confused_with
         return [k for k in np.flatnonzero(~self.problem.switches).tolist() if self.name(k) in names]

@@ -45,8 +45,8 @@ from visthrow.diagnose.select.scatter import (
 
 @dataclass(frozen=True)
 class Work:
-    """What a diagnosis leaves behind for gain, report, plan and blind: the search's problem, its
-    first and its last point.
+    """The remains of a diagnosis for gain, report, plan and blind: the search's problem, its first
+    and its last point.
     """
 
     problem: Problem

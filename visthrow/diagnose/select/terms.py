@@ -140,8 +140,8 @@ def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarr
 def _exerted(
     point: Point, part: WindowStatistics, w: int, block: str, known: Known, own: int
 ) -> tuple[np.ndarray, ...]:
-    """Of what is exerted at a window's knots: square and information, score and cross
-    information.
+    """Return square and information, score and cross information of what is exerted at a window's
+    knots.
     """
     through = through_latents(point.windows[w], known, block)
     here = through[point.grams[w].latent_block == own]

@@ -352,7 +352,7 @@ def _finding(
 
 
 def _blank(effect: Effect) -> Finding:
-    """What is said of an effect before anything was seen of it."""
+    """Return the finding on an effect before any flight."""
     return Finding(
         effect.name,
         result.UNOBSERVABLE,

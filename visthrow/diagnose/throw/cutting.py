@@ -55,7 +55,7 @@ def _phase(flight: Recorded, first: float, last: float) -> str:
 
 
 def payload_down(flight: Recorded, landing_height: float) -> float:
-    """When the payload is about to come down, or NEVER [s]."""
+    """Return when the payload is about to come down, or NEVER [s]."""
     if flight.payload is None or flight.latch == NEVER:
         return flight.landing
     after = flight.payload.time > flight.latch
@@ -95,8 +95,8 @@ def cut(
 
 
 def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
-    """Of hours of flight, all throws and what follows them, and so many of the other windows that
-    ``most`` are left.
+    """Thin hours of flight out to all throws and what follows them, and so many of the other
+    windows that ``most`` are left.
     """
     plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
     room = max(most - len(cuts) + len(plain), most // 4)

@@ -57,7 +57,7 @@ class DirectMeasurement(Protocol):
         ...
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
-        """The same in a setting, shape (N,)."""
+        """Return the measurement in a setting, shape (N,)."""
         ...
 
 
@@ -287,7 +287,9 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
 
 
 def _noise(points: np.ndarray, seen: np.ndarray) -> float:
-    """Of coordinates while they are seen: what stands in the log where they are not is none."""
+    """Estimate the noise of coordinates while they are seen: what stands in the log elsewhere is
+    none.
+    """
     tracks = [points[seen[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
     sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
     return float(np.median(sigmas)) if sigmas else 0.0

@@ -51,7 +51,7 @@ def _flown(
     simulation: Simulation,
     states: States,
 ) -> list[np.ndarray]:
-    """Of a few windows: a lane with all commands, then one without each of them, which leaves the
+    """Fly a few windows: a lane with all commands, then one without each of them, which leaves the
     first at the knot before.
     """
     lanes, times, sent, run, kept = [], [], [], [], 0

@@ -310,7 +310,9 @@ class InitialFit:
 
 
 def drift(flights: Flights, w: int) -> np.ndarray:
-    """How far gusts may have led a window's samples by their time, as a deviation, shape (N,)."""
+    """Return how far gusts may have moved a window's samples by their time, as a deviation, shape
+    (N,).
+    """
     since = np.maximum(flights.time[w] - flights.cuts[w].start, 0.0)
     return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
 
@@ -328,8 +330,8 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
 
 
 def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
-    """How a window's initial state follows its effects: so that the flight stays as near to where
-    it was as it can.
+    """Return how a window's initial state follows its effects, so that the flight stays as near to
+    where it was as it can.
 
     ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as
     known [s]. Returns changes in the state's units by the effects' sizes, shape (D, K)."""

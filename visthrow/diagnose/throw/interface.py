@@ -65,7 +65,7 @@ class Mistake:
 
 
 def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
-    """What may be wrong with the commands of all logs, in the order in which it is put right; not
+    """Return what may be wrong with the commands of all logs, in the order of correction; not
     weighed yet.
     """
     found: list[Mistake] = []
@@ -155,7 +155,8 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
 
 
 def _followed(log: FlightLog) -> relations.Relation | None:
-    """How the measured attitude's rates follow the commanded ones; None where nothing turns."""
+    """Return how the measured attitude's rates follow the commanded ones; None where nothing turns.
+    """
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
         return None

@@ -54,7 +54,7 @@ class Landings:
 
     @property
     def released_errors(self) -> np.ndarray:
-        """The same of the prediction from the separation [m], shape (F,)."""
+        """Return the errors of the prediction from the separation [m], shape (F,)."""
         return np.linalg.norm((self.released - self.measured)[:, :2], axis=1)
 
 
@@ -116,8 +116,8 @@ def landings(
 
 
 def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Where a throw's state is fitted [s]: before the open loop, and up to the separation; both
-    outside of a slack rope.
+    """Return where a throw's state is fitted [s]: before the open loop, and up to the separation;
+    both outside of a slack rope.
     """
     flight = model.flights.flights[number]
     separation = flight.latch + model.setting.plant.release.lag
@@ -186,7 +186,7 @@ def _with_path(flight: Recorded, end: float | None) -> Recorded:
 
 
 def _crossing(path: np.ndarray, height: float) -> np.ndarray:
-    """Where a path, shape (T, 3), comes down through a height; NaN where it does not."""
+    """Return where a path, shape (T, 3), comes down through a height; NaN where it does not."""
     down = np.flatnonzero((path[:-1, 2] > height) & (path[1:, 2] <= height))
     if not len(down):
         return np.full(3, np.nan)

@@ -119,7 +119,7 @@ class Plan:
         knots: Mapping[str, np.ndarray],
         moved: np.ndarray,
     ) -> Window:
-        """What comes of the lanes.
+        """Return the window that the lanes make up.
 
         ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated
         quantities at all its knots; ``moved``: how far each window's state was moved from where its

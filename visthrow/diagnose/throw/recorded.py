@@ -234,7 +234,7 @@ def _hanging(log: FlightLog) -> bool | None:
 
 
 def _latch(log: FlightLog) -> float:
-    """When the release was commanded."""
+    """Return when the release was commanded."""
     if "release_command" not in log:
         return NEVER
     channel = log["release_command"]

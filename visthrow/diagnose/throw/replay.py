@@ -35,7 +35,7 @@ BATCH, CUDA_BATCH = (
 
 
 def downloaded(array: wp.array) -> np.ndarray:
-    """What a replay has written, on the host."""
+    """Copy an array that a replay wrote to the host."""
     return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
 
 
@@ -87,7 +87,7 @@ class Simulation:
 
 
 class Lane(NamedTuple):
-    """What one lane of a batch flies; there are some ten thousand in a run."""
+    """The settings of one lane of a batch; there are some ten thousand in a run."""
 
     window: int
     plant: int  # row of the settings
@@ -184,7 +184,7 @@ class Flights:
         return [self.spread(w, *own) for w, own in enumerate(groups)]
 
     def like(self, w: int) -> tuple[int, bool]:
-        """What :meth:`alike` depends on: the same of two windows, the same answer."""
+        """Return what :meth:`alike` depends on: the same of two windows, the same answer."""
         c = self.cuts[w]
         return c.payload, self.flights[c.flight].latch >= c.end
 
@@ -250,7 +250,9 @@ class Flights:
         )
 
     def repeated(self, windows: np.ndarray) -> "Flights":
-        """The same as it concerns :meth:`fly`, of windows that stand there more than once."""
+        """Return the flights as they concern :meth:`fly`, with windows that stand there more than
+        once.
+        """
         other = copy.copy(self)
         other.knots, other._fineness = self.knots[windows], self._fineness[windows]
         return other

@@ -147,7 +147,7 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
 
 
 def _shape(part: str | int, segments: int) -> np.ndarray:
-    """How far each segment turns, shape (L,)."""
+    """Return the angle by which each segment turns, shape (L,)."""
     if isinstance(part, int):
         return np.cos(part * np.pi * (np.arange(segments) + 0.5) / segments)
     return (

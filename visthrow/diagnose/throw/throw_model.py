@@ -215,8 +215,8 @@ class ThrowModel:
         ]
 
     def _moved(self, states: States, w: int) -> np.ndarray:
-        """How far a window's state is from the middle of its prior, in its directions,
-        shape (D,).
+        """Return how far a window's state is from the middle of its prior, in its directions, shape
+        (D,).
         """
         return states[MOVED][w, [concerns(x, self.flights.cuts[w]) for x in self._directions]]
 
@@ -338,7 +338,7 @@ class ThrowModel:
         return landings(self, theta, flights)
 
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
-        """The same model of other windows of its flights."""
+        """Return the model of other windows of its flights."""
         other = copy.copy(self)
         other._settled_at, other._before, other._follows, other._secants = (
             {},
@@ -368,7 +368,7 @@ class ThrowModel:
         return states, ends
 
     def _initial_fit(self, setting: Setting) -> InitialFit:
-        """What fits initial states in a setting."""
+        """Return the fit of initial states in a setting."""
         return InitialFit(
             self.flights, self._retained, self.simulation(setting), self.setting.plant.release.lag
         )
@@ -387,8 +387,8 @@ class ThrowModel:
         return self._fits[cuts]
 
     def _among_more(self, cuts: tuple[Cut, ...]) -> tuple[States, dict[int, np.ndarray]] | None:
-        """What was fitted to all windows of some flights among those of others, as each flight is
-        fitted by itself.
+        """Return what was fitted to all windows of some flights among those of others, as each
+        flight is fitted by itself.
         """
         flights = {c.flight for c in cuts}
         for more, (states, slopes) in self._fits.items():
